@@ -1,0 +1,44 @@
+# The two commands of the README, and what they are made of. Needs Python >= 3.11 and make, nothing else.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: help demo test install lint types tests schemas wheel clean
+help:
+	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
+	@echo "make test    everything that CI runs: lint, types, tests, schemas, wheel, demo"
+	@echo "make clean   remove the virtual environment and everything generated"
+
+# The stamp is newer than what it was made from, so a second call installs nothing.
+$(VENV)/.installed: pyproject.toml requirements.lock
+	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint requirements.lock --editable ".[dev]"
+	touch $@
+
+install: $(VENV)/.installed
+
+demo: install
+	$(BIN)/optipmb demo --out out/demo
+
+test: lint types tests schemas wheel demo
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: install
+	$(BIN)/mypy
+
+tests: install
+	$(BIN)/pytest
+
+schemas: install
+	$(BIN)/python -m optipmb_schemas.export --check schemas/json
+
+wheel: install
+	sh tests/wheel.sh $(PYTHON) $(BIN)
+
+clean:
+	rm -rf $(VENV) out build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
