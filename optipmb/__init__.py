@@ -1,1 +1,48 @@
-"""To be written."""
+"""OptiPMB: 3D multi-object tracking with an optimised Poisson multi-Bernoulli filter.
+
+    import optipmb
+
+    parameters = optipmb.load_profile("nuscenes")
+    tracker = optipmb.Tracker(parameters)
+    density = tracker.initial()
+    for stamp_ns, boxes in detections:
+        frame, _ = optipmb.make_frame(parameters, stamp_ns=stamp_ns, **boxes)
+        density, tracks, diagnostics = tracker.step(density, frame)
+
+Pure computation: no files but the profiles, no network, no state outside the density.
+"""
+
+from optipmb.density import Bernoullis, Density, Poissons
+from optipmb.errors import FrameError, OptipmbError, ParameterError
+from optipmb.extract import Tracks
+from optipmb.frame import Frame, PointCloud, Pose, make_frame
+from optipmb.geometry import bev_iou, points_in_boxes
+from optipmb.parameters import ClassParameters, Parameters, load_profile, parse_parameters, profiles
+from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
+from optipmb.warm import warm_up
+
+__all__ = [
+    "Bernoullis",
+    "ClassParameters",
+    "Density",
+    "Diagnostics",
+    "Frame",
+    "FrameError",
+    "Modules",
+    "OptipmbError",
+    "ParameterError",
+    "Parameters",
+    "PointCloud",
+    "Poissons",
+    "Pose",
+    "StepResult",
+    "Tracker",
+    "Tracks",
+    "bev_iou",
+    "load_profile",
+    "make_frame",
+    "parse_parameters",
+    "points_in_boxes",
+    "profiles",
+    "warm_up",
+]

@@ -1,0 +1,165 @@
+"""The PMB density (eq. PMB) as arrays: a Poisson intensity of undetected objects, a multi-Bernoulli of detected ones.
+
+One row per component, structure of arrays, so that kernels run over contiguous memory and a density can be kept,
+compared, hashed and stored as it is. Arrays are never written after the density is made.
+
+Motion state x_M = [x, y, v, phi, omega, a]: position on the ground plane (m), speed along the heading (m/s, negative
+when reversing), heading (rad, in (-pi, pi]), turn rate (rad/s), acceleration (m/s^2).
+Auxiliary state x_A = [length, width, height, z]: box size and height of the box's centre, m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Final, Self
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+X: Final = 0
+Y: Final = 1
+V: Final = 2
+PHI: Final = 3
+OMEGA: Final = 4
+A: Final = 5
+STATE: Final = 6
+"""Length of the motion state, and the index of each of its entries."""
+
+NO_FRAME: Final = -1
+"""`Density.stamp_ns` before the first frame."""
+
+
+class _Rows:
+    """What Bernoullis and Poissons share: columns of equal length that are filtered and joined together."""
+
+    __slots__ = ()
+
+    def columns(self) -> Iterator[tuple[str, NDArray[np.generic]]]:
+        """Yield the name and the array of each column."""
+        for field in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
+            yield field.name, getattr(self, field.name)
+
+    def take(self, rows: NDArray[np.generic]) -> Self:
+        """Return the rows that an index array or a mask selects."""
+        return type(self)(**{name: column[rows] for name, column in self.columns()})
+
+    def join(self, other: Self) -> Self:
+        """Return the rows of both, `other` last."""
+        pairs = zip(self.columns(), other.columns(), strict=True)
+        return type(self)(**{name: np.concatenate((mine, theirs)) for (name, mine), (_, theirs) in pairs})
+
+
+@dataclass(frozen=True, slots=True)
+class Bernoullis(_Rows):
+    """The detected potential objects.
+
+    Attributes:
+        mean: (N, 6) posterior mean m of the motion state.
+        covariance: (N, 6, 6) posterior covariance P.
+        existence: (N,) existence probability r.
+        label: (N,) int64 class c, index into the classes of the parameters.
+        auxiliary: (N, 4) auxiliary state x_A.
+        id: (N,) int64 track id t, unique in the session, ascending.
+        born_ns: (N,) int64 stamp of the first detection.
+        seen_ns: (N,) int64 stamp of the last detection; x_cnt and x_len are its and born_ns's distance to now.
+        score: (N,) confidence score x_s.
+        extracted: (N,) bool, whether the track was ever extracted (t in T).
+    """
+
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    existence: NDArray[np.float64]
+    label: NDArray[np.int64]
+    auxiliary: NDArray[np.float64]
+    id: NDArray[np.int64]
+    born_ns: NDArray[np.int64]
+    seen_ns: NDArray[np.int64]
+    score: NDArray[np.float64]
+    extracted: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.existence)
+
+    @classmethod
+    def empty(cls) -> Bernoullis:
+        """No objects."""
+        return cls(
+            mean=np.zeros((0, STATE)),
+            covariance=np.zeros((0, STATE, STATE)),
+            existence=np.zeros(0),
+            label=np.zeros(0, np.int64),
+            auxiliary=np.zeros((0, 4)),
+            id=np.zeros(0, np.int64),
+            born_ns=np.zeros(0, np.int64),
+            seen_ns=np.zeros(0, np.int64),
+            score=np.zeros(0),
+            extracted=np.zeros(0, np.bool_),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Poissons(_Rows):
+    """The Gaussian components of the Poisson intensity of undetected objects (eq. PPP Posterior).
+
+    Attributes:
+        mean: (N, 6) m^u.
+        covariance: (N, 6, 6) P^u.
+        weight: (N,) mu^u, expected number of objects.
+        label: (N,) int64 class.
+        auxiliary: (N, 4) box of the detection that made the component.
+        born_ns: (N,) int64 stamp of that detection.
+    """
+
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    label: NDArray[np.int64]
+    auxiliary: NDArray[np.float64]
+    born_ns: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.weight)
+
+    @classmethod
+    def empty(cls) -> Poissons:
+        """No components."""
+        return cls(
+            mean=np.zeros((0, STATE)),
+            covariance=np.zeros((0, STATE, STATE)),
+            weight=np.zeros(0),
+            label=np.zeros(0, np.int64),
+            auxiliary=np.zeros((0, 4)),
+            born_ns=np.zeros(0, np.int64),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Density:
+    """The whole state of a session between two frames.
+
+    Attributes:
+        stamp_ns: stamp of the last frame, `NO_FRAME` before the first.
+        next_id: the id of the next new track; ids are never reused.
+        bernoulli: detected potential objects.
+        poisson: undetected potential objects.
+    """
+
+    stamp_ns: int
+    next_id: int
+    bernoulli: Bernoullis
+    poisson: Poissons
+
+    @classmethod
+    def empty(cls, next_id: int = 1) -> Density:
+        """Return the density before the first frame; `next_id` lets a restarted session go on with fresh ids."""
+        return cls(stamp_ns=NO_FRAME, next_id=next_id, bernoulli=Bernoullis.empty(), poisson=Poissons.empty())
+
+
+def whole_periods(since_ns: NDArray[np.int64], now_ns: int, period: float) -> NDArray[np.int64]:
+    """Count the nominal periods (s) from each stamp to now, to the nearest: step counters for any frame rate."""
+    periods: NDArray[np.int64] = np.floor((now_ns - since_ns) * 1e-9 / period + 0.5).astype(np.int64)
+    return periods

@@ -1,0 +1,32 @@
+"""The errors of the tracker: both are `ValueError`, both name what was wrong by the path of the field.
+
+OptipmbError
+├── FrameError       a frame's arrays have a wrong shape, dtype or value, or its stamp goes back
+└── ParameterError   a profile cannot be found or read, or a value in it is not allowed
+"""
+
+from __future__ import annotations
+
+
+class OptipmbError(ValueError):
+    """An input was refused.
+
+    Attributes:
+        path: the field, as ``center[3]`` or ``classes.Car.survival``.
+        expected: what would have been accepted.
+        received: what was found, shortened to be printable.
+    """
+
+    def __init__(self, path: str, expected: str, received: str) -> None:
+        super().__init__(f"{path}: expected {expected}, received {received}")
+        self.path = path
+        self.expected = expected
+        self.received = received
+
+
+class FrameError(OptipmbError):
+    """A frame was refused before it reached the filter."""
+
+
+class ParameterError(OptipmbError):
+    """A parameter profile was refused."""

@@ -1,0 +1,227 @@
+"""A frame: what the tracker is given at one stamp, already checked, in the world frame.
+
+Conventions: the world frame is fixed, right-handed, z up; metres, seconds, radians; yaw counter-clockwise from x. A
+box is its geometric centre, its size (length along the heading, width, height) and its yaw. A sensor's pose maps its
+coordinates to the world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optipmb.errors import FrameError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from optipmb.parameters import Parameters
+
+UNIT_TOLERANCE = 1e-3
+"""How far the norm of a quaternion may be from one; it is normalised afterwards."""
+
+MAX_COORDINATE = 1e8
+"""Coordinates beyond this (metres) are not positions on Earth; the limit keeps squares far from overflow."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """World from sensor: ``world = rotation @ sensor + translation``.
+
+    Attributes:
+        translation: (3,) float64, m.
+        quaternion: (4,) float64, unit, w x y z.
+
+    Raises:
+        FrameError: wrong shape, not finite, or no unit quaternion.
+    """
+
+    translation: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        translation = _floats("pose.translation", self.translation, (3,), MAX_COORDINATE)
+        quaternion = _floats("pose.quaternion", self.quaternion, (4,), 2.0)
+        norm = float(np.sqrt(np.sum(quaternion * quaternion)))
+        if abs(norm - 1.0) > UNIT_TOLERANCE:
+            raise FrameError("pose.quaternion", "a unit quaternion (w, x, y, z)", f"norm {norm:.6g}")
+        object.__setattr__(self, "translation", translation)
+        object.__setattr__(self, "quaternion", quaternion / norm)
+
+    @cached_property
+    def rotation(self) -> NDArray[np.float64]:
+        """Rotation matrix (3, 3) of the quaternion."""
+        w, x, y, z = (float(value) for value in self.quaternion)
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """A LiDAR scan.
+
+    Attributes:
+        xyz: (P, 3) float32 in the sensor frame, m; read where it lies, never copied or written. Points that are not
+            finite are in no box.
+        pose: world from sensor at the stamp of the frame.
+
+    Raises:
+        FrameError: wrong shape or dtype.
+    """
+
+    xyz: NDArray[np.float32]
+    pose: Pose
+
+    def __post_init__(self) -> None:
+        if self.xyz.dtype != np.float32 or self.xyz.ndim != 2 or self.xyz.shape[1] != 3:  # noqa: PLR2004 - x, y, z
+            raise FrameError("cloud.xyz", "(P, 3) float32", f"{self.xyz.shape} {self.xyz.dtype}")
+        # A read-only view: one type for the kernels whether the points came from a file or lie in a message.
+        view = np.ascontiguousarray(self.xyz).view()
+        view.flags.writeable = False
+        object.__setattr__(self, "xyz", view)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Detections of one stamp in the world frame; made by `make_frame`, which checks them.
+
+    Attributes:
+        stamp_ns: sensor time, nanoseconds.
+        center: (M, 3) m.
+        size: (M, 3) length, width, height, m.
+        yaw: (M,) rad.
+        velocity: (M, 2) over ground, m/s; a row of NaN where the detector gives none.
+        score: (M,) in (0, 1].
+        label: (M,) int64, index into the classes of the parameters.
+        source: (M,) int64, index of the object in the arrays that the caller gave.
+        cloud: the scan of the same stamp, or None.
+    """
+
+    stamp_ns: int
+    center: NDArray[np.float64]
+    size: NDArray[np.float64]
+    yaw: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    score: NDArray[np.float64]
+    label: NDArray[np.int64]
+    source: NDArray[np.int64]
+    cloud: PointCloud | None = None
+
+
+def make_frame(
+    parameters: Parameters,
+    *,
+    stamp_ns: int,
+    labels: Sequence[str],
+    label: ArrayLike,
+    center: ArrayLike,
+    size: ArrayLike,
+    yaw: ArrayLike,
+    score: ArrayLike,
+    velocity: ArrayLike | None = None,
+    pose: Pose | None = None,
+    cloud: PointCloud | None = None,
+) -> tuple[Frame, int]:
+    """Check the detections of one stamp and bring them to the world frame and to the classes of the parameters.
+
+    Args:
+        parameters: whose classes are meant.
+        stamp_ns: sensor time, nanoseconds, not negative.
+        labels: names of the classes that `label` points into.
+        label: (M,) integers.
+        center: (M, 3) geometric centres, m, in the world frame, or in the sensor frame when `pose` is given.
+        size: (M, 3) length, width, height, m, all positive.
+        yaw: (M,) rad, in the same frame.
+        score: (M,) in (0, 1].
+        velocity: (M, 2) over ground along the axes of the same frame, m/s; None, or rows of NaN, where unknown.
+        pose: world from sensor, or None when the arrays are in the world frame already.
+        cloud: the scan of the same stamp.
+
+    Returns:
+        The frame, and how many objects were left out because their class is not in the parameters.
+
+    Raises:
+        FrameError: wrong shapes or values; `path` names the field and the element.
+    """
+    if not 0 <= stamp_ns < 2**63:
+        raise FrameError("stamp_ns", "nanoseconds in [0, 2^63)", str(stamp_ns))
+    which = np.asarray(label)
+    if which.ndim != 1 or (which.size and which.dtype.kind not in "iu"):
+        raise FrameError("label", "(M,) integers", f"{which.shape} {which.dtype}")
+    which = which.astype(np.int64)
+    m = which.shape[0]
+    _all("label", (which >= 0) & (which < len(labels)), f"an index below {len(labels)}", which)
+    center = _floats("center", center, (m, 3), MAX_COORDINATE)
+    size = _floats("size", size, (m, 3), MAX_COORDINATE)
+    _all("size", size > 0, "a positive length", size)
+    yaw = _floats("yaw", yaw, (m,), MAX_COORDINATE)
+    score = _floats("score", score, (m,), 1.0)
+    _all("score", score > 0, "a score in (0, 1]", score)
+    velocity = _velocities(velocity, m)
+
+    if pose is not None:
+        rotation = pose.rotation
+        center = center @ rotation.T + pose.translation
+        heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) @ rotation[:2, :2].T
+        yaw = np.arctan2(heading[:, 1], heading[:, 0])
+        velocity = velocity @ rotation[:2, :2].T
+
+    index = {name: i for i, name in enumerate(parameters.labels)}
+    class_of = np.array([index.get(name, -1) for name in labels], dtype=np.int64)
+    known = class_of[which] if m else which
+    source = np.flatnonzero(known >= 0)
+    frame = Frame(
+        stamp_ns=int(stamp_ns),
+        center=center[source],
+        size=size[source],
+        yaw=yaw[source],
+        velocity=velocity[source],
+        score=score[source],
+        label=known[source],
+        source=source.astype(np.int64),
+        cloud=cloud,
+    )
+    return frame, m - source.shape[0]
+
+
+def _velocities(velocity: ArrayLike | None, m: int) -> NDArray[np.float64]:
+    if velocity is None:
+        return np.full((m, 2), np.nan)
+    values = np.asarray(velocity, dtype=np.float64).reshape(-1, 2) if m == 0 else np.asarray(velocity, dtype=np.float64)
+    if values.shape != (m, 2):
+        raise FrameError("velocity", f"shape {(m, 2)}", str(values.shape))
+    unknown = np.isnan(values).all(axis=1, keepdims=True)
+    _all("velocity", (np.abs(values) <= MAX_COORDINATE) | unknown, "finite, or a whole row of NaN", values)
+    return values
+
+
+def _floats(path: str, values: ArrayLike, shape: tuple[int, ...], bound: float) -> NDArray[np.float64]:
+    """Return `values` as finite float64 of exactly `shape`; an empty list stands for any shape with no rows."""
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise FrameError(path, f"numbers of shape {shape}", repr(values)[:80]) from error
+    if array.shape != shape:
+        if array.size or 0 not in shape:
+            raise FrameError(path, f"shape {shape}", str(array.shape))
+        array = array.reshape(shape)
+    _all(path, np.abs(array) <= bound, f"a finite number of size at most {bound:g}", array)
+    return array
+
+
+def _all(path: str, good: NDArray[np.bool_], expected: str, values: NDArray[np.generic]) -> None:
+    """Raise for the first element that is not `good`; NaN compares as not good."""
+    if not good.all():
+        where = tuple(int(i) for i in np.argwhere(~good)[0])
+        element = "".join(f"[{i}]" for i in where)
+        raise FrameError(path + element, expected, str(values[where]))

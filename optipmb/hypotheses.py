@@ -1,0 +1,266 @@
+"""Local data association hypotheses and their costs (Section IV.D and the birth model of IV.F).
+
+Three kinds: an object is missed, an object is detected by a measurement, a measurement detects something for the
+first time. The costs need the position alone (eq. Simplified measurement model), so the full update is left to the
+hypotheses that win (`optipmb.update`). Likelihoods are kept as logarithms: weights of 1e-300 are ordinary here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from optipmb.compiled import kernel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from optipmb.density import Bernoullis, Poissons
+    from optipmb.preprocess import Measurements
+    from optipmb.table import ClassTable
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+FROM_POISSON: Final = 0
+"""First-time detection of what a Poisson component announced."""
+CLUTTER: Final = 1
+"""No component, low score: taken for clutter now, and announced as a Poisson component for later (M_low)."""
+NEWBORN: Final = 2
+"""No component, high score: a newborn object (M_high)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Objects and measurements of one class within the gate, ordered by object, then by measurement.
+
+    Attributes:
+        row: (K,) index of the object or component.
+        measurement: (K,) index of the measurement.
+        log_likelihood: (K,) ln N(z_xy; z_hat, S), eq. Predicted Measurement.
+    """
+
+    row: Index
+    measurement: Index
+    log_likelihood: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Hypotheses:
+    """All local hypotheses of one frame.
+
+    Attributes:
+        detections: object-measurement pairs in the gate.
+        detection_cost: (K,) w of each pair (eq. Detection Hypothesis Update).
+        announced: component-measurement pairs in the gate, the sets J^m.
+        log_e: (L,) ln e^j of each of those pairs (eq. First-Time Detection Hypothesis Update 2).
+        first_kind: (M,) `FROM_POISSON`, `CLUTTER` or `NEWBORN`.
+        first_cost: (M,) w of the first-time detection of each measurement.
+        first_existence: (M,) r of the Bernoulli that it would make.
+        association: (M,) p_a, probability that an existing object made the measurement (eq. Association Probability).
+    """
+
+    detections: Pairs
+    detection_cost: Array
+    announced: Pairs
+    log_e: Array
+    first_kind: Index
+    first_cost: Array
+    first_existence: Array
+    association: Array
+
+
+def enumerate_hypotheses(
+    bernoulli: Bernoullis,
+    p_d: Array,
+    poisson: Poissons,
+    p_d_poisson: Array,
+    measurements: Measurements,
+    table: ClassTable,
+) -> Hypotheses:
+    """Enumerate the hypotheses that pass the class gate and the distance gate, with their costs.
+
+    Resolutions: a likelihood outside the gate counts as zero in p_a, as its cost is infinite; mu_+ in e^j already
+    contains the survival probability that Algorithm 1 writes beside it.
+
+    Args:
+        bernoulli: predicted detected objects.
+        p_d: (N,) their detection probabilities.
+        poisson: predicted Poisson components.
+        p_d_poisson: (J,) theirs.
+        measurements: Z_k.
+        table: parameters as columns.
+    """
+    detections = _gate(bernoulli.mean, bernoulli.covariance, bernoulli.label, measurements, table)
+    detection_cost, association = detection_costs(
+        detections.row, detections.measurement, detections.log_likelihood, bernoulli.existence, p_d, len(measurements)
+    )
+    announced = _gate(poisson.mean, poisson.covariance, poisson.label, measurements, table)
+    log_e = np.log(poisson.weight * p_d_poisson)[announced.row] + announced.log_likelihood
+    kind, cost, existence = first_detections(
+        announced.measurement,
+        log_e,
+        measurements.score,
+        association,
+        table.clutter_intensity[measurements.label],
+        table.birth_intensity[measurements.label],
+        table.birth_score[measurements.label],
+    )
+    return Hypotheses(detections, detection_cost, announced, log_e, kind, cost, existence, association)
+
+
+def _gate(mean: Array, covariance: Array, label: Index, measurements: Measurements, table: ClassTable) -> Pairs:
+    by_x = np.argsort(measurements.position[:, 0], kind="stable")
+    row, measurement, log_likelihood = gate(
+        mean, covariance, label, measurements.position, measurements.label, by_x, table.gate, table.noise_position
+    )
+    return Pairs(row, measurement, log_likelihood)
+
+
+@kernel
+def gate(
+    mean: Array,
+    covariance: Array,
+    label: Index,
+    position: Array,
+    measured_label: Index,
+    by_x: Index,
+    gate_distance: Array,
+    noise_position: Array,
+) -> tuple[Index, Index, Array]:
+    """Find the measurements of an object's class within its gate and their position likelihoods.
+
+    A sweep along x: of the measurements sorted by x, only those within the gate's reach are looked at.
+
+    Args:
+        mean: (N, 6) predicted means.
+        covariance: (N, 6, 6) predicted covariances.
+        label: (N,) classes.
+        position: (M, 2) z_xy.
+        measured_label: (M,) z_c.
+        by_x: (M,) order of the measurements by x.
+        gate_distance: (C,) eta_dist.
+        noise_position: (C,) standard deviation of z_x and z_y; R_xy = sigma^2 I.
+
+    Returns:
+        Objects, measurements and log-likelihoods of the pairs, ordered by object, then measurement.
+    """
+    sorted_x = position[by_x, 0]
+    capacity = 4 * (mean.shape[0] + position.shape[0]) + 16
+    row = np.empty(capacity, np.int64)
+    measurement = np.empty(capacity, np.int64)
+    log_likelihood = np.empty(capacity)
+    count = 0
+    for n in range(mean.shape[0]):
+        eta = gate_distance[label[n]]
+        begin = count
+        for k in range(np.searchsorted(sorted_x, mean[n, 0] - eta), position.shape[0]):
+            m = by_x[k]
+            dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
+            if dx > eta:
+                break
+            if measured_label[m] != label[n] or dx * dx + dy * dy > eta * eta:
+                continue
+            if count == capacity:
+                capacity *= 2
+                row = _grown(row, capacity)
+                measurement = _grown(measurement, capacity)
+                log_likelihood = _grown(log_likelihood, capacity)
+            slot = count  # keep the measurements of this object in ascending order
+            while slot > begin and measurement[slot - 1] > m:
+                measurement[slot] = measurement[slot - 1]
+                slot -= 1
+            measurement[slot] = m
+            row[count] = n
+            count += 1
+        r_xy = noise_position[label[n]] ** 2
+        s_xx, s_xy, s_yy = covariance[n, 0, 0] + r_xy, covariance[n, 0, 1], covariance[n, 1, 1] + r_xy
+        determinant = s_xx * s_yy - s_xy * s_xy
+        constant = -math.log(2.0 * math.pi) - 0.5 * math.log(determinant)
+        for k in range(begin, count):
+            dx, dy = position[measurement[k], 0] - mean[n, 0], position[measurement[k], 1] - mean[n, 1]
+            squared = (s_yy * dx * dx - 2.0 * s_xy * dx * dy + s_xx * dy * dy) / determinant
+            log_likelihood[k] = constant - 0.5 * squared
+    return row[:count].copy(), measurement[:count].copy(), log_likelihood[:count].copy()
+
+
+@kernel
+def _grown(array: Array, capacity: int) -> Array:
+    larger = np.empty(capacity, array.dtype)
+    larger[: array.shape[0]] = array
+    return larger
+
+
+@kernel
+def detection_costs(
+    row: Index, measurement: Index, log_likelihood: Array, existence: Array, p_d: Array, n_measurements: int
+) -> tuple[Array, Array]:
+    """Compute the cost of each detection hypothesis and the association probability of each measurement.
+
+    ``w = -ln [r p_d N(z; z_hat, S) / (1 - r + r (1 - p_d))]`` (eq. Detection Hypothesis Update) and
+    ``p_a = min[1, sum_n N(z; z_hat^n, S^n)]`` (eq. Association Probability).
+
+    Returns:
+        (K,) costs and (M,) association probabilities.
+    """
+    cost = np.empty(row.shape[0])
+    association = np.zeros(n_measurements)
+    for k in range(row.shape[0]):
+        r, p = existence[row[k]], p_d[row[k]]
+        cost[k] = math.log(1.0 - r + r * (1.0 - p)) - math.log(r * p) - log_likelihood[k]
+        association[measurement[k]] += math.exp(log_likelihood[k])
+    return cost, np.minimum(association, 1.0)
+
+
+@kernel
+def first_detections(
+    measurement: Index,
+    log_e: Array,
+    score: Array,
+    association: Array,
+    clutter_intensity: Array,
+    birth_intensity: Array,
+    birth_score: Array,
+) -> tuple[Index, Array, Array]:
+    """Compute kind, cost and existence of the first-time detection hypothesis of each measurement.
+
+    With components in the gate (eq. First-Time Detection Hypothesis Update 1): ``w = -ln(e + lambda_c)``, ``r = e /
+    (e + lambda_c)``. Without, by the hybrid adaptive birth model: a low score is clutter (eq. Clutter Hypothesis),
+    ``w = -ln lambda_c``, ``r = 0``; a high score is newborn (eq. Newborn Hypothesis), ``w = -ln[mu_b0 (1 - p_a) / A
+    + lambda_c]``, ``r = 1``.
+
+    Args:
+        measurement: (L,) measurement of each announced pair.
+        log_e: (L,) ln e^j.
+        score: (M,) z_s.
+        association: (M,) p_a.
+        clutter_intensity: (M,) lambda_c at each measurement.
+        birth_intensity: (M,) mu_b0 / A at each measurement.
+        birth_score: (M,) eta_score at each measurement.
+    """
+    n_measurements = score.shape[0]
+    log_sum = np.full(n_measurements, -math.inf)  # ln e, e = sum_j e^j
+    kind = np.full(n_measurements, CLUTTER)
+    for k in range(measurement.shape[0]):
+        m = measurement[k]
+        kind[m] = FROM_POISSON
+        larger, smaller = max(log_sum[m], log_e[k]), min(log_sum[m], log_e[k])
+        log_sum[m] = larger if smaller == -math.inf else larger + math.log1p(math.exp(smaller - larger))
+    cost = np.empty(n_measurements)
+    existence = np.empty(n_measurements)
+    for m in range(n_measurements):
+        if kind[m] == FROM_POISSON:
+            ratio = math.exp(min(log_sum[m] - math.log(clutter_intensity[m]), 700.0))  # e / lambda_c
+            cost[m] = -math.log(clutter_intensity[m]) - math.log1p(ratio)
+            existence[m] = ratio / (1.0 + ratio)
+        elif score[m] < birth_score[m]:
+            cost[m] = -math.log(clutter_intensity[m])
+            existence[m] = 0.0
+        else:
+            kind[m] = NEWBORN
+            cost[m] = -math.log(birth_intensity[m] * (1.0 - association[m]) + clutter_intensity[m])
+            existence[m] = 1.0
+    return kind, cost, existence

@@ -1,0 +1,175 @@
+"""The CTRA motion model and the unscented transform over it (Section IV.A, eq. Motion Predict).
+
+The unscented transform uses the symmetric set of 2n = 12 points at distance sqrt(n) along the columns of a matrix
+square root, all of weight 1/12 (kappa = 0): no weight is negative, so the transformed covariance is positive
+semi-definite whatever the function.
+
+The square root is the Cholesky factor of the covariance with the state REORDERED as [v, phi, omega, a, x, y],
+position last. Then the columns that bend (v, phi, omega, a) do not depend on the axes of the world, and the columns
+of x and y pass through unbent: turning the world turns the result, exactly. A factor taken in the usual order would
+make the tracker prefer compass directions.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optipmb.compiled import kernel
+from optipmb.density import PHI, STATE, A, V, X, Y
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+SPREAD = math.sqrt(STATE)
+"""Distance of the sigma points in units of the square root, sqrt(n + kappa)."""
+
+WEIGHT = 1.0 / (2 * STATE)
+"""Weight of each sigma point."""
+
+ORDER = (2, 3, 4, 5, 0, 1)
+"""Row of the square root -> entry of the state."""
+
+SMALL_TURN = 0.1
+"""Turn angle (rad) below which the integrals of the motion are summed as series; the closed form divides by its
+square."""
+
+TINY_PIVOT = 1e-12
+"""A pivot of the square root is lifted to this: a covariance that lost rank in rounding is repaired, and counted."""
+
+
+@kernel
+def wrap(angle: float) -> float:
+    """Return the angle in (-pi, pi]."""
+    if -math.pi < angle <= math.pi:
+        return angle
+    wrapped = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+    return wrapped if wrapped > -math.pi else math.pi
+
+
+@kernel
+def ctra_displacement(v: float, omega: float, a: float, dt: float) -> tuple[float, float]:
+    """Integrate the speed v + a t along a heading that turns with omega, from 0 to dt.
+
+    Returns:
+        The way along the starting heading and the way across it (to the left), m:
+        ``along = int (v + a t) cos(omega t) dt``, ``across = int (v + a t) sin(omega t) dt``.
+    """
+    u = omega * dt
+    if abs(u) < SMALL_TURN:
+        u2 = u * u
+        sinc = 1.0 - u2 / 6.0 * (1.0 - u2 / 20.0 * (1.0 - u2 / 42.0))
+        cosc = u / 2.0 * (1.0 - u2 / 12.0 * (1.0 - u2 / 30.0 * (1.0 - u2 / 56.0)))
+        ramp_cos = 0.5 - u2 / 8.0 + u2 * u2 / 144.0 - u2 * u2 * u2 / 5760.0
+        ramp_sin = u / 3.0 - u * u2 / 30.0 + u * u2 * u2 / 840.0 - u * u2 * u2 * u2 / 45360.0
+    else:
+        sin_u = math.sin(u)
+        cos_u = math.cos(u)
+        sinc = sin_u / u
+        cosc = (1.0 - cos_u) / u
+        ramp_cos = (cos_u + u * sin_u - 1.0) / (u * u)
+        ramp_sin = (sin_u - u * cos_u) / (u * u)
+    along = dt * (v * sinc + a * dt * ramp_cos)
+    across = dt * (v * cosc + a * dt * ramp_sin)
+    return along, across
+
+
+@kernel
+def square_root(covariance: Array, root: Array) -> int:
+    """Factor a (6, 6) covariance, rows and columns in `ORDER`, into a lower `root`; return the pivots repaired."""
+    repaired = 0
+    for i in range(STATE):
+        for j in range(i + 1):
+            value = covariance[ORDER[i], ORDER[j]]
+            for k in range(j):
+                value -= root[i, k] * root[j, k]
+            if i == j:
+                if not value > TINY_PIVOT:
+                    value = TINY_PIVOT
+                    repaired += 1
+                root[i, i] = math.sqrt(value)
+            else:
+                root[i, j] = value / root[j, j]
+        for j in range(i + 1, STATE):
+            root[i, j] = 0.0
+    return repaired
+
+
+@kernel
+def predict_states(
+    mean: Array,
+    covariance: Array,
+    label: NDArray[np.int64],
+    dt: float,
+    process_noise: Array,
+    mean_out: Array,
+    covariance_out: Array,
+) -> int:
+    """Predict every state by the unscented transform of the CTRA model (eq. Motion Predict).
+
+    Args:
+        mean: (N, 6) posterior means.
+        covariance: (N, 6, 6) posterior covariances.
+        label: (N,) class indices.
+        dt: time to predict over, s, positive.
+        process_noise: (C, 6) standard deviations per square root of a second and class; ``Q = diag(q^2) dt``.
+        mean_out: (N, 6) receives m_+.
+        covariance_out: (N, 6, 6) receives P_+.
+
+    Returns:
+        How many covariances had to be repaired.
+    """
+    root = np.empty((STATE, STATE))
+    # Deviations of the transformed points from the transformed centre; the mean is added last, so that large world
+    # coordinates cost no digits.
+    points = np.empty((2 * STATE, STATE))
+    repaired = 0
+    for n in range(mean.shape[0]):
+        if square_root(covariance[n], root) > 0:
+            repaired += 1
+        v, phi, omega, a = mean[n, V], mean[n, PHI], mean[n, PHI + 1], mean[n, A]
+        along0, across0 = ctra_displacement(v, omega, a, dt)
+        cos_phi, sin_phi = math.cos(phi), math.sin(phi)
+        dx0 = cos_phi * along0 - sin_phi * across0
+        dy0 = sin_phi * along0 + cos_phi * across0
+        for column in range(STATE):
+            for side in range(2):
+                step = SPREAD if side == 0 else -SPREAD
+                point = points[2 * column + side]
+                for row in range(STATE):
+                    point[ORDER[row]] = step * root[row, column]
+                if column < STATE - 2:  # the columns of x and y leave the motion itself as it is at the centre
+                    along, across = ctra_displacement(v + point[V], omega + point[PHI + 1], a + point[A], dt)
+                    cos_point, sin_point = math.cos(phi + point[PHI]), math.sin(phi + point[PHI])
+                    point[X] += cos_point * along - sin_point * across - dx0
+                    point[Y] += sin_point * along + cos_point * across - dy0
+                    point[V] += point[A] * dt
+                    point[PHI] += point[PHI + 1] * dt
+        shift = np.zeros(STATE)
+        for i in range(2 * STATE):
+            for s in range(STATE):
+                shift[s] += WEIGHT * points[i, s]
+        for i in range(2 * STATE):
+            for s in range(STATE):
+                points[i, s] -= shift[s]
+        for s in range(STATE):
+            for t in range(s + 1):
+                value = 0.0
+                for i in range(2 * STATE):
+                    value += points[i, s] * points[i, t]
+                value *= WEIGHT
+                if s == t:
+                    value += process_noise[label[n], s] ** 2 * dt
+                covariance_out[n, s, t] = value
+                covariance_out[n, t, s] = value
+        mean_out[n, X] = mean[n, X] + (dx0 + shift[X])
+        mean_out[n, Y] = mean[n, Y] + (dy0 + shift[Y])
+        mean_out[n, V] = v + a * dt + shift[V]
+        mean_out[n, PHI] = wrap(phi + omega * dt + shift[PHI])
+        mean_out[n, PHI + 1] = omega + shift[PHI + 1]
+        mean_out[n, A] = a + shift[A]
+    return repaired

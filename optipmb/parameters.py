@@ -1,0 +1,180 @@
+"""The parameters of the tracker: one table per class, as the paper's (Section V.A) has one column per class.
+
+A profile is a TOML file: ``name``, ``nominal_period`` and a table ``[classes.NAME]`` per class; the order of the
+tables is the order of the class indices. Two profiles come with the package, ``nuscenes`` and ``kitti``; own files
+load the same way (`load_profile`).
+
+Beyond the paper's table there are the quantities that the paper uses and does not give (Q, R, P0, A) and two that a
+filter with survival probability one needs to forget objects (`max_misses`, `min_existence`).
+"""
+
+from __future__ import annotations
+
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from optipmb.errors import ParameterError
+
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+OpenProbability = Annotated[float, Field(gt=0.0, lt=1.0)]
+Positive = Annotated[float, Field(gt=0.0, le=1e9)]
+NonNegative = Annotated[float, Field(ge=0.0, le=1e9)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class ProcessNoise(_Table):
+    """Process noise Q_k of the CTRA model, as standard deviations that grow with the square root of time.
+
+    ``Q_k = diag(q_x, q_x, q_v, q_phi, q_omega, q_a)^2 * dt``, so that two steps of dt/2 add as much as one of dt.
+    The position entry is common to x and y: nothing may prefer an axis of the world.
+    """
+
+    position: Positive = Field(description="standard deviation of x and of y gained in one second, m")
+    speed: Positive = Field(description="of v, m/s")
+    heading: Positive = Field(description="of phi, rad")
+    turn_rate: Positive = Field(description="of omega, rad/s")
+    acceleration: Positive = Field(description="of a, m/s^2")
+
+
+class MeasurementNoise(_Table):
+    """Measurement noise R_k of the detector, as standard deviations of z_M = [x, y, v_x, v_y, phi]."""
+
+    position: Positive = Field(description="standard deviation of x and of y, m; its square fills R_xy")
+    velocity: Positive = Field(description="of v_x and of v_y, m/s; unused where a detection has no velocity")
+    heading: Positive = Field(description="of phi, rad")
+
+
+class BirthSpread(_Table):
+    """Birth covariance P^0 of a newborn object, as standard deviations."""
+
+    position: Positive = Field(description="of x and of y, m")
+    speed: Positive = Field(description="of v when the detection brings a velocity, m/s")
+    unknown_speed: Positive = Field(description="of v when it does not (v starts at 0), m/s")
+    heading: Positive = Field(description="of phi, rad")
+    turn_rate: Positive = Field(description="of omega, rad/s")
+    acceleration: Positive = Field(description="of a, m/s^2")
+
+
+class ClassParameters(_Table):
+    """Everything the tracker knows of one object class; the paper's symbol stands first in each description."""
+
+    score_filter: Probability = Field(description="eta_sf: detections with a lower score are removed")
+    nms_iou: Probability = Field(description="eta_iou: of two detections that overlap more, the better scored stays")
+    survival: Annotated[float, Field(gt=0.0, le=1.0)] = Field(
+        description="p_s: survival probability per nominal period"
+    )
+    gate: Positive = Field(description="eta_dist: gating distance on the ground plane, m")
+    detection: OpenProbability = Field(description="p_d0: baseline detection probability")
+    expected_points: Positive = Field(description="PTS_0: number of LiDAR points in the box of an object in full view")
+    detection_floor: Annotated[float, Field(gt=0.0, le=1.0)] = Field(
+        description="s_d: what is left of p_d0 without points"
+    )
+    birth_score: Probability = Field(
+        description="eta_score: unused detections from this score on start a track at once"
+    )
+    adaptive_birth_rate: Positive = Field(
+        description="mu_ab: weight of the Poisson component of a low-scored detection"
+    )
+    undetected_birth_rate: Positive = Field(
+        description="mu_b0: expected undetected objects in the region of observation"
+    )
+    clutter_rate: Positive = Field(description="mu_c: expected false detections in a frame")
+    area: Positive = Field(description="A: area of the region of observation, m^2")
+    poisson_steps: Annotated[int, Field(ge=0)] = Field(
+        description="eta_step: nominal periods a Poisson component survives"
+    )
+    extract_new: Probability = Field(
+        description="eta_ext1: existence from which a track is extracted for the first time"
+    )
+    extract_known: Probability = Field(description="eta_ext2: existence from which a known track is extracted again")
+    extract_misses: Annotated[int, Field(ge=0)] = Field(
+        description="eta_cnt: missed nominal periods from which a known track is no longer extracted"
+    )
+    max_misses: Annotated[int, Field(ge=0)] = Field(
+        description="missed nominal periods after which a Bernoulli is removed; with p_s = 1 nothing else does"
+    )
+    min_existence: OpenProbability = Field(description="existence probability below which a Bernoulli is removed")
+    heading_sign_reliable: bool = Field(
+        default=True, description="false: the detector may turn a box by pi, the heading innovation is taken modulo pi"
+    )
+    birth_heading_speed: NonNegative = Field(
+        default=0.0,
+        description="measured speed, m/s, from which a birth heads along its velocity (the paper: 0), else as its box",
+    )
+    process_noise: ProcessNoise = Field(description="Q")
+    measurement_noise: MeasurementNoise = Field(description="R")
+    birth: BirthSpread = Field(description="P^0")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ClassParameters:
+        if self.extract_new > self.extract_known:
+            raise ValueError(f"extract_new <= extract_known, received {self.extract_new} > {self.extract_known}")
+        return self
+
+
+class Parameters(_Table):
+    """A profile: the classes to track, in the order of their indices, and the nominal period of the stream."""
+
+    name: Annotated[str, Field(min_length=1, max_length=64)] = Field(
+        description="name of the profile, repeated in results"
+    )
+    nominal_period: Positive = Field(
+        description="seconds between frames for which p_s and the counted limits hold; with another dt they are scaled"
+    )
+    provenance: str = Field(default="", max_length=10_000, description="where the values come from")
+    classes: Annotated[dict[str, ClassParameters], Field(min_length=1, max_length=256)] = Field(
+        description="one table per class; a detection of any other class is left out and counted"
+    )
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the classes in the order of their indices."""
+        return tuple(self.classes)
+
+
+def profiles() -> tuple[str, ...]:
+    """Names of the profiles that come with the package."""
+    folder = resources.files("optipmb").joinpath("profiles")
+    return tuple(sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml")))
+
+
+def load_profile(profile: str | Path) -> Parameters:
+    """Read a profile by the name of one that comes with the package, or by the path of a TOML file.
+
+    Raises:
+        ParameterError: no such profile, no TOML, or a value that is not allowed; `path` names the field.
+    """
+    if isinstance(profile, str) and profile in profiles():
+        text = resources.files("optipmb").joinpath("profiles", f"{profile}.toml").read_text(encoding="utf-8")
+    else:
+        try:
+            text = Path(profile).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            expected = f"one of {', '.join(profiles())} or a readable TOML file"
+            raise ParameterError("profile", expected, f"{str(profile)!r} ({type(error).__name__})") from error
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ParameterError("profile", "TOML", f"{str(profile)!r}: {error}") from error
+    return parse_parameters(document)
+
+
+def parse_parameters(document: dict[str, Any]) -> Parameters:
+    """Check a profile that is already in memory, as nested dictionaries.
+
+    Raises:
+        ParameterError: for the first value that is not allowed.
+    """
+    try:
+        return Parameters.model_validate(document)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        path = ".".join(str(part) for part in first["loc"]) or "profile"
+        raise ParameterError(path, first["msg"], repr(first["input"])[:80]) from error

@@ -1,0 +1,118 @@
+"""The parameters as columns, one entry per class, ready for kernels and for indexing by class."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from optipmb.parameters import ClassParameters, Parameters
+
+    Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ClassTable:
+    """Columns over the classes; names as in `optipmb.parameters.ClassParameters`, where they are described.
+
+    Attributes:
+        clutter_intensity: lambda_c = mu_c / A, 1/m^2.
+        birth_intensity: mu_b0 / A, 1/m^2.
+        process_noise: (C, 6) standard deviations in state order, per square root of a second.
+        noise_position: (C,) standard deviation of z_x and z_y.
+        noise_velocity: (C,) of z_vx and z_vy.
+        noise_heading: (C,) of z_phi.
+        birth_known: (C, 6) standard deviations of P^0 when the detection brings a velocity.
+        birth_unknown: (C, 6) when it does not.
+    """
+
+    period: float
+    score_filter: Array
+    nms_iou: Array
+    survival: Array
+    gate: Array
+    detection: Array
+    expected_points: Array
+    detection_floor: Array
+    birth_score: Array
+    adaptive_birth_rate: Array
+    clutter_intensity: Array
+    birth_intensity: Array
+    poisson_steps: NDArray[np.int64]
+    extract_new: Array
+    extract_known: Array
+    extract_misses: NDArray[np.int64]
+    max_misses: NDArray[np.int64]
+    min_existence: Array
+    heading_sign_reliable: NDArray[np.bool_]
+    birth_heading_speed: Array
+    process_noise: Array
+    noise_position: Array
+    noise_velocity: Array
+    noise_heading: Array
+    birth_known: Array
+    birth_unknown: Array
+
+    @classmethod
+    def of(cls, parameters: Parameters) -> ClassTable:
+        """Lay out the classes of a profile as columns."""
+        rows = tuple(parameters.classes.values())
+
+        def column(value: Callable[[ClassParameters], float]) -> Array:
+            return np.array([value(row) for row in rows], dtype=np.float64)
+
+        def count(value: Callable[[ClassParameters], int]) -> NDArray[np.int64]:
+            return np.array([value(row) for row in rows], dtype=np.int64)
+
+        def spread(speed: Callable[[ClassParameters], float]) -> Array:
+            return np.array(
+                [
+                    [
+                        p.birth.position,
+                        p.birth.position,
+                        speed(p),
+                        p.birth.heading,
+                        p.birth.turn_rate,
+                        p.birth.acceleration,
+                    ]
+                    for p in rows
+                ]
+            )
+
+        noise = [p.process_noise for p in rows]
+        return cls(
+            period=parameters.nominal_period,
+            score_filter=column(lambda p: p.score_filter),
+            nms_iou=column(lambda p: p.nms_iou),
+            survival=column(lambda p: p.survival),
+            gate=column(lambda p: p.gate),
+            detection=column(lambda p: p.detection),
+            expected_points=column(lambda p: p.expected_points),
+            detection_floor=column(lambda p: p.detection_floor),
+            birth_score=column(lambda p: p.birth_score),
+            adaptive_birth_rate=column(lambda p: p.adaptive_birth_rate),
+            clutter_intensity=column(lambda p: p.clutter_rate / p.area),
+            birth_intensity=column(lambda p: p.undetected_birth_rate / p.area),
+            poisson_steps=count(lambda p: p.poisson_steps),
+            extract_new=column(lambda p: p.extract_new),
+            extract_known=column(lambda p: p.extract_known),
+            extract_misses=count(lambda p: p.extract_misses),
+            max_misses=count(lambda p: p.max_misses),
+            min_existence=column(lambda p: p.min_existence),
+            heading_sign_reliable=np.array([p.heading_sign_reliable for p in rows], dtype=np.bool_),
+            birth_heading_speed=column(lambda p: p.birth_heading_speed),
+            process_noise=np.array(
+                [[q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration] for q in noise]
+            ),
+            noise_position=column(lambda p: p.measurement_noise.position),
+            noise_velocity=column(lambda p: p.measurement_noise.velocity),
+            noise_heading=column(lambda p: p.measurement_noise.heading),
+            birth_known=spread(lambda p: p.birth.speed),
+            birth_unknown=spread(lambda p: p.birth.unknown_speed),
+        )

@@ -1,0 +1,247 @@
+"""Measurement update of the motion state by the unscented Kalman filter (eq. UKF Update).
+
+It runs for the pairs of the best global hypothesis only: costs need the position alone, nothing else uses the result.
+
+z_M = [x, y, v_x, v_y, phi] = H(x_M) + w (eq. Single Object Measurement Model); a detection without velocity leaves
+the two velocity rows out, and H is then linear. Sigma points and square root are those of `optipmb.motion`. The
+innovation of phi is taken in (-pi, pi], or modulo pi in (-pi/2, pi/2] where the detector may turn boxes around.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optipmb.compiled import kernel
+from optipmb.density import PHI, STATE, V, X, Y
+from optipmb.motion import ORDER, SPREAD, WEIGHT, square_root, wrap
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from optipmb.preprocess import Measurements
+    from optipmb.table import ClassTable
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+MEASURED = 5
+"""Rows of z_M with a velocity; three without."""
+
+
+def update_states(
+    mean: Array, covariance: Array, measurement: Index, measurements: Measurements, table: ClassTable
+) -> tuple[Array, Array, int]:
+    """Update states with the measurement of each; a negative index leaves the state as predicted.
+
+    Args:
+        mean: (N, 6) predicted means.
+        covariance: (N, 6, 6) predicted covariances.
+        measurement: (N,) index of the associated measurement, or -1.
+        measurements: Z_k.
+        table: parameters as columns.
+
+    Returns:
+        (N, 6) and (N, 6, 6) posterior, and how many covariances had to be repaired.
+    """
+    mean_out, covariance_out = np.empty_like(mean), np.empty_like(covariance)
+    repaired = ukf_updates(
+        mean,
+        covariance,
+        measurement,
+        measurements.position,
+        measurements.velocity,
+        measurements.yaw,
+        measurements.label,
+        table.noise_position,
+        table.noise_velocity,
+        table.noise_heading,
+        table.heading_sign_reliable,
+        mean_out,
+        covariance_out,
+    )
+    return mean_out, covariance_out, repaired
+
+
+@kernel
+def ukf_updates(
+    mean: Array,
+    covariance: Array,
+    measurement: Index,
+    position: Array,
+    velocity: Array,
+    yaw: Array,
+    label: Index,
+    noise_position: Array,
+    noise_velocity: Array,
+    noise_heading: Array,
+    heading_sign_reliable: NDArray[np.bool_],
+    mean_out: Array,
+    covariance_out: Array,
+) -> int:
+    """Run `ukf_update` for every state with a measurement; return how many covariances had to be repaired."""
+    repaired = 0
+    z = np.empty(MEASURED)
+    sigma = np.empty(MEASURED)
+    for n in range(mean.shape[0]):
+        m = measurement[n]
+        if m < 0:
+            mean_out[n] = mean[n]
+            covariance_out[n] = covariance[n]
+            continue
+        c = label[m]
+        z[0], z[1], z[4] = position[m, 0], position[m, 1], yaw[m]
+        z[2], z[3] = velocity[m, 0], velocity[m, 1]
+        sigma[0] = sigma[1] = noise_position[c]
+        sigma[2] = sigma[3] = noise_velocity[c]
+        sigma[4] = noise_heading[c]
+        if ukf_update(mean[n], covariance[n], z, sigma, heading_sign_reliable[c], mean_out[n], covariance_out[n]) > 0:
+            repaired += 1
+    return repaired
+
+
+@kernel
+def ukf_update(
+    mean: Array,
+    covariance: Array,
+    z: Array,
+    sigma: Array,
+    heading_sign: bool,
+    mean_out: Array,
+    covariance_out: Array,
+) -> int:
+    """Update one state with one measurement.
+
+    With C the cross covariance, S the innovation covariance and nu the innovation: ``K = C S^-1``, ``m = m_+ + K nu``,
+    ``P = P_+ - K S K'``, computed through the Cholesky factor L of S as ``W = C L^-T``, ``P = P_+ - W W'``.
+
+    Args:
+        mean: (6,) m_+.
+        covariance: (6, 6) P_+.
+        z: (5,) z_M; NaN at 2 and 3 where the velocity is unknown.
+        sigma: (5,) standard deviations of the measurement noise, ``R = diag(sigma^2)``.
+        heading_sign: whether the sign of the measured heading can be trusted.
+        mean_out: (6,) receives m.
+        covariance_out: (6, 6) receives P.
+
+    Returns:
+        Number of pivots that had to be repaired.
+    """
+    with_velocity = not (math.isnan(z[2]) or math.isnan(z[3]))
+    size = MEASURED if with_velocity else 3
+    root = np.empty((STATE, STATE))
+    repaired = square_root(covariance, root)
+    v, phi = mean[V], mean[PHI]
+
+    # Deviations of the sigma points (chi) and of their measurements (psi) from the centre.
+    chi = np.empty((2 * STATE, STATE))
+    psi = np.empty((2 * STATE, size))
+    innovation = np.zeros(size)
+    vx0, vy0 = v * math.cos(phi), v * math.sin(phi)
+    for i in range(2 * STATE):
+        step = SPREAD if i % 2 == 0 else -SPREAD
+        for row in range(STATE):
+            chi[i, ORDER[row]] = step * root[row, i // 2]
+        psi[i, 0], psi[i, 1] = chi[i, X], chi[i, Y]
+        if with_velocity:
+            psi[i, 2] = (v + chi[i, V]) * math.cos(phi + chi[i, PHI]) - vx0
+            psi[i, 3] = (v + chi[i, V]) * math.sin(phi + chi[i, PHI]) - vy0
+        psi[i, size - 1] = chi[i, PHI]
+        for r in range(size):
+            innovation[r] -= WEIGHT * psi[i, r]
+    for i in range(2 * STATE):
+        for r in range(size):
+            psi[i, r] += innovation[r]  # the mean of psi is minus the innovation so far
+    innovation[0] += z[0] - mean[X]
+    innovation[1] += z[1] - mean[Y]
+    if with_velocity:
+        innovation[2] += z[2] - vx0
+        innovation[3] += z[3] - vy0
+    turn = innovation[size - 1] + z[4] - phi
+    innovation[size - 1] = wrap(turn) if heading_sign else 0.5 * wrap(2.0 * turn)
+
+    # S = Psi' W Psi + R, factored in place; then W = C L^-T and u = L^-1 nu.
+    factor = np.empty((size, size))
+    for r in range(size):
+        for s in range(r + 1):
+            value = 0.0
+            for i in range(2 * STATE):
+                value += psi[i, r] * psi[i, s]
+            value *= WEIGHT
+            if r == s:
+                deviation = sigma[r] if r < size - 1 else sigma[4]
+                value += deviation * deviation
+            for k in range(s):
+                value -= factor[r, k] * factor[s, k]
+            factor[r, s] = math.sqrt(value) if r == s else value / factor[s, s]
+    for r in range(size):
+        for k in range(r):
+            innovation[r] -= factor[r, k] * innovation[k]
+        innovation[r] /= factor[r, r]
+    weighted = np.empty((STATE, size))
+    for s in range(STATE):
+        for r in range(size):
+            value = 0.0
+            for i in range(2 * STATE):
+                value += chi[i, s] * psi[i, r]
+            value *= WEIGHT
+            for k in range(r):
+                value -= weighted[s, k] * factor[r, k]
+            weighted[s, r] = value / factor[r, r]
+    for s in range(STATE):
+        gained = 0.0
+        for r in range(size):
+            gained += weighted[s, r] * innovation[r]
+        mean_out[s] = mean[s] + gained
+        for t in range(s + 1):
+            value = covariance[s, t]
+            for r in range(size):
+                value -= weighted[s, r] * weighted[t, r]
+            covariance_out[s, t] = value
+            covariance_out[t, s] = value
+    mean_out[PHI] = wrap(mean_out[PHI])
+    return repaired
+
+
+@kernel
+def moment_match(
+    start: Index, weight: Array, mean: Array, covariance: Array, mean_out: Array, covariance_out: Array
+) -> None:
+    """Replace Gaussian mixtures by single Gaussians of the same mean and covariance.
+
+    Headings are averaged as differences from the heading of the heaviest component, taken in (-pi, pi].
+
+    Args:
+        start: (K + 1,) where the components of each mixture start.
+        weight: (L,) weights, summing to one within each mixture.
+        mean: (L, 6) component means.
+        covariance: (L, 6, 6) component covariances.
+        mean_out: (K, 6) receives the means.
+        covariance_out: (K, 6, 6) receives the covariances.
+    """
+    for k in range(start.shape[0] - 1):
+        first, last = start[k], start[k + 1]
+        heaviest = first
+        for j in range(first, last):
+            if weight[j] > weight[heaviest]:
+                heaviest = j
+        deviation = np.empty((last - first, STATE))
+        shift = np.zeros(STATE)
+        for j in range(first, last):
+            for s in range(STATE):
+                deviation[j - first, s] = mean[j, s] - mean[heaviest, s]
+            deviation[j - first, PHI] = wrap(deviation[j - first, PHI])
+            for s in range(STATE):
+                shift[s] += weight[j] * deviation[j - first, s]
+        for s in range(STATE):
+            mean_out[k, s] = mean[heaviest, s] + shift[s]
+            for t in range(s + 1):
+                value = 0.0
+                for j in range(first, last):
+                    spread = (deviation[j - first, s] - shift[s]) * (deviation[j - first, t] - shift[t])
+                    value += weight[j] * (covariance[j, s, t] + spread)
+                covariance_out[k, s, t] = value
+                covariance_out[k, t, s] = value
+        mean_out[k, PHI] = wrap(mean_out[k, PHI])
