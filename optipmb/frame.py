@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -153,9 +153,9 @@ def make_frame(
     Raises:
         FrameError: wrong shapes or values; `path` names the field and the element.
     """
-    if not 0 <= stamp_ns < 2**63:
-        raise FrameError("stamp_ns", "nanoseconds in [0, 2^63)", str(stamp_ns))
-    which = np.asarray(label)
+    if not isinstance(stamp_ns, (int, np.integer)) or not 0 <= stamp_ns < 2**63:
+        raise FrameError("stamp_ns", "whole nanoseconds in [0, 2^63)", repr(stamp_ns))
+    which = _array("label", label, None)
     if which.ndim != 1 or (which.size and which.dtype.kind not in "iu"):
         raise FrameError("label", "(M,) integers", f"{which.shape} {which.dtype}")
     which = which.astype(np.int64)
@@ -207,16 +207,20 @@ def _velocities(velocity: ArrayLike | None, m: int) -> NDArray[np.float64]:
 
 def _floats(path: str, values: ArrayLike, shape: tuple[int, ...], bound: float) -> NDArray[np.float64]:
     """Return `values` as finite float64 of exactly `shape`; an empty list stands for any shape with no rows."""
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise FrameError(path, f"numbers of shape {shape}", repr(values)[:80]) from error
+    array: NDArray[np.float64] = _array(path, values, np.float64)
     if array.shape != shape:
         if array.size or 0 not in shape:
             raise FrameError(path, f"shape {shape}", str(array.shape))
         array = array.reshape(shape)
     _all(path, np.abs(array) <= bound, f"a finite number of size at most {bound:g}", array)
     return array
+
+
+def _array(path: str, values: ArrayLike, dtype: type[np.float64] | None) -> NDArray[Any]:
+    try:
+        return np.asarray(values, dtype=dtype)
+    except (TypeError, ValueError) as error:
+        raise FrameError(path, "an array of numbers", repr(values)[:80]) from error
 
 
 def _all(path: str, good: NDArray[np.bool_], expected: str, values: NDArray[np.generic]) -> None:

@@ -86,10 +86,21 @@ def non_maximum_suppression(boxes: Array, label: NDArray[np.int64], threshold: A
     Returns:
         (M,) whether the box is kept.
     """
-    keep = np.ones(boxes.shape[0], np.bool_)
-    for m in range(boxes.shape[0]):
-        for k in range(m):
-            if keep[k] and label[k] == label[m] and box_iou(boxes[k], boxes[m]) > threshold[label[m]]:
-                keep[m] = False
-                break
+    count = boxes.shape[0]
+    keep = np.ones(count, np.bool_)
+    # A sweep along x: boxes whose circles cannot touch are never compared.
+    by_x = np.argsort(boxes[:, 0])
+    place = np.empty(count, np.int64)
+    place[by_x] = np.arange(count)
+    radius = 0.5 * np.hypot(boxes[:, 2], boxes[:, 3])
+    largest = radius.max() if count else 0.0
+    for m in range(count):
+        reach = radius[m] + largest
+        for step in (-1, 1):
+            p = place[m] + step
+            while 0 <= p < count and keep[m] and abs(boxes[by_x[p], 0] - boxes[m, 0]) <= reach:
+                k = by_x[p]
+                if k < m and keep[k] and label[k] == label[m] and box_iou(boxes[k], boxes[m]) > threshold[label[m]]:
+                    keep[m] = False
+                p += step
     return keep

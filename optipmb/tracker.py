@@ -151,12 +151,13 @@ class Tracker:
         free[assigned[assigned != UNASSIGNED]] = False
         new, new_measurement, repaired_new = new_objects(measurements, free, hypotheses, poisson, now, table)
 
-        # Light-weight filter and pruning of the MB
-        alive = surviving_objects(old, now, table)
+        # Light-weight filter, then pruning of the MB: what was seen now was not missed
         ids = predicted.next_id + np.arange(len(new))
-        objects = old.take(alive).join(replace(new, id=ids))
-        measurement = np.concatenate((assigned[alive], new_measurement))
+        objects = old.join(replace(new, id=ids))
+        measurement = np.concatenate((assigned, new_measurement))
         objects = light_weight_filter(objects, measurement, measurements, now, table)
+        alive = surviving_objects(objects, now, table)
+        objects, measurement = objects.take(alive), measurement[alive]
 
         # PPP update and redundant PPP pruning
         undetected = self._update_poisson(poisson, p_d_poisson, hypotheses, measurements, n_predicted, now)

@@ -1,0 +1,296 @@
+"""The slow twin of the tracker: Algorithm 1 of the paper with one Python object per component and no shortcuts.
+
+Conventions as in `oracle_formulas`. Nothing here imports the tracker: `Oracle` reads parameters, modules and frames
+by attribute. Where the paper is silent the decisions are those of the tracker's docstrings.
+"""
+# ruff: noqa: N806 - Q and W are the names that the paper uses
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from oracle_formulas import (
+    Array,
+    Measurement,
+    birth,
+    count_inside,
+    iou,
+    log_likelihood,
+    moment_match,
+    periods,
+    predict,
+    ukf_update,
+)
+from scipy.optimize import linear_sum_assignment
+
+
+@dataclass
+class Bernoulli:
+    """A potential object that was detected at least once: (r, N(m, P)) and the non-motion states."""
+
+    mean: Array
+    covariance: Array
+    existence: float
+    label: int
+    auxiliary: Array
+    born_ns: int
+    seen_ns: int
+    score: float
+    id: int = 0
+    extracted: bool = False
+    detection: int = -1
+
+
+@dataclass
+class Poisson:
+    """A component mu N(m, P) of the intensity of undetected objects."""
+
+    mean: Array
+    covariance: Array
+    weight: float
+    label: int
+    auxiliary: Array
+    born_ns: int
+    newborn: bool = False
+
+
+@dataclass
+class NewObject:
+    """First-time detection hypothesis: cost w, and the Bernoulli (r, m, P)."""
+
+    w: float
+    r: float
+    mean: Array | None = None
+    covariance: Array | None = None
+    low: bool = False
+
+
+@dataclass
+class OracleTracks:
+    """The extracted tracks in columns of the same names as those of the tracker."""
+
+    columns: dict[str, Array] = field(default_factory=dict)
+
+
+class Oracle:
+    """Keeps the density as lists of components; `step` is one pass of Algorithm 1."""
+
+    def __init__(self, parameters: Any, modules: Any) -> None:
+        self.classes = list(parameters.classes.values())
+        self.nominal: float = parameters.nominal_period
+        self.modules = modules
+        self.bernoulli: list[Bernoulli] = []
+        self.poisson: list[Poisson] = []
+        self.stamp_ns = -1
+        self.next_id = 1
+        self.costs = np.zeros((0, 0))  # the cost matrix of the last step, for tests of the scenes
+
+    def step(self, frame: Any) -> OracleTracks:
+        """One frame: predict, preprocess, update, associate, prune, light-weight filter, extract."""
+        now = int(frame.stamp_ns)
+        if self.stamp_ns >= 0:
+            self._predict(now)
+        self.stamp_ns = now
+        measurements = self._preprocess(frame)
+        world = None
+        if frame.cloud is not None and self.modules.adp:
+            pose = frame.cloud.pose
+            world = np.asarray(frame.cloud.xyz, dtype=np.float64) @ pose.rotation.T + pose.translation
+        if not self.modules.habm:
+            for z in measurements:
+                mean, covariance = birth(z, self.classes[z.label])
+                weight = self.classes[z.label].adaptive_birth_rate
+                self.poisson.append(Poisson(mean, covariance, weight, z.label, z.auxiliary.copy(), now, newborn=True))
+        p_d = [self._detection_probability(b, world) for b in self.bernoulli]
+        p_du = [self._detection_probability(u, world) for u in self.poisson]
+        gates = [[j for j, u in enumerate(self.poisson) if self._in_gate(u, z)] for z in measurements]  # J^m
+        p_a = [self._association_probability(z) for z in measurements]
+        new = [self._first_detection(z, gates[m], p_du, p_a[m]) for m, z in enumerate(measurements)]
+        chosen = self._associate(measurements, p_d, new)
+        newborn = self._newborn_poisson(measurements, new, p_a, now)
+        self._update_bernoulli(measurements, chosen, p_d, now)
+        self._append_new(measurements, new, set(chosen.values()), now)
+        self._update_poisson(p_du, {j for gate in gates for j in gate}, newborn, now)
+        return self._extract(now)
+
+    def _predict(self, now: int) -> None:
+        """Eqs. (PPP_prediction), (MB_prediction); first goes what the silence of the stream put past its limit."""
+        dt = (now - self.stamp_ns) * 1e-9
+        self.bernoulli = [
+            b for b in self.bernoulli if periods(b.seen_ns, now, self.nominal) - 1 <= self.classes[b.label].max_misses
+        ]
+        self.poisson = [
+            u for u in self.poisson if periods(u.born_ns, now, self.nominal) - 1 <= self.classes[u.label].poisson_steps
+        ]
+        components: list[Bernoulli | Poisson] = [*self.bernoulli, *self.poisson]
+        for component in components:
+            c = self.classes[component.label]
+            q = c.process_noise
+            Q = np.diag(np.square([q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration]))
+            component.mean, component.covariance = predict(component.mean, component.covariance, Q, dt)
+            survival = c.survival ** (dt / self.nominal)
+            if isinstance(component, Bernoulli):
+                component.existence *= survival
+            else:
+                component.weight *= survival
+
+    def _preprocess(self, frame: Any) -> list[Measurement]:
+        """Score filter (eta_sf) and non-maximum suppression per class (eta_iou), in the canonical order."""
+        rows = []
+        for i in range(len(frame.score)):
+            x, y, z = (float(value) for value in frame.center[i])
+            length, width, height = (float(value) for value in frame.size[i])
+            key = (-float(frame.score[i]), x, y, z, length, width, height, float(frame.yaw[i]), int(frame.source[i]))
+            rows.append((key, i))
+        kept: list[Measurement] = []
+        boxes: list[Array] = []
+        for (minus_score, x, y, z, length, width, height, yaw, source), i in sorted(rows):
+            label = int(frame.label[i])
+            box = np.array([x, y, length, width, yaw])
+            if -minus_score < self.classes[label].score_filter:
+                continue
+            rivals = [other for other, known in zip(boxes, kept, strict=True) if known.label == label]
+            if any(iou(box, other) > self.classes[label].nms_iou for other in rivals):
+                continue
+            velocity = None if np.isnan(frame.velocity[i]).any() else np.array(frame.velocity[i])
+            auxiliary = np.array([length, width, height, z])
+            kept.append(Measurement(np.array([x, y]), velocity, yaw, auxiliary, label, -minus_score, source))
+            boxes.append(box)
+        return kept
+
+    def _detection_probability(self, component: Bernoulli | Poisson, world: Array | None) -> float:
+        """ADP: p_d = p_d0 min[1, (1 - s_d) PTS / PTS_0 + s_d]."""
+        c = self.classes[component.label]
+        if world is None:
+            return float(c.detection)
+        points = count_inside(world, component.mean[:2], component.mean[3], component.auxiliary)
+        scale = (1 - c.detection_floor) * points / c.expected_points + c.detection_floor
+        return float(c.detection * min(1.0, scale))
+
+    def _in_gate(self, component: Bernoulli | Poisson, z: Measurement) -> bool:
+        """Class gate and distance gate."""
+        distance = math.hypot(*(component.mean[:2] - z.xy))
+        return component.label == z.label and distance <= self.classes[z.label].gate
+
+    def _log_likelihood(self, component: Bernoulli | Poisson, z: Measurement) -> float:
+        position = self.classes[z.label].measurement_noise.position
+        return log_likelihood(z.xy, component.mean, component.covariance, position)
+
+    def _association_probability(self, z: Measurement) -> float:
+        """Eq. (Association Probability)."""
+        return min(1.0, sum(math.exp(self._log_likelihood(b, z)) for b in self.bernoulli if self._in_gate(b, z)))
+
+    def _first_detection(self, z: Measurement, gate: list[int], p_d: list[float], p_a: float) -> NewObject:
+        """Eqs. (First-Time Detection Hypothesis Update 1, 2), (Clutter Hypothesis), (Newborn Hypothesis)."""
+        c = self.classes[z.label]
+        clutter = c.clutter_rate / c.area  # lambda_c
+        if gate:
+            members = [self.poisson[j] for j in gate]
+            log_e = np.array(
+                [math.log(u.weight * p_d[j]) + self._log_likelihood(u, z) for j, u in zip(gate, members, strict=True)]
+            )
+            log_sum = log_e.max() + math.log(np.sum(np.exp(log_e - log_e.max())))
+            log_total = np.logaddexp(log_sum, math.log(clutter))
+            weights = [float(w) for w in np.exp(log_e - log_sum)]
+            parts = [ukf_update(u.mean, u.covariance, z, c) for u in members]
+            return NewObject(-log_total, math.exp(log_sum - log_total), *moment_match(weights, parts))
+        if z.score < c.birth_score:
+            return NewObject(-math.log(clutter), 0.0, low=True)
+        return NewObject(-math.log(c.undetected_birth_rate * (1 - p_a) / c.area + clutter), 1.0, *birth(z, c))
+
+    def _associate(self, zs: list[Measurement], p_d: list[float], new: list[NewObject]) -> dict[int, int]:
+        """The cost matrix of Fig. 3, eq. (Detection Hypothesis Update), inf where impossible: object -> measurement."""
+        n = len(self.bernoulli)
+        W = np.full((len(zs), n + len(zs)), np.inf)
+        for m, z in enumerate(zs):
+            W[m, n + m] = new[m].w
+            for i, b in enumerate(self.bernoulli):
+                if self._in_gate(b, z):
+                    r = b.existence
+                    w = -math.log(r * p_d[i] / (1 - r + r * (1 - p_d[i]))) - self._log_likelihood(b, z)
+                    W[m, i] = w if w < new[m].w else np.inf  # used only when strictly cheaper
+        self.costs = W
+        rows, columns = linear_sum_assignment(W)
+        return {int(i): int(m) for m, i in zip(rows, columns, strict=True) if i < n}
+
+    def _update_bernoulli(self, zs: list[Measurement], chosen: dict[int, int], p_d: list[float], now: int) -> None:
+        """Eqs. (UKF Update), (Misdetect Hypothesis Update) for the hypotheses chosen; light-weight filter; pruning."""
+        survivors = []
+        for i, b in enumerate(self.bernoulli):
+            c = self.classes[b.label]
+            if i in chosen:
+                z = zs[chosen[i]]
+                b.mean, b.covariance = ukf_update(b.mean, b.covariance, z, c)
+                b.existence = 1.0
+                b.auxiliary = (1 - z.score) * b.auxiliary + z.score * z.auxiliary
+                length = 1 + (now - b.born_ns) * 1e-9 / self.nominal
+                b.score = (1 - math.exp(-length)) * z.score  # eq. (Confidence Score)
+                b.seen_ns, b.detection = now, z.source
+            else:
+                r = b.existence
+                b.existence = r * (1 - p_d[i]) / (1 - r + r * (1 - p_d[i]))
+                b.score, b.detection = 0.0, -1
+            if b.existence >= c.min_existence and periods(b.seen_ns, now, self.nominal) <= c.max_misses:
+                survivors.append(b)
+        self.bernoulli = survivors
+
+    def _append_new(self, zs: list[Measurement], new: list[NewObject], used: set[int], now: int) -> None:
+        """First-time detections that the best global hypothesis contains become Bernoullis with new ids."""
+        for m, (z, h) in enumerate(zip(zs, new, strict=True)):
+            if m in used or h.mean is None or h.covariance is None or h.r < self.classes[z.label].min_existence:
+                continue
+            score = (1 - math.exp(-1.0)) * z.score
+            b = Bernoulli(h.mean, h.covariance, h.r, z.label, z.auxiliary.copy(), now, now, score, self.next_id)
+            b.detection = z.source
+            self.bernoulli.append(b)
+            self.next_id += 1
+
+    def _newborn_poisson(
+        self, zs: list[Measurement], new: list[NewObject], p_a: list[float], now: int
+    ) -> list[Poisson]:
+        """Eq. (HABM): one component per low-scored measurement."""
+        newborn = []
+        for z, h, probability in zip(zs, new, p_a, strict=True):
+            weight = self.classes[z.label].adaptive_birth_rate * (1 - probability)
+            if h.low and weight > 0:
+                newborn.append(Poisson(*birth(z, self.classes[z.label]), weight, z.label, z.auxiliary.copy(), now))
+        return newborn
+
+    def _update_poisson(self, p_d: list[float], marked: set[int], newborn: list[Poisson], now: int) -> None:
+        """Eq. (PPP Update) with mu+ (1 - p_d); redundant PPP pruning, or with RPP off all of it."""
+        survivors = []
+        for j, u in enumerate(self.poisson):
+            u.weight *= 1 - p_d[j]
+            expired = periods(u.born_ns, now, self.nominal) > self.classes[u.label].poisson_steps
+            if (j not in marked or u.newborn) and not expired:
+                u.newborn = False
+                survivors.append(u)
+        self.poisson = [*survivors, *newborn] if self.modules.rpp else []
+
+    def _extract(self, now: int) -> OracleTracks:
+        """Optimized track extraction with eta_ext1, eta_ext2, eta_cnt."""
+        rows: list[dict[str, Any]] = []
+        for b in self.bernoulli:
+            c = self.classes[b.label]
+            if b.extracted and self.modules.ote:
+                count = periods(b.seen_ns, now, self.nominal)
+                taken = b.existence >= c.extract_known and count < c.extract_misses
+            else:
+                taken = b.existence >= c.extract_new
+            b.extracted = b.extracted or taken
+            if not taken:
+                continue
+            x, y, v, phi, omega, a = b.mean
+            rows.append(
+                {
+                    "id": b.id, "label": b.label, "center": [x, y, b.auxiliary[3]], "size": b.auxiliary[:3], "yaw": phi,
+                    "velocity": [v * math.cos(phi), v * math.sin(phi)], "yaw_rate": omega, "acceleration": a,
+                    "existence": b.existence, "score": b.score, "covariance": b.covariance,
+                    "age": (now - b.born_ns) * 1e-9, "time_since_detection": (now - b.seen_ns) * 1e-9,
+                    "detection": b.detection,
+                }
+            )  # fmt: skip
+        return OracleTracks({name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())})

@@ -1,0 +1,193 @@
+"""Textbook formulas, written out one by one: what the tracker's kernels are compared with.
+
+Conventions are the tracker's: motion state [x, y, v, phi, omega, a] in the world frame, metres, seconds, radians;
+auxiliary state [length, width, height, z]; stamps in nanoseconds. The paper's names of quantities are kept, so that a
+formula can be proof-read against it. Nothing here imports the tracker.
+"""
+# ruff: noqa: N803, N806 - P, S, K, R, C and the like are the names that the formulas of the paper use
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+ORDER = [2, 3, 4, 5, 0, 1]  # the order of the state for the matrix square root: position last
+
+
+@dataclass
+class Measurement:
+    """One detection that passed the preprocessing: z = [z_M, z_A, z_c, z_s]."""
+
+    xy: Array
+    velocity: Array | None
+    yaw: float
+    auxiliary: Array
+    label: int
+    score: float
+    source: int
+
+
+def wrap(angle: float) -> float:
+    """The same angle in (-pi, pi]."""
+    return math.pi - (math.pi - angle) % (2 * math.pi)
+
+
+def fold(angle: float) -> float:
+    """The same angle modulo pi in (-pi/2, pi/2]."""
+    return math.pi / 2 - (math.pi / 2 - angle) % math.pi
+
+
+def periods(a_ns: int, b_ns: int, nominal: float) -> int:
+    """Whole nominal periods from stamp a to stamp b."""
+    return math.floor((b_ns - a_ns) * 1e-9 / nominal + 0.5)
+
+
+@lru_cache(maxsize=64)
+def _nodes(count: int) -> tuple[Array, Array]:
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return nodes, weights
+
+
+def ctra(x: Array, dt: float) -> Array:
+    """Gamma_CTRA: the integral of constant omega and a over dt, by Gauss-Legendre quadrature."""
+    px, py, v, phi, omega, a = x
+    nodes, weights = _nodes(24 + math.ceil(abs(omega) * dt))
+    t = 0.5 * dt * (nodes + 1.0)
+    speed = v + a * t
+    px += 0.5 * dt * np.sum(weights * speed * np.cos(phi + omega * t))
+    py += 0.5 * dt * np.sum(weights * speed * np.sin(phi + omega * t))
+    return np.array([px, py, v + a * dt, phi + omega * dt, omega, a])
+
+
+def sigma_points(m: Array, P: Array) -> list[Array]:
+    """The symmetric set m +- sqrt(n) L_i, equal weights; L: Cholesky factor of the state with position last."""
+    n = len(m)
+    L = np.zeros((n, n))
+    L[ORDER] = np.linalg.cholesky(P[np.ix_(ORDER, ORDER)])
+    return [m + sign * math.sqrt(n) * L[:, i] for sign in (1.0, -1.0) for i in range(n)]
+
+
+def predict(m: Array, P: Array, Q: Array, dt: float) -> tuple[Array, Array]:
+    """Eq. (Motion Predict): (m+, P+) by the unscented transform through the CTRA model, Q = diag(q)^2 dt."""
+    if dt == 0.0:
+        return m.copy(), P.copy()
+    points = [ctra(x, dt) for x in sigma_points(m, P)]
+    mean = np.mean(points, axis=0)
+    covariance = np.mean([np.outer(x - mean, x - mean) for x in points], axis=0) + Q * dt
+    mean[3] = wrap(mean[3])
+    return mean, 0.5 * (covariance + covariance.T)
+
+
+def measure(x: Array, *, with_velocity: bool) -> Array:
+    """Eq. (Single Object Measurement Model): H(x) = [x, y, v cos phi, v sin phi, phi]."""
+    px, py, v, phi = x[:4]
+    return np.array([px, py, v * np.cos(phi), v * np.sin(phi), phi] if with_velocity else [px, py, phi])
+
+
+def ukf_update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array, Array]:
+    """Eq. (UKF Update) with the parameters `c` of the class."""
+    known = z.velocity is not None
+    points = sigma_points(m, P)
+    images = [measure(x, with_velocity=known) for x in points]
+    z_hat = np.mean(images, axis=0)
+    noise = c.measurement_noise
+    deviations = [noise.position] * 2 + ([noise.velocity] * 2 if known else []) + [noise.heading]
+    S = np.mean([np.outer(y - z_hat, y - z_hat) for y in images], axis=0) + np.diag(np.square(deviations))
+    C = np.mean([np.outer(x - m, y - z_hat) for x, y in zip(points, images, strict=True)], axis=0)
+    nu = np.concatenate([z.xy, z.velocity if z.velocity is not None else [], [z.yaw]]) - z_hat
+    nu[-1] = wrap(nu[-1]) if c.heading_sign_reliable else fold(nu[-1])
+    K = C @ np.linalg.inv(S)
+    mean = m + K @ nu
+    mean[3] = wrap(mean[3])
+    covariance = P - K @ S @ K.T
+    return mean, 0.5 * (covariance + covariance.T)
+
+
+def log_likelihood(xy: Array, m: Array, P: Array, position: float) -> float:
+    """Logarithm of N(z_xy; z_hat, S) with eq. (Predicted Measurement): z_hat = H_xy m+, S = H_xy P+ H_xy' + R_xy."""
+    H = np.eye(2, 6)
+    S = H @ P @ H.T + position**2 * np.eye(2)
+    d = xy - H @ m
+    return float(-0.5 * d @ np.linalg.inv(S) @ d - 0.5 * math.log(np.linalg.det(2 * math.pi * S)))
+
+
+def moment_match(weights: list[float], parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Mean and covariance of a Gaussian mixture; headings relative to the heaviest component, the first one on ties."""
+    reference = parts[weights.index(max(weights))][0]
+    unrolled = []
+    for mean, _ in parts:
+        x = mean.copy()
+        x[3] = reference[3] + wrap(mean[3] - reference[3])
+        unrolled.append(x)
+    m = np.sum([w * x for w, x in zip(weights, unrolled, strict=True)], axis=0)
+    spread = [P + np.outer(x - m, x - m) for x, (_, P) in zip(unrolled, parts, strict=True)]
+    P = np.sum([w * part for w, part in zip(weights, spread, strict=True)], axis=0)
+    m[3] = wrap(m[3])
+    return m, 0.5 * (P + P.T)
+
+
+def corners(x: float, y: float, length: float, width: float, yaw: float) -> list[Array]:
+    """Corners of a rectangle on the ground plane, counter-clockwise."""
+    forward = np.array([math.cos(yaw), math.sin(yaw)]) * length / 2
+    left = np.array([-math.sin(yaw), math.cos(yaw)]) * width / 2
+    return [np.array([x, y]) + i * forward + j * left for i, j in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+
+
+def _area(polygon: list[Array]) -> float:
+    if not polygon:
+        return 0.0
+    origin = polygon[0]
+    pairs = zip(polygon, polygon[1:] + polygon[:1], strict=True)
+    return 0.5 * sum(float((p - origin)[0] * (q - origin)[1] - (p - origin)[1] * (q - origin)[0]) for p, q in pairs)
+
+
+def iou(box_a: Array, box_b: Array) -> float:
+    """Intersection over union of two boxes [x, y, length, width, yaw], by Sutherland-Hodgman clipping."""
+    polygon = corners(*box_a)
+    clip = corners(*box_b)
+    for a, b in zip(clip, clip[1:] + clip[:1], strict=True):
+        edge, kept = b - a, []
+        side = [float(edge[0] * (p - a)[1] - edge[1] * (p - a)[0]) for p in polygon]
+        for i, p in enumerate(polygon):
+            j = (i + 1) % len(polygon)
+            if side[i] >= 0:
+                kept.append(p)
+            if side[i] * side[j] < 0:
+                kept.append(p + (polygon[j] - p) * side[i] / (side[i] - side[j]))
+        polygon = kept
+    common = _area(polygon)
+    return float(common / (box_a[2] * box_a[3] + box_b[2] * box_b[3] - common))
+
+
+def count_inside(world: Array, xy: Array, yaw: float, auxiliary: Array) -> int:
+    """Points in a box, faces included; `world` holds world points in rows."""
+    length, width, height, z = auxiliary
+    count = 0
+    offsets = world - np.array([xy[0], xy[1], z])
+    close = np.all(np.abs(offsets) <= length + width + height, axis=1)  # only to be spared the far ones
+    for dx, dy, dz in offsets[close]:
+        along = math.cos(yaw) * dx + math.sin(yaw) * dy
+        across = -math.sin(yaw) * dx + math.cos(yaw) * dy
+        count += abs(along) <= length / 2 and abs(across) <= width / 2 and abs(dz) <= height / 2
+    return count
+
+
+def birth(z: Measurement, c: Any) -> tuple[Array, Array]:
+    """The newborn Gaussian N(m0, P0) of a measurement."""
+    phi, v, spread = z.yaw, 0.0, c.birth.unknown_speed
+    if z.velocity is not None:
+        spread = c.birth.speed
+        v = math.hypot(*z.velocity)
+        if v > 0 and v >= c.birth_heading_speed:
+            phi = math.atan2(z.velocity[1], z.velocity[0])
+        else:
+            v = z.velocity[0] * math.cos(z.yaw) + z.velocity[1] * math.sin(z.yaw)
+    b = c.birth
+    deviations = [b.position, b.position, spread, b.heading, b.turn_rate, b.acceleration]
+    return np.array([*z.xy, v, wrap(phi), 0.0, 0.0]), np.diag(np.square(deviations))

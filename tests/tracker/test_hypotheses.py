@@ -1,0 +1,203 @@
+"""Gating, costs and assignment against naive loops and the full matrix of the paper's Fig. 3."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise, permutations
+
+import numpy as np
+import oracle_formulas as textbook
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from optipmb.association import UNASSIGNED, associate, clusters
+from optipmb.hypotheses import (
+    CLUTTER,
+    FROM_POISSON,
+    NEWBORN,
+    Hypotheses,
+    Pairs,
+    detection_costs,
+    first_detections,
+    gate,
+)
+
+Array = NDArray[np.float64]
+NOTHING = np.zeros(0)
+NO_INDEX = np.zeros(0, np.int64)
+
+
+def random_objects(rng: np.random.Generator, count: int) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Means, covariances and classes of objects in a crowd."""
+    mean = rng.normal(0, 4, (count, 6))
+    root = rng.normal(0, 0.5, (count, 6, 6))
+    return mean, root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6), rng.integers(0, 2, count)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 60])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_gate_holds_every_pair_of_a_class_within_the_distance(seed: int, count: int) -> None:
+    """The sweep finds the pairs of the double loop, in its order, with their textbook likelihoods."""
+    rng = np.random.default_rng(seed)
+    mean, covariance, label = random_objects(rng, count)
+    position, measured = rng.normal(0, 4, (40, 2)), rng.integers(0, 2, 40)
+    position[:3] = position[0]  # several at one place
+    distance, noise = np.array([1.5, 5.0]), np.array([0.2, 0.7])
+    by_x = np.argsort(position[:, 0], kind="stable")
+    found = gate(mean, covariance, label, position, measured, by_x, distance, noise)
+    wanted = [
+        (n, m)
+        for n in range(count)
+        for m in range(40)
+        if label[n] == measured[m] and math.dist(mean[n, :2], position[m]) <= distance[label[n]]
+    ]
+    assert list(zip(found[0].tolist(), found[1].tolist(), strict=True)) == wanted
+    likelihood = [textbook.log_likelihood(position[m], mean[n], covariance[n], noise[label[n]]) for n, m in wanted]
+    np.testing.assert_allclose(found[2], likelihood, rtol=1e-10, atol=1e-10)
+
+
+def test_the_edge_of_the_gate_is_inside() -> None:
+    """A measurement at exactly the gating distance passes, on all sides; one float farther does not."""
+    position = np.array([[3.0, 0], [-3, 0], [0, 3], [0, -3], [np.nextafter(3, 4), 0], [-np.nextafter(3, 4), 0]])
+    arguments = np.zeros((1, 6)), np.eye(6)[None], np.zeros(1, np.int64), position, np.zeros(6, np.int64)
+    by_x = np.argsort(position[:, 0], kind="stable")
+    _, measurement, _ = gate(*arguments, by_x, np.array([3.0]), np.array([1.0]))
+    np.testing.assert_array_equal(measurement, [0, 1, 2, 3])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_costs_and_association_probabilities_are_the_formulas(seed: int) -> None:
+    """W of eq. Detection Hypothesis Update and p_a of eq. Association Probability, p_a at most one."""
+    rng = np.random.default_rng(seed)
+    row, measurement = np.repeat(np.arange(8), 3), rng.integers(0, 5, 24)
+    likelihood = rng.normal(-2, 1.5, 24)
+    r, p_d = rng.uniform(1e-6, 1, 8), rng.uniform(0.01, 0.99, 8)
+    r[0] = 1.0
+    cost, association = detection_costs(row, measurement, likelihood, r, p_d, 6)
+    for k, n in enumerate(row):
+        ratio = r[n] * p_d[n] * math.exp(likelihood[k]) / (1 - r[n] + r[n] * (1 - p_d[n]))
+        assert cost[k] == pytest.approx(-math.log(ratio), rel=1e-12)
+    wanted = [min(1.0, sum(math.exp(likelihood[k]) for k in range(24) if measurement[k] == m)) for m in range(6)]
+    np.testing.assert_allclose(association, wanted, rtol=1e-12)
+    assert association[5] == 0
+
+
+def test_costs_stay_finite_where_likelihoods_vanish() -> None:
+    """Far in the tail, where exp would be zero, the cost still orders the hypotheses."""
+    arguments = np.array([0, 0]), np.array([0, 1]), np.array([-2000.0, -3000.0]), np.array([0.5]), np.array([0.9])
+    cost, association = detection_costs(*arguments, 2)
+    assert cost[0] < cost[1] < math.inf
+    np.testing.assert_array_equal(association, 0)
+
+
+def test_each_kind_of_first_detection_has_its_formula() -> None:
+    """Poisson components in the gate, a low score without, a high score without."""
+    log_e = np.log([0.2, 0.3, 0.05])
+    clutter, birth = np.full(4, 0.01), np.full(4, 0.002)
+    kind, cost, existence = first_detections(
+        np.array([0, 0, 3]),
+        log_e,
+        np.array([0.9, 0.1, 0.5, 0.1]),
+        np.array([0, 0, 0.25, 1.0]),
+        clutter,
+        birth,
+        np.full(4, 0.5),
+    )
+    np.testing.assert_array_equal(kind, [FROM_POISSON, CLUTTER, NEWBORN, FROM_POISSON])
+    wanted = [-math.log(0.5 + 0.01), -math.log(0.01), -math.log(0.002 * 0.75 + 0.01), -math.log(0.05 + 0.01)]
+    np.testing.assert_allclose(cost, wanted, rtol=1e-12)
+    np.testing.assert_allclose(existence, [0.5 / 0.51, 0, 1, 0.05 / 0.06], rtol=1e-12)
+
+
+@given(st.lists(st.floats(-4000, 600), min_size=1, max_size=6))
+@settings(deadline=None)  # the first call compiles
+def test_first_detections_hold_over_all_magnitudes(log_e: list[float]) -> None:
+    """E is summed as logarithms: no overflow, no underflow, r in [0, 1]."""
+    arguments = np.zeros(len(log_e), np.int64), np.array(log_e), np.array([0.5]), np.zeros(1)
+    _, cost, existence = first_detections(*arguments, np.array([1e-3]), np.array([1e-4]), np.array([0.5]))
+    total = np.logaddexp.reduce([*log_e, math.log(1e-3)])
+    assert cost[0] == pytest.approx(-total, rel=1e-10, abs=1e-10)
+    assert existence[0] == pytest.approx(math.exp(np.logaddexp.reduce(log_e) - total), rel=1e-9, abs=1e-300)
+
+
+def hypotheses(cost: Array, first: Array) -> Hypotheses:
+    """The hypotheses of a cost matrix (N, M), infinite where the gate is closed."""
+    row, measurement = np.nonzero(np.isfinite(cost))
+    pairs = Pairs(row, measurement, np.zeros(row.size))
+    nothing = Pairs(NO_INDEX, NO_INDEX, NOTHING)
+    kind = np.full(first.size, CLUTTER)
+    return Hypotheses(pairs, cost[row, measurement], nothing, NOTHING, kind, first, np.zeros(first.size), NOTHING)
+
+
+def total(cost: Array, first: Array, assigned: NDArray[np.int64]) -> float:
+    """Cost of a global hypothesis."""
+    objects = np.flatnonzero(assigned != UNASSIGNED)
+    free = np.setdiff1d(np.arange(first.size), assigned[objects])
+    return float(cost[objects, assigned[objects]].sum() + first[free].sum())
+
+
+def sparse_costs(rng: np.random.Generator, objects: int, measurements: int, density: float) -> tuple[Array, Array]:
+    """Random costs with closed gates."""
+    cost = rng.normal(0, 2, (objects, measurements))
+    cost[rng.random(cost.shape) > density] = np.inf
+    return cost, rng.normal(1, 1, measurements)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_no_global_hypothesis_is_cheaper(seed: int) -> None:
+    """Brute force over all assignments of small cases finds none better, and each measurement is used once."""
+    rng = np.random.default_rng(seed)
+    objects, measurements = (int(n) for n in rng.integers(1, 5, 2))
+    cost, first = sparse_costs(rng, objects, measurements, 0.7)
+    assigned = associate(hypotheses(cost, first), objects)
+    used = assigned[assigned != UNASSIGNED]
+    assert len(set(used.tolist())) == len(used)
+    best = math.inf
+    for choice in permutations([*range(measurements), *[UNASSIGNED] * objects], objects):
+        if all(m == UNASSIGNED or np.isfinite(cost[n, m]) for n, m in enumerate(choice)):
+            best = min(best, total(cost, first, np.array(choice)))
+    assert total(cost, first, assigned) == pytest.approx(best, rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize("density", [0.02, 0.1, 0.5, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_clusters_give_the_optimum_of_the_full_matrix(seed: int, density: float) -> None:
+    """The same assignment as the Hungarian algorithm on [costs | diagonal of first-time costs], infinite elsewhere."""
+    rng = np.random.default_rng(seed)
+    cost, first = sparse_costs(rng, 50, 60, density)
+    matrix = np.full((60, 110), np.inf)
+    matrix[:, :50] = cost.T
+    matrix[np.arange(60), 50 + np.arange(60)] = first
+    rows, columns = linear_sum_assignment(matrix)
+    wanted = np.full(50, UNASSIGNED)
+    wanted[columns[columns < 50]] = rows[columns < 50]
+    np.testing.assert_array_equal(associate(hypotheses(cost, first), 50), wanted)
+
+
+def test_a_pair_that_is_not_cheaper_is_not_used() -> None:
+    """At equal cost the measurement keeps its own first-time detection."""
+    assigned = associate(hypotheses(np.array([[1.0]]), np.array([1.0])), 1)
+    np.testing.assert_array_equal(assigned, [UNASSIGNED])
+    assigned = associate(hypotheses(np.array([[np.nextafter(1.0, 0)]]), np.array([1.0])), 1)
+    np.testing.assert_array_equal(assigned, [0])
+
+
+@given(
+    pairs=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=25, unique=True).map(sorted)
+)
+@settings(deadline=None)  # the first call compiles
+def test_clusters_are_the_connected_components(pairs: list[tuple[int, int]]) -> None:
+    """Two pairs share a cluster exactly when a chain of common objects and measurements links them."""
+    rows, columns = (np.array(side) for side in zip(*pairs, strict=True))
+    order, start = clusters(rows, columns, 10, 10)
+    assert sorted(order.tolist()) == list(range(len(pairs)))
+    found = {frozenset(order[a:b].tolist()) for a, b in pairwise(start)}
+    linked = (rows[:, None] == rows) | (columns[:, None] == columns)
+    for _ in pairs:
+        linked = linked @ linked
+    assert found == {frozenset(np.flatnonzero(row).tolist()) for row in linked}
+    for a, b in pairwise(start):
+        assert sorted(order[a:b].tolist()) == order[a:b].tolist()

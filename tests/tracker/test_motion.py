@@ -1,0 +1,169 @@
+"""The motion kernels against numerical integration and the textbook unscented transform."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import oracle_formulas as textbook
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.integrate import quad, solve_ivp
+
+from optipmb.motion import ORDER, TINY_PIVOT, ctra_displacement, predict_states, square_root, wrap
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Array = NDArray[np.float64]
+COMPILING = settings(deadline=None)  # the first call compiles
+SPEEDS = st.floats(-40, 40)
+TURNS = st.one_of(st.floats(-3, 3), st.sampled_from([0.0, 1e-300, 1e-12, -1e-9, 1e-6, 1e-3, -0.0]))
+
+
+def random_state(rng: np.random.Generator) -> tuple[Array, Array]:
+    """A motion state and a full covariance of plausible size, far from the origin of the world."""
+    mean = rng.normal(0, [100, 100, 8, 1.5, 0.4, 1.0])
+    root = rng.normal(size=(6, 6)) * np.array([[0.5], [0.5], [2.0], [0.3], [0.3], [0.8]])
+    return mean, root @ root.T + 1e-6 * np.eye(6)
+
+
+@COMPILING
+@given(st.floats(-50, 50))
+@example(math.pi)
+@example(-math.pi)
+@example(3 * math.pi)
+@example(math.nextafter(-math.pi, 0))
+@example(math.nextafter(math.pi, 9))
+@example(-1e-17)
+def test_a_wrapped_angle_is_the_same_direction_in_the_half_open_interval(angle: float) -> None:
+    """The result lies in (-pi, pi] and differs from the angle by whole turns."""
+    wrapped = wrap(angle)
+    assert -math.pi < wrapped <= math.pi
+    turns = (angle - wrapped) / (2 * math.pi)
+    assert abs(turns - round(turns)) < 1e-14
+    if -math.pi < angle <= math.pi:
+        assert wrapped == angle
+
+
+@COMPILING
+@given(v=SPEEDS, omega=TURNS, a=st.floats(-10, 10), dt=st.floats(1e-6, 10))
+@example(v=10.0, omega=0.1, a=1.0, dt=1.0)  # where the series ends
+@example(v=10.0, omega=math.nextafter(0.1, 0), a=1.0, dt=1.0)
+@example(v=0.0, omega=-0.0999, a=10.0, dt=1.0)
+def test_the_displacement_is_the_integral_of_the_velocity(v: float, omega: float, a: float, dt: float) -> None:
+    """Along and across agree with quadrature, with the series for small turns as well as with the closed form."""
+    along, across = ctra_displacement(v, omega, a, dt)
+    for found, turn in ((along, math.cos), (across, math.sin)):
+
+        def speed(t: float, turn: Callable[[float], float] = turn) -> float:
+            return (v + a * t) * turn(omega * t)
+
+        wanted = quad(speed, 0, dt, epsabs=1e-12, epsrel=1e-12, limit=200, full_output=1)[0]
+        assert found == pytest.approx(wanted, rel=1e-10, abs=1e-11 * (1 + dt * (abs(v) + abs(a) * dt)))
+
+
+@COMPILING
+@given(v=SPEEDS, a=st.floats(-10, 10), dt=st.floats(1e-3, 10))
+def test_no_turn_is_the_straight_line(v: float, a: float, dt: float) -> None:
+    """For omega -> 0 the way is v t + a t^2 / 2, without a jump."""
+    for omega in (0.0, 1e-14, -1e-14):
+        along, across = ctra_displacement(v, omega, a, dt)
+        assert along == pytest.approx(v * dt + a * dt * dt / 2, rel=1e-12, abs=1e-12)
+        assert abs(across) < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_quadrature_of_the_oracle_solves_the_differential_equation(seed: int) -> None:
+    """The oracle's own transition is checked too: it solves x' = v cos phi, y' = v sin phi, v' = a, phi' = omega."""
+    rng = np.random.default_rng(seed)
+    x, dt = random_state(rng)[0], rng.uniform(0.05, 5)
+
+    def derivative(_: float, s: Array) -> list[float]:
+        return [s[2] * math.cos(s[3]), s[2] * math.sin(s[3]), s[5], s[4], 0.0, 0.0]
+
+    solution = solve_ivp(derivative, (0, dt), x, method="DOP853", rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(textbook.ctra(x, dt), solution.y[:, -1], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_square_root_squared_is_the_covariance(seed: int) -> None:
+    """L L' is the covariance in the order with position last, L is lower triangular, and nothing is repaired."""
+    _, covariance = random_state(np.random.default_rng(seed))
+    root = np.full((6, 6), np.nan)
+    assert square_root(covariance, root) == 0
+    np.testing.assert_array_equal(np.triu(root, 1), 0)
+    np.testing.assert_allclose(root @ root.T, covariance[np.ix_(ORDER, ORDER)], rtol=1e-12, atol=1e-12)
+
+
+def test_a_covariance_without_full_rank_is_repaired_and_counted() -> None:
+    """A pivot that rounding made zero or negative is lifted, so that the filter goes on; the repair is reported."""
+    covariance = np.diag([1.0, 1.0, 1.0, 0.0, -1e-18, 1.0])
+    root = np.full((6, 6), np.nan)
+    assert square_root(covariance, root) == 2
+    assert np.isfinite(root).all()
+    np.testing.assert_allclose(root @ root.T, np.diag([1.0, TINY_PIVOT, TINY_PIVOT, 1.0, 1.0, 1.0]), atol=1e-15)
+
+
+def predicted(mean: Array, covariance: Array, dt: float, noise: Array) -> tuple[Array, Array]:
+    """One state through the kernel; its class is the second of two."""
+    table = np.stack([np.full(6, np.nan), noise])
+    out, spread = np.full((1, 6), np.nan), np.full((1, 6, 6), np.nan)
+    assert predict_states(mean[None], covariance[None], np.array([1]), dt, table, out, spread) == 0
+    return out[0], spread[0]
+
+
+@pytest.mark.parametrize("dt", [1e-3, 0.1, 0.5, 2.0])
+@pytest.mark.parametrize("seed", range(8))
+def test_the_prediction_is_the_textbook_unscented_transform(seed: int, dt: float) -> None:
+    """Mean and covariance equal the naive sums over twelve transformed points, plus Q dt."""
+    rng = np.random.default_rng(seed)
+    mean, covariance = random_state(rng)
+    if seed == 0:
+        mean[4] = 0.0
+        covariance *= 1e-6
+    noise = rng.uniform(0.01, 1, 6)
+    found = predicted(mean, covariance, dt, noise)
+    wanted = textbook.predict(mean, covariance, np.diag(noise**2), dt)
+    np.testing.assert_allclose(np.exp(1j * found[0][3]), np.exp(1j * wanted[0][3]), atol=1e-10)
+    np.testing.assert_allclose(np.delete(found[0], 3), np.delete(wanted[0], 3), rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(found[1], wanted[1], rtol=1e-9, atol=1e-9 * np.abs(wanted[1]).max())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_straight_certain_motion_is_the_linear_prediction(seed: int) -> None:
+    """With heading certain and no turn, the transform is the Kalman prediction of constant acceleration."""
+    rng = np.random.default_rng(seed)
+    dt, phi = rng.uniform(0.05, 2), rng.uniform(-3, 3)
+    mean = np.array([*rng.normal(0, 50, 2), rng.normal(0, 8), phi, 0.0, rng.normal()])
+    root = rng.normal(size=(6, 6))
+    root[3:5] = 0
+    covariance = root @ root.T + np.diag([1, 1, 1, 1e-11, 1e-11, 1])
+    transition = np.eye(6)
+    for row, direction in ((0, math.cos(phi)), (1, math.sin(phi))):
+        transition[row, 2], transition[row, 5] = direction * dt, direction * dt**2 / 2
+    transition[2, 5] = transition[3, 4] = dt
+    found = predicted(mean, covariance, dt, np.full(6, 1e-9))
+    np.testing.assert_allclose(found[0][[0, 1, 2, 5]], (transition @ mean)[[0, 1, 2, 5]], atol=1e-6)
+    np.testing.assert_allclose(found[1], transition @ covariance @ transition.T, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_prediction_turns_with_the_world(seed: int) -> None:
+    """A state in a world turned about z is predicted to the turned prediction: no direction is preferred."""
+    rng = np.random.default_rng(seed)
+    mean, covariance = random_state(rng)
+    angle = rng.uniform(-3, 3)
+    turn = np.eye(6)
+    turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    heading = np.array([0, 0, 0, angle, 0, 0])
+    noise = np.array([0.2, 0.2, 1.0, 0.1, 0.3, 0.5])
+    one = predicted(mean, covariance, 0.7, noise)
+    other = predicted(turn @ mean + heading, turn @ covariance @ turn.T, 0.7, noise)
+    difference = other[0] - (turn @ one[0] + heading)
+    difference[3] = wrap(difference[3])
+    np.testing.assert_allclose(difference, 0, atol=1e-10)
+    np.testing.assert_allclose(other[1], turn @ one[1] @ turn.T, atol=1e-10 * np.abs(one[1]).max())
