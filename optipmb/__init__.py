@@ -7,7 +7,8 @@
     density = tracker.initial()
     for stamp_ns, boxes in detections:
         frame, _ = optipmb.make_frame(parameters, stamp_ns=stamp_ns, **boxes)
-        density, tracks, diagnostics = tracker.step(density, frame)
+        result = tracker.step(density, frame)
+        density, tracks = result.density, result.tracks
 
 Pure computation: no files but the profiles, no network, no state outside the density.
 """

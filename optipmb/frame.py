@@ -28,6 +28,9 @@ UNIT_TOLERANCE = 1e-3
 MAX_COORDINATE = 1e8
 """Coordinates beyond this (metres) are not positions on Earth; the limit keeps squares far from overflow."""
 
+MAX_SPEED = 1e3
+"""Velocities beyond this (metres per second) are not those of objects on a road; squared, they would drown a covariance."""
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -83,6 +86,8 @@ class PointCloud:
     pose: Pose
 
     def __post_init__(self) -> None:
+        if not isinstance(self.xyz, np.ndarray):
+            raise FrameError("cloud.xyz", "(P, 3) float32", type(self.xyz).__name__)
         if self.xyz.dtype != np.float32 or self.xyz.ndim != 2 or self.xyz.shape[1] != 3:  # noqa: PLR2004 - x, y, z
             raise FrameError("cloud.xyz", "(P, 3) float32", f"{self.xyz.shape} {self.xyz.dtype}")
         # A read-only view: one type for the kernels whether the points came from a file or lie in a message.
@@ -197,11 +202,14 @@ def make_frame(
 def _velocities(velocity: ArrayLike | None, m: int) -> NDArray[np.float64]:
     if velocity is None:
         return np.full((m, 2), np.nan)
-    values = np.asarray(velocity, dtype=np.float64).reshape(-1, 2) if m == 0 else np.asarray(velocity, dtype=np.float64)
+    values: NDArray[np.float64] = _array("velocity", velocity, np.float64)
+    if values.size == 0 == m:
+        values = values.reshape(0, 2)
     if values.shape != (m, 2):
         raise FrameError("velocity", f"shape {(m, 2)}", str(values.shape))
     unknown = np.isnan(values).all(axis=1, keepdims=True)
-    _all("velocity", (np.abs(values) <= MAX_COORDINATE) | unknown, "finite, or a whole row of NaN", values)
+    expected = f"at most {MAX_SPEED:g} m/s, or a whole row of NaN"
+    _all("velocity", (np.abs(values) <= MAX_SPEED) | unknown, expected, values)
     return values
 
 

@@ -90,11 +90,15 @@ def test_iou_is_a_table_of_all_pairs() -> None:
     assert optipmb.bev_iou(np.zeros((0, 5)), b).shape == (0, 4)
 
 
+@pytest.mark.parametrize("mixed", [False, True])
 @pytest.mark.parametrize("seed", range(6))
-def test_suppression_is_the_greedy_one_per_class(seed: int) -> None:
+def test_suppression_is_the_greedy_one_per_class(seed: int, mixed: bool) -> None:  # noqa: FBT001 - parametrized
     """A box goes when a better KEPT one of its class overlaps it by more than the threshold of the class."""
     rng = np.random.default_rng(seed)
     boxes = rng.uniform([0, 0, 1, 1, -3], [12, 12, 5, 2, 3], (60, 5))
+    if mixed:  # specks beside giants, many at the same x
+        boxes[:, 0] = np.round(boxes[:, 0])
+        boxes[:, 2:4] = 10 ** rng.uniform(-0.5, 1.2, (60, 2))
     label = rng.integers(0, 3, 60)
     thresholds = np.array([0.0, 0.1, 0.5])
     wanted: list[int] = []
@@ -104,6 +108,14 @@ def test_suppression_is_the_greedy_one_per_class(seed: int) -> None:
             wanted.append(i)
     np.testing.assert_array_equal(np.flatnonzero(non_maximum_suppression(boxes, label, thresholds)), wanted)
     assert 0 < len(wanted) < 60
+
+
+def test_nothing_to_suppress() -> None:
+    """No boxes, no result; one box stays."""
+    one = np.array([[0.0, 0, 4, 2, 0]])
+    label, thresholds = np.zeros(1, np.int64), np.array([0.1])
+    assert non_maximum_suppression(one[:0], label[:0], thresholds).shape == (0,)
+    np.testing.assert_array_equal(non_maximum_suppression(one, label, thresholds), [True])
 
 
 def test_what_was_suppressed_suppresses_nothing() -> None:

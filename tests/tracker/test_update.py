@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import oracle_formulas as textbook
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -183,6 +183,8 @@ def test_a_mixture_is_matched_by_what_its_samples_say() -> None:
     yaw=st.floats(-10, 10),
     threshold=st.sampled_from([0.0, 2.0]),
 )
+@example(velocity=(0.0, 2.0), yaw=1.0, threshold=2.0)  # at the threshold the velocity gives the heading
+@example(velocity=(0.0, 0.0), yaw=1.0, threshold=0.0)
 def test_a_birth_is_the_textbook_birth(velocity: tuple[float, float] | None, yaw: float, threshold: float) -> None:
     """m0 and P0 with, without and below the speed that gives a heading."""
     known, unknown = np.arange(1.0, 7.0), np.arange(11.0, 17.0)
