@@ -29,7 +29,7 @@ MAX_COORDINATE = 1e8
 """Coordinates beyond this (metres) are not positions on Earth; the limit keeps squares far from overflow."""
 
 MAX_SPEED = 1e3
-"""Velocities beyond this (metres per second) are not those of objects on a road; squared, they would drown a covariance."""
+"""Velocities beyond this (m/s) are not those of objects on a road; squared, they would drown a covariance."""
 
 
 @dataclass(frozen=True)
