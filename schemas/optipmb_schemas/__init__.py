@@ -1,1 +1,52 @@
-"""To be written."""
+"""Messages of the tracking service: typed models, a bounded codec, Zenoh keys.
+
+    from optipmb_schemas import Detections, Keys, decode, encode, encoding_of
+
+`docs/messages.md` describes the same for publishers in other languages.
+"""
+
+from optipmb_schemas.arrays import Array
+from optipmb_schemas.codec import MESSAGES, decode, encode, encode_json, encoding_of
+from optipmb_schemas.control import (
+    Problem,
+    ResetRequest,
+    ServiceStatus,
+    SessionParameters,
+    SessionState,
+    SessionSummary,
+)
+from optipmb_schemas.errors import CODES, Code, MessageError
+from optipmb_schemas.keys import PREFIX, Keys, Query, Topic
+from optipmb_schemas.limits import DEFAULT, Limits
+from optipmb_schemas.messages import Delivery, Detections, Points, Pose, Tracks
+from optipmb_schemas.model import Message
+
+__all__ = [
+    "CODES",
+    "DEFAULT",
+    "MESSAGES",
+    "PREFIX",
+    "Array",
+    "Code",
+    "Delivery",
+    "Detections",
+    "Keys",
+    "Limits",
+    "Message",
+    "MessageError",
+    "Points",
+    "Pose",
+    "Problem",
+    "Query",
+    "ResetRequest",
+    "ServiceStatus",
+    "SessionParameters",
+    "SessionState",
+    "SessionSummary",
+    "Topic",
+    "Tracks",
+    "decode",
+    "encode",
+    "encode_json",
+    "encoding_of",
+]

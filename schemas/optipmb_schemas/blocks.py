@@ -1,0 +1,88 @@
+"""Array blocks of the wire: `{"dtype": "f8", "shape": [M, 3], "data": <bytes>}`, little-endian, row by row, no gaps.
+
+Decoding a block makes a view of the received bytes where they are aligned and of the wanted number type, and one copy
+otherwise. The encoder moves the data of a large block to a multiple of 8 bytes from the start of the message (with the
+optional field `pad`), so that the receiver's view is aligned.
+"""
+
+from math import prod
+from typing import Any, Final
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from optipmb_schemas.arrays import Array
+from optipmb_schemas.errors import MessageError, invalid
+from optipmb_schemas.limits import Limits
+
+DTYPES: Final = {name: np.dtype("<" + name) for name in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")}
+"""Number types that a block may have. Numpy's spelling (`<f8`, `|u1`) is understood as well."""
+
+LARGE: Final = 4096
+"""Bytes from which on a block's data are viewed instead of copied, in both directions."""
+
+ALIGNMENT: Final = 8
+"""Large blocks start at a multiple of this many bytes from the start of the message."""
+
+_NAMES: Final = DTYPES | {dtype.str: dtype for dtype in DTYPES.values()}
+
+_msgpack: Any = msgpack  # its type information is partial
+
+
+def read_array(value: object, description: Array, limits: Limits) -> NDArray[Any]:
+    """Return a received block or nested list as an array of an allowed shape and of any number type.
+
+    Raises:
+        MessageError: with a path relative to the field, when the block is not well formed, or the shape is not as
+            described or above a limit. The values are not checked here.
+    """
+    if isinstance(value, dict):
+        array = _read_block(value, description)
+    elif isinstance(value, list):
+        array = description.from_lists(value)
+    else:
+        raise invalid("", f"an array of shape {description.shape_described}", value)
+    description.check_shape(array.shape)
+    most = limits.rows(description.rows) if description.rows else len(array)
+    if len(array) > most:
+        raise MessageError("too_large", "", f"at most {most} rows", f"{len(array)} rows")
+    return array
+
+
+def _read_block(block: dict[str, Any], description: Array) -> NDArray[Any]:
+    for name in ("dtype", "shape", "data"):
+        if block.get(name) is None:
+            raise MessageError("missing_field", name, "a value", "nothing")
+    name, shape, data = block["dtype"], block["shape"], block["data"]
+    dtype = _NAMES.get(name) if isinstance(name, str) else None
+    if dtype is None:
+        raise invalid("dtype", f"one of {', '.join(DTYPES)} (little-endian)", name)
+    if not isinstance(shape, list) or len(shape) != len(description.shape):
+        raise invalid("shape", f"a list of {len(description.shape)} integers", shape)
+    for i, length in enumerate(shape):
+        if type(length) is not int or length < 0:
+            raise invalid(f"shape[{i}]", "an integer of at least 0", length)
+    description.check_shape(tuple(shape))
+    if not isinstance(data, bytes | memoryview):
+        raise invalid("data", "bytes (in JSON, arrays are nested lists)", data)
+    size = prod(shape) * dtype.itemsize  # integers of Python do not overflow
+    if size != len(data):
+        raise invalid("data", f"{size} bytes, from dtype and shape", data)
+    return np.frombuffer(data, dtype).reshape(shape) if size else np.empty(shape, dtype)
+
+
+def block_of(array: NDArray[Any]) -> dict[str, Any]:
+    """Return the block of a native array. The data of a large one are a view, not a copy."""
+    little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+    data = little.data if little.nbytes >= LARGE else little.tobytes()
+    return {"dtype": f"{array.dtype.kind}{array.dtype.itemsize}", "shape": list(array.shape), "data": data}
+
+
+def pack_large(block: dict[str, Any], offset: int) -> tuple[bytes, memoryview]:
+    """Return head and data of a large block that is to lie at `offset`, with the padding that aligns its data."""
+    pack, data = _msgpack.packb, block["data"]
+    head: bytes = b"\x84" + b"".join(map(pack, ("dtype", block["dtype"], "shape", block["shape"], "pad")))
+    tail: bytes = pack("data") + b"\xc6" + data.nbytes.to_bytes(4, "big")
+    padding = -(offset + len(head) + 2 + len(tail)) % ALIGNMENT
+    return head + b"\xc4" + bytes((padding, *bytes(padding))) + tail, data

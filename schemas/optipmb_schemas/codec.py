@@ -1,0 +1,212 @@
+"""Messages to bytes and back: pure, total and bounded.
+
+Total: `decode` returns a message or raises `MessageError`, whatever the bytes are. Bounded: sizes, counts and nesting
+are checked before memory is taken for them. `encode` is deterministic: equal messages give equal bytes.
+"""
+
+import json
+import re
+from typing import Any, Final, TypeVar
+
+import msgpack
+import numpy as np
+
+from optipmb_schemas.blocks import block_of, pack_large, read_array
+from optipmb_schemas.control import Problem, ResetRequest, ServiceStatus, SessionParameters, SessionState
+from optipmb_schemas.errors import MessageError, show
+from optipmb_schemas.limits import DEFAULT, Limits
+from optipmb_schemas.messages import Detections, Points, Tracks
+from optipmb_schemas.model import Message
+from optipmb_schemas.structure import Span, check_json, check_msgpack
+
+T = TypeVar("T", bound=Message)
+
+MESSAGES: Final[tuple[type[Message], ...]] = (
+    Detections,
+    Points,
+    Tracks,
+    SessionState,
+    SessionParameters,
+    ResetRequest,
+    Problem,
+    ServiceStatus,
+)
+"""Every type that is sent on its own."""
+
+MAJOR: Final = 1
+"""Major version of all messages. Another one has another encoding string and is refused."""
+
+_ENCODING: Final = re.compile(r"application/(msgpack|json)(?:; ?optipmb\.([A-Za-z]{1,64})\.v([0-9]{1,6}))?")
+_UNDECLARED: Final = frozenset({"", "zenoh/bytes", "zenoh/string"})  # what Zenoh says when a publisher says nothing
+_JSON_STARTS: Final = frozenset(b"{ \t\r\n")  # in msgpack these are small integers, never the start of a map
+_DIGITS: Final = 20  # of a 64-bit integer with its sign; the time to read longer ones grows with their square
+
+_msgpack: Any = msgpack  # its type information is partial
+
+
+def encoding_of(message: Message | type[Message], *, form: str = "msgpack") -> str:
+    """Return the Zenoh encoding of a message or type, as `application/msgpack;optipmb.Detections.v1`."""
+    kind = message if isinstance(message, type) else type(message)
+    return f"application/{form};optipmb.{kind.__name__}.v{MAJOR}"
+
+
+def encode(message: Message) -> bytes:
+    """Return the message as msgpack, arrays as blocks. Fields that are None are left out."""
+    fields = _plain(message, blocks=True)
+    parts: list[bytes | memoryview] = [_msgpack.Packer().pack_map_header(len(fields))]
+    size = len(parts[0])
+    for name, value in fields.items():
+        parts.append(_msgpack.packb(name))
+        size += len(parts[-1])
+        if isinstance(value, dict) and isinstance(value.get("data"), memoryview):
+            head, data = pack_large(value, size)
+            parts += (head, data)
+            size += len(head) + data.nbytes
+        else:
+            parts.append(_msgpack.packb(value))
+            size += len(parts[-1])
+    return b"".join(parts)
+
+
+def encode_json(message: Message) -> bytes:
+    """Return the message as one line of JSON: arrays as nested lists, the epoch as hexadecimal digits."""
+    plain = _plain(message, blocks=False)
+    return json.dumps(plain, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
+
+
+def decode(payload: bytes, expected: type[T], *, encoding: str = "", limits: Limits = DEFAULT) -> T:
+    """Return the message of type `expected` that the payload holds.
+
+    Args:
+        payload: msgpack or JSON. Large arrays of the message are views of it.
+        expected: the type of message that belongs on the key.
+        encoding: the Zenoh encoding of the sample. Where it does not say, the first byte tells msgpack from JSON.
+        limits: what is accepted at most.
+
+    Raises:
+        MessageError: whenever the payload is not a valid message of this type within the limits.
+    """
+    form = _form(encoding, expected)
+    if not form:
+        form = "json" if payload and payload[0] in _JSON_STARTS else "msgpack"
+    most = limits.max_json_bytes if form == "json" else limits.max_bytes
+    if len(payload) > most:
+        raise MessageError("too_large", "", f"at most {most} bytes of {form}", f"{len(payload)} bytes")
+    fields = _parse_json(payload, limits) if form == "json" else _parse_msgpack(payload, limits)
+    if not isinstance(fields, dict):
+        raise MessageError("malformed", "", f"one map with the fields of {expected.__name__}", show(fields))
+    labels = fields.get("labels")
+    if isinstance(labels, list) and len(labels) > limits.max_labels:
+        raise MessageError("too_large", "labels", f"at most {limits.max_labels} labels", f"{len(labels)} labels")
+    _read_arrays(fields, expected, limits)
+    return expected(**fields)
+
+
+def _form(encoding: str, expected: type[Message]) -> str:
+    """Return `msgpack`, `json`, or nothing when the encoding does not say. Refuse other types and versions."""
+    if encoding in _UNDECLARED:
+        return ""
+    match = _ENCODING.fullmatch(encoding)
+    form, kind, major = match.groups() if match else ("", "", "")
+    if not match or kind not in {None, expected.__name__}:
+        raise MessageError("wrong_type", "encoding", encoding_of(expected), show(encoding))
+    if major is not None and int(major) != MAJOR:
+        raise MessageError("unsupported_version", "encoding", encoding_of(expected, form=form), show(encoding))
+    return str(form)
+
+
+def _parse_msgpack(payload: bytes, limits: Limits) -> Any:
+    large = check_msgpack(payload, limits)
+    views = [memoryview(payload)[start:end] for _, start, end in large]
+    try:
+        return _msgpack.unpackb(
+            _without(payload, large) if large else payload,
+            object_pairs_hook=_unique,
+            ext_hook=lambda _code, number: views[int.from_bytes(number, "big")],
+            strict_map_key=True,
+            max_str_len=limits.max_text,
+            max_array_len=limits.max_values,
+            max_map_len=limits.max_values,
+        )
+    except MessageError:
+        raise
+    except ValueError as error:
+        raise MessageError("malformed", "", "msgpack, its keys texts, its texts in UTF-8", show(str(error))) from None
+
+
+def _without(payload: bytes, large: list[Span]) -> bytes:
+    """Return the payload with a numbered extension in place of every large byte string.
+
+    So msgpack builds everything but the large strings. The payload itself holds no extensions: the check refuses them.
+    """
+    parts: list[bytes] = []
+    end = 0
+    for number, (header, _, after) in enumerate(large):
+        parts += (payload[end:header], b"\xd6\x00", number.to_bytes(4, "big"))
+        end = after
+    return b"".join((*parts, payload[end:]))
+
+
+def _parse_json(payload: bytes, limits: Limits) -> Any:
+    check_json(payload, limits)
+    try:
+        text = payload.decode()
+        return json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse_constant, parse_int=_integer)
+    except MessageError:
+        raise
+    except ValueError as error:
+        raise MessageError("malformed", "", "JSON in UTF-8", show(str(error))) from None
+
+
+def _unique(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
+    """Return the pairs of a map, whose keys must be texts, each there once."""
+    fields: dict[str, Any] = dict(pairs)
+    if len(fields) != len(pairs):
+        raise MessageError("malformed", "", "every key of a map once", f"{len(pairs) - len(fields)} again")
+    for key in fields:
+        if type(key) is not str:
+            raise MessageError("malformed", "", "maps with texts as keys", f"a key of {show(key)}")
+    return fields
+
+
+def _refuse_constant(text: str) -> float:
+    raise MessageError("malformed", "", "finite numbers (null for an unknown velocity)", text)
+
+
+def _integer(text: str) -> int:
+    if len(text) > _DIGITS:
+        raise MessageError("malformed", "", "integers of at most 64 bits", show(text))
+    return int(text)
+
+
+def _read_arrays(fields: dict[str, Any], kind: type[Message], limits: Limits) -> None:
+    """Replace blocks and lists by arrays in `fields`, also in the messages that they hold."""
+    name = ""
+    try:
+        for name, description in kind.arrays.items():
+            if fields.get(name) is not None:
+                fields[name] = read_array(fields[name], description, limits)
+        for name, inner in kind.nested.items():
+            if isinstance(fields.get(name), dict):
+                _read_arrays(fields[name], inner, limits)
+    except MessageError as error:
+        raise error.under(name) from None
+
+
+def _plain(value: Any, *, blocks: bool) -> Any:
+    """Return a message as maps, lists and scalars, in a fixed order."""
+    if isinstance(value, Message):
+        fields: dict[str, Any] = {}
+        for name, field in value.present():
+            if isinstance(field, np.ndarray):
+                fields[name] = block_of(field) if blocks else value.arrays[name].to_lists(field)
+            else:
+                fields[name] = _plain(field, blocks=blocks)
+        return fields
+    if isinstance(value, tuple | list):
+        return [_plain(item, blocks=blocks) for item in value]
+    if isinstance(value, dict):
+        return {key: _plain(value[key], blocks=blocks) for key in sorted(value)}
+    if isinstance(value, bytes) and not blocks:
+        return value.hex()
+    return value

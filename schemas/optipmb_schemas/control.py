@@ -1,0 +1,117 @@
+"""Messages about sessions and the service: parameters, resets, states and problems."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from optipmb_schemas.fields import (
+    Count,
+    Epoch,
+    Flag,
+    Name,
+    NonNegative,
+    Plain,
+    SessionId,
+    Stamp,
+    Stream,
+    Text,
+    Word,
+)
+from optipmb_schemas.model import Message
+
+
+class SessionParameters(Message):
+    """Query `q/parameters`. Without a payload it asks; with one it sets what is present. The reply has all fields."""
+
+    profile: Name | None = Field(default=None, description="Name of a profile of the service, such as `nuscenes`.")
+    cloud_wait_s: NonNegative | None = Field(
+        default=None, description="Longest time in seconds that detections wait for the cloud of the same stamp."
+    )
+    restart: Flag = Field(
+        default=False,
+        description="Start the session anew when the parameters change; without it a running session refuses a change.",
+    )
+    values: Plain | None = Field(default=None, description="In replies: all parameters in force. Ignored in queries.")
+
+
+class ResetRequest(Message):
+    """Query `q/reset`, with or without a payload. The session starts anew without tracks. No track id is used again."""
+
+    close: Flag = Field(default=False, description="End the session and free it instead of starting it anew.")
+
+
+class SessionState(Message):
+    """Reply of `q/state` and `q/reset`: the state of one session. Counters start at the start of the session."""
+
+    stream: Stream = Field(description="Name of the stream.")
+    session: SessionId = Field(description="32 hexadecimal digits, as in the tracks.")
+    state: Literal["new", "running", "closed"] = Field(description="New: no frame yet.")
+    profile: Name = Field(description="Name of the parameters in force.")
+    epoch: Epoch | None = Field(default=None, description="Epoch of the newest frame.")
+    seq: Count | None = Field(default=None, description="Number of the newest frame.")
+    stamp_ns: Stamp | None = Field(default=None, description="Stamp of the newest frame.")
+    frames: Count = Field(default=0, description="Frames tracked.")
+    duplicates: Count = Field(default=0, description="Frames that had been tracked before and were dropped.")
+    late: Count = Field(default=0, description="Frames that came too late and were dropped.")
+    refused: Count = Field(default=0, description="Messages that were not valid.")
+    shed: Count = Field(default=0, description="Frames dropped because the queue was full.")
+    gaps: Count = Field(default=0, description="Frames missing.")
+    new_epochs: Count = Field(default=0, description="How often the publisher started anew.")
+    clouds_used: Count = Field(default=0, description="Frames tracked with their cloud.")
+    clouds_missed: Count = Field(default=0, description="Frames that waited for a cloud in vain.")
+    tracks: Count = Field(default=0, description="Tracks extracted at the newest frame.")
+    bernoullis: Count = Field(default=0, description="Bernoulli components now.")
+    poissons: Count = Field(default=0, description="Poisson components now.")
+    next_id: Count = Field(default=0, description="Lower bound of the next new track id.")
+    queue: Count = Field(default=0, description="Frames waiting now.")
+
+
+class Problem(Message):
+    """What was refused or lost, why, and where. Texts are cut to their limits."""
+
+    stream: Text = Field(description="Name of the stream; empty when the problem belongs to none.")
+    instance: Name = Field(description="Name of the service instance that reports.")
+    code: Word = Field(description="Kind of the problem, for programs. More may be added.")
+    path: Text = Field(default="", description="Field and element at fault, as `score[3]`; empty: the whole message.")
+    expected: Text = Field(default="", description="What was expected there.")
+    received: Text = Field(default="", description="What was received, cut to a short printable text.")
+    message: Text = Field(description="One sentence for people.")
+    seq: Count | None = Field(default=None, description="Number of the frame, when known.")
+    stamp_ns: Stamp | None = Field(default=None, description="Stamp of the frame, when known.")
+    count: Count = Field(default=1, description="How many equal problems this one stands for.")
+
+
+class SessionSummary(Message):
+    """One line of the service's status."""
+
+    stream: Stream = Field(description="Name of the stream.")
+    profile: Name = Field(description="Name of the parameters in force.")
+    state: Word = Field(description="State of the session, such as `running`.")
+    rate_hz: NonNegative = Field(default=0.0, description="Frames per second lately.")
+    latency_p50_ms: NonNegative = Field(default=0.0, description="Median time from arrival to publication, ms.")
+    latency_p99_ms: NonNegative = Field(default=0.0, description="99th percentile of the same, ms.")
+    frames: Count = Field(default=0, description="Frames tracked.")
+    refused: Count = Field(default=0, description="Messages that were not valid.")
+    shed: Count = Field(default=0, description="Frames dropped because the queue was full.")
+    gaps: Count = Field(default=0, description="Frames missing.")
+    tracks: Count = Field(default=0, description="Tracks extracted at the newest frame.")
+    queue: Count = Field(default=0, description="Frames waiting now.")
+    age_s: NonNegative | None = Field(default=None, description="Seconds since the last frame arrived.")
+
+
+class ServiceStatus(Message):
+    """Reply of `q/status`: the service instance, its sessions and its newest problems."""
+
+    instance: Name = Field(description="Name of the service instance.")
+    version: Word = Field(description="Version of the software.")
+    started_ns: Stamp = Field(description="When the instance started, ns since 1970 UTC.")
+    uptime_s: NonNegative = Field(description="Seconds since then.")
+    state: Word = Field(description="State of the instance, such as `ready` or `degraded`.")
+    sessions: tuple[SessionSummary, ...] = Field(
+        default=(), max_length=10_000, fail_fast=True, description="The sessions of this instance."
+    )
+    frames: Count = Field(default=0, description="Frames tracked since the start.")
+    refused: Count = Field(default=0, description="Messages refused since the start.")
+    problems: tuple[Problem, ...] = Field(
+        default=(), max_length=100, fail_fast=True, description="The newest problems, the oldest first."
+    )

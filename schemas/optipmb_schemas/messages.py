@@ -1,0 +1,193 @@
+"""Messages of a stream: detections and points towards the service, tracks back.
+
+World frame: fixed, right-handed, z up; metres, seconds, radians. Yaw is counter-clockwise from x. The centre of a box
+is its geometric centre; its size is length, width, height. Stamps are nanoseconds of the sensor's time. The fields are
+described here and nowhere else: the JSON Schemas and the tables of the documentation are made from these descriptions.
+"""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field
+
+from optipmb_schemas.arrays import Array, unit_quaternion
+from optipmb_schemas.errors import MessageError, invalid, show
+from optipmb_schemas.fields import Count, Epoch, Flag, Labels, Name, NonNegative, SessionId, Stamp, Stream
+from optipmb_schemas.model import Message
+
+FAR = 1e8
+"""Largest coordinate in metres: beyond every map projection, small enough that no square overflows."""
+INT64 = 2**63 - 1
+
+
+class Pose(Message):
+    """Pose of the sensor: takes points of the sensor frame to the world frame (rotate first, then translate)."""
+
+    translation: Annotated[NDArray[np.float64], Array("f8", (3,), -FAR, FAR)] = Field(
+        description="Position of the sensor in the world frame: x, y, z in metres."
+    )
+    quaternion: Annotated[NDArray[np.float64], Array("f8", (4,), -1.001, 1.001), AfterValidator(unit_quaternion)] = (
+        Field(
+            description="Rotation from the sensor frame to the world frame: w, x, y, z; its norm within 0.001 of one."
+        )
+    )
+
+
+class Header(Message):
+    """What every message of a stream starts with."""
+
+    stream: Stream = Field(description="Name of the stream: `site/node/sensor`, each of letters, digits and `_ . -`.")
+    epoch: Epoch = Field(
+        description="16 bytes (JSON: 32 hexadecimal digits), random, new at every start of the publisher."
+    )
+    seq: Count = Field(
+        description="Counts the messages of this type and stream within the epoch: 0, 1, 2, without gaps. "
+        "A message that is sent again keeps its number."
+    )
+    stamp_ns: Stamp = Field(description="Sensor time in nanoseconds. Only differences and the order matter.")
+
+
+class SensorMessage(Header):
+    """Header of what a publisher sends: also says in which frame its coordinates are."""
+
+    frame: Literal["world", "sensor"] = Field(
+        description="Frame of all coordinates here: the fixed world frame, or the sensor frame at `stamp_ns`."
+    )
+    pose: Pose | None = Field(
+        default=None,
+        description="World from sensor at `stamp_ns`. Required when `frame` is `sensor`, optional otherwise.",
+    )
+
+    def check(self) -> None:
+        """A sensor frame needs its pose."""
+        if self.frame == "sensor" and self.pose is None:
+            raise MessageError("missing_field", "pose", "a pose, because frame is sensor", "nothing")
+
+
+class Detections(SensorMessage):
+    """The detected objects of one frame, M of them (M may be 0). One row of every array is one object."""
+
+    labels: Labels = Field(description="Names of the classes that `label` counts, for example `car`. All different.")
+    label: Annotated[NDArray[np.int64], Array("i8", ("M",), 0, 255)] = Field(
+        description="Class of each object as an index into `labels`, from 0."
+    )
+    center: Annotated[NDArray[np.float64], Array("f8", ("M", 3), -FAR, FAR)] = Field(
+        description="Geometric centres of the boxes: x, y, z in metres, in `frame`."
+    )
+    size: Annotated[NDArray[np.float64], Array("f8", ("M", 3), 0, 1e4, above=True)] = Field(
+        description="Length (along the heading), width, height in metres."
+    )
+    yaw: Annotated[NDArray[np.float64], Array("f8", ("M",), -1e4, 1e4)] = Field(
+        description="Heading in radians, counter-clockwise about z from the x axis of `frame`."
+    )
+    score: Annotated[NDArray[np.float64], Array("f8", ("M",), 0, 1, above=True)] = Field(
+        description="Confidence of the detector. Logits must be passed through a sigmoid first."
+    )
+    velocity: Annotated[NDArray[np.float64], Array("f8", ("M", 2), -1e4, 1e4, unknown=True)] | None = Field(
+        default=None,
+        description="Velocity over ground in m/s along the x and y axes of `frame` (not relative to a moving sensor). "
+        "A row of two NaN (JSON: null) is an object of unknown velocity. Absent: unknown for all.",
+    )
+    has_points: Flag | None = Field(
+        default=None,
+        description="True: a `Points` message of the same stamp was or will be published. False: none comes. "
+        "Absent: the service judges from what the stream has sent so far.",
+    )
+
+    def check(self) -> None:
+        """Every label must be in the list."""
+        super().check()
+        _check_labels(self.label, self.labels)
+
+
+class Points(SensorMessage):
+    """One point cloud of the sensor. Its `seq` counts clouds, apart from the detections."""
+
+    xyz: Annotated[NDArray[np.float32], Array("f4", ("P", 3), -FAR, FAR, wider=True)] = Field(
+        description="Points x, y, z in metres, in `frame`. Further columns (up to 64) are dropped. "
+        "All must be finite: leave out the points without a return."
+    )
+
+
+class Delivery(Message):
+    """How one publication of the tracks came about. The only part that differs when the same tracks are sent again."""
+
+    instance: Name = Field(description="Name of the service instance that published.")
+    received_ns: Stamp = Field(description="When the detections arrived: clock of the service, ns since 1970 UTC.")
+    published_ns: Stamp = Field(description="When the tracks were handed to Zenoh: same clock.")
+    queue_ms: NonNegative = Field(description="Milliseconds spent waiting, for a worker and for the cloud.")
+    decode_ms: NonNegative = Field(description="Milliseconds spent decoding.")
+    step_ms: NonNegative = Field(description="Milliseconds spent in the tracker.")
+
+
+class Tracks(Header):
+    """The tracks of one frame, N of them, ordered by id. `epoch`, `seq` and `stamp_ns` are those of the detections."""
+
+    session: SessionId = Field(
+        description="32 hexadecimal digits. New when the session starts anew: earlier tracks have ended."
+    )
+    revision: Count = Field(
+        default=0,
+        description="0 at first. Higher: corrects what was published for the same `session`, `epoch` and `seq`, "
+        "because a late frame came in.",
+    )
+    profile: Name = Field(description="Name of the parameters in force.")
+    cloud_used: Flag = Field(description="Whether a point cloud took part in this frame.")
+    gap: Count = Field(default=0, description="Number of frames known to be missing directly before this one.")
+    ignored: Count = Field(default=0, description="Number of detections whose class the profile does not have.")
+    labels: Labels = Field(description="Names of the classes that `label` counts.")
+    id: Annotated[NDArray[np.int64], Array("i8", ("N",), 0, INT64)] = Field(
+        description="Identity of the track: unique in the stream, never used again. Ascending."
+    )
+    label: Annotated[NDArray[np.int64], Array("i8", ("N",), 0, 255)] = Field(
+        description="Class, an index into `labels`."
+    )
+    center: Annotated[NDArray[np.float64], Array("f8", ("N", 3), -FAR * 10, FAR * 10)] = Field(
+        description="Geometric centres of the boxes: x, y, z in metres, world frame."
+    )
+    size: Annotated[NDArray[np.float64], Array("f8", ("N", 3), 0, 1e5, above=True)] = Field(
+        description="Length, width, height in metres."
+    )
+    yaw: Annotated[NDArray[np.float64], Array("f8", ("N",), -1e5, 1e5)] = Field(
+        description="Heading in radians, counter-clockwise about z from the x axis of the world frame."
+    )
+    velocity: Annotated[NDArray[np.float64], Array("f8", ("N", 2), -1e5, 1e5)] = Field(
+        description="Velocity in m/s along x and y of the world frame."
+    )
+    yaw_rate: Annotated[NDArray[np.float64], Array("f8", ("N",), -1e5, 1e5)] = Field(description="Turn rate in rad/s.")
+    acceleration: Annotated[NDArray[np.float64], Array("f8", ("N",), -1e5, 1e5)] = Field(
+        description="Acceleration along the heading in m/s^2."
+    )
+    existence: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1)] = Field(
+        description="Probability that the object exists."
+    )
+    score: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1)] = Field(description="Confidence of the track.")
+    covariance: Annotated[NDArray[np.float64], Array("f8", ("N", 6, 6), -1e30, 1e30)] = Field(
+        description="Covariance of [x, y, speed, heading, turn rate, acceleration], in the units above."
+    )
+    age: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1e12)] = Field(
+        description="Seconds since the first detection of the track."
+    )
+    time_since_detection: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1e12)] = Field(
+        description="Seconds since the last detection of the track; 0 when this frame has one."
+    )
+    detection: Annotated[NDArray[np.int64], Array("i8", ("N",), -1, INT64)] = Field(
+        description="Row of the associated detection in the `Detections` message of this frame; -1: none."
+    )
+    delivery: Delivery | None = Field(default=None, description="How this publication came about.")
+
+    def check(self) -> None:
+        """Labels must be in the list, ids ascending."""
+        super().check()
+        _check_labels(self.label, self.labels)
+        steps = np.diff(self.id)
+        if steps.size and steps.min() <= 0:
+            at = int(np.argmax(steps <= 0)) + 1
+            raise invalid(f"id[{at}]", f"an id above {self.id[at - 1]}, in ascending order", self.id[at])
+
+
+def _check_labels(label: NDArray[np.int64], labels: tuple[str, ...]) -> None:
+    if label.size and label.max() >= len(labels):
+        at = int(label.argmax())
+        raise MessageError("invalid_value", f"label[{at}]", f"an index into the {len(labels)} labels", show(label[at]))

@@ -1,0 +1,127 @@
+"""What all messages share: frozen pydantic models whose errors name the field, and whose arrays agree in their rows."""
+
+from types import UnionType
+from typing import Annotated, Any, ClassVar, Final, Self, Union, get_args, get_origin
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+
+from optipmb_schemas.arrays import Array
+from optipmb_schemas.errors import MessageError, invalid, path_of, shape_text, show
+
+
+class Message(BaseModel):
+    """Base of every message and of what messages hold.
+
+    Fields that are not known are ignored: a newer minor version may have added them. Arrays are views of what the
+    constructor was given wherever that is possible, so its arrays must not be changed afterwards.
+
+    Raises:
+        MessageError: when a field is missing or not valid.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore", arbitrary_types_allowed=True)
+
+    arrays: ClassVar[dict[str, Array]] = {}
+    """Descriptions of the array fields, by name."""
+    nested: ClassVar[dict[str, type["Message"]]] = {}
+    """Message types of the fields that hold one message, by name."""
+
+    def __init__(self, /, **fields: Any) -> None:
+        try:
+            super().__init__(**fields)
+        except ValidationError as error:
+            raise _first(error) from None
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Collect the array fields once per class."""
+        super().__pydantic_init_subclass__(**kwargs)
+        cls.arrays, cls.nested = {}, {}
+        for name, info in cls.model_fields.items():
+            for part in (*info.metadata, *_parts(info.annotation)):
+                if isinstance(part, Array):
+                    cls.arrays[name] = part
+                elif isinstance(part, type) and issubclass(part, Message):
+                    cls.nested[name] = part
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        rows: dict[str, tuple[str, int]] = {}
+        for name, description in self.arrays.items():
+            array = getattr(self, name)
+            if array is None or description.rows is None:
+                continue
+            first, number = rows.setdefault(description.rows, (name, len(array)))
+            if len(array) != number:
+                expected = f"{number} rows as in {first}, for shape {description.shape_described}"
+                raise MessageError("invalid_value", name, expected, f"shape {shape_text(array.shape)}")
+        self.check()
+        return self
+
+    def check(self) -> None:
+        """Check what concerns several fields. Raises MessageError."""
+
+    def present(self) -> list[tuple[str, Any]]:
+        """Return the names and values of the fields that are not None, in the order of their description."""
+        return [(name, value) for name in type(self).model_fields if (value := getattr(self, name)) is not None]
+
+    def __eq__(self, other: object) -> bool:
+        """Equal messages have equal bytes on the wire; NaN equals NaN here, and 0.0 differs from -0.0 in arrays."""
+        if type(other) is not type(self):
+            return NotImplemented
+        return all(_same(getattr(self, name), getattr(other, name)) for name in type(self).model_fields)
+
+    __hash__ = BaseModel.__hash__  # pydantic's, of all fields: messages with arrays are not hashable
+
+    def __repr_args__(self) -> list[tuple[str | None, Any]]:
+        """Show arrays by type and shape."""
+        return [(n, show(v) if isinstance(v, np.ndarray) else v) for n, v in self.present()]
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, np.ndarray):
+        return isinstance(other, np.ndarray) and one.shape == other.shape and one.tobytes() == other.tobytes()
+    return bool(one == other)
+
+
+def _parts(annotation: Any) -> list[Any]:
+    """Return what an annotation is made of: the alternatives of a union and the metadata of each."""
+    if get_origin(annotation) is Annotated:
+        inner, *metadata = get_args(annotation)
+        return [*_parts(inner), *metadata]
+    if get_origin(annotation) in {Union, UnionType}:
+        return [part for alternative in get_args(annotation) for part in _parts(alternative)]
+    return [annotation]
+
+
+def _first(error: ValidationError) -> MessageError:
+    """Return the first of pydantic's errors as ours."""
+    first = error.errors(include_url=False)[0]
+    path = path_of(first["loc"])
+    cause = first.get("ctx", {}).get("error")
+    if isinstance(cause, MessageError):
+        return cause.under(path) if path else cause
+    if first["type"] == "missing":
+        return MessageError("missing_field", path, "a value", "nothing")
+    return invalid(path, _expected(first["msg"]), first["input"])
+
+
+_PHRASES: Final = (
+    ("be a valid tuple", "a list"),
+    ("be a valid dictionary", "a map"),
+    ("be greater", "a number greater"),
+    ("be less", "a number less"),
+    ("have ", "a value of "),
+    ("match pattern", "a text that matches"),
+    ("be ", ""),
+)
+
+
+def _expected(sentence: str) -> str:
+    """Return what pydantic's sentence asks for: `Input should be a valid string` asks for `a valid string`."""
+    _, _, rest = sentence.partition(" should ")
+    for start, ours in _PHRASES:
+        if rest.startswith(start):
+            return ours + rest.removeprefix(start)
+    return sentence

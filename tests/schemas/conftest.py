@@ -1,0 +1,121 @@
+"""One valid message of every type, small and complete: every field is present."""
+
+import numpy as np
+import pytest
+from optipmb_schemas import (
+    Delivery,
+    Detections,
+    Message,
+    Points,
+    Pose,
+    Problem,
+    ResetRequest,
+    ServiceStatus,
+    SessionParameters,
+    SessionState,
+    SessionSummary,
+    Tracks,
+)
+
+EPOCH = bytes(range(16))
+POSE = Pose(translation=np.array([10.0, 20.0, 1.5]), quaternion=np.array([0.6, 0.0, 0.0, 0.8]))
+HEADER = {"stream": "site-1/node.2/lidar_3", "epoch": EPOCH, "seq": 7, "stamp_ns": 1_700_000_000_123_456_789}
+
+
+def _examples() -> list[Message]:
+    detections = Detections(
+        **HEADER,
+        frame="sensor",
+        pose=POSE,
+        labels=("car", "pedestrian"),
+        label=np.array([0, 1, 0]),
+        center=np.array([[1.0, 2.0, 0.5], [-3.0, 0.0, -0.0], [40.0, -8.5, 1.0]]),
+        size=np.array([[4.2, 1.8, 1.5], [0.6, 0.7, 1.75], [4.0, 1.7, 1.4]]),
+        yaw=np.array([0.0, 1.5, -3.0]),
+        score=np.array([1.0, 0.3, 1e-9]),
+        velocity=np.array([[1.0, -0.0], [np.nan, np.nan], [0.0, 5.5]]),
+        has_points=True,
+    )
+    points = Points(**HEADER, frame="sensor", pose=POSE, xyz=np.arange(30, dtype="f4").reshape(10, 3))
+    tracks = Tracks(
+        **HEADER,
+        session="0123456789abcdef" * 2,
+        revision=1,
+        profile="nuscenes",
+        cloud_used=True,
+        gap=2,
+        ignored=3,
+        labels=("car", "pedestrian"),
+        id=np.array([3, 8]),
+        label=np.array([1, 0]),
+        center=np.array([[1.0, 2.0, 0.5], [-3.0, 0.0, -0.0]]),
+        size=np.array([[4.2, 1.8, 1.5], [0.6, 0.7, 1.75]]),
+        yaw=np.array([0.1, -0.2]),
+        velocity=np.array([[1.0, 2.0], [0.0, 0.5]]),
+        yaw_rate=np.array([0.01, 0.0]),
+        acceleration=np.array([0.5, -0.5]),
+        existence=np.array([0.99, 0.0]),
+        score=np.array([0.7, 1.0]),
+        covariance=np.stack([np.eye(6), 2 * np.eye(6)]),
+        age=np.array([1.5, 0.0]),
+        time_since_detection=np.array([0.0, 0.5]),
+        detection=np.array([1, -1]),
+        delivery=Delivery(instance="host-1", received_ns=5, published_ns=6, queue_ms=0.5, decode_ms=0.125, step_ms=3.0),
+    )
+    state = SessionState(
+        stream=HEADER["stream"],
+        session="f" * 32,
+        state="running",
+        profile="kitti",
+        epoch=EPOCH,
+        seq=7,
+        stamp_ns=8,
+        frames=9,
+    )
+    parameters = SessionParameters(
+        profile="kitti",
+        cloud_wait_s=0.05,
+        restart=True,
+        values={"b": [1, 2.5, None, True], "a": {"text": "ü", "low": -(2**63)}},
+    )
+    problem = Problem(
+        stream=HEADER["stream"],
+        instance="host-1",
+        code="invalid_value",
+        path="score[3]",
+        expected="a number in (0, 1]",
+        received="0.0",
+        message="score[3]: expected a number in (0, 1], received 0.0",
+        seq=7,
+        stamp_ns=8,
+        count=2,
+    )
+    status = ServiceStatus(
+        instance="host-1",
+        version="0.1.0",
+        started_ns=1,
+        uptime_s=2.5,
+        state="ready",
+        sessions=(
+            SessionSummary(stream="a/b/c", profile="kitti", state="running", rate_hz=10.0, age_s=0.1),
+            SessionSummary(stream="a/b/d", profile="kitti", state="new"),
+        ),
+        frames=3,
+        refused=4,
+        problems=(problem,),
+    )
+    return [detections, points, tracks, state, parameters, ResetRequest(close=True), problem, status]
+
+
+@pytest.fixture(scope="session")
+def examples() -> dict[str, Message]:
+    """A valid message of every type, by the name of the type."""
+    return {type(message).__name__: message for message in _examples()}
+
+
+@pytest.fixture(scope="session")
+def detections(examples: dict[str, Message]) -> Detections:
+    """Three detections in the sensor frame."""
+    message = examples["Detections"]
+    assert isinstance(message, Detections)
+    return message

@@ -1,0 +1,130 @@
+"""What docs/messages.md says is what the code does."""
+
+import json
+import re
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from optipmb_schemas import (
+    CODES,
+    MESSAGES,
+    Detections,
+    Keys,
+    MessageError,
+    Pose,
+    Query,
+    Topic,
+    decode,
+    encode,
+    encoding_of,
+)
+from optipmb_schemas.export import main
+from optipmb_schemas.pages import fill, table
+
+ROOT = Path(__file__).parents[2]
+FILE = ROOT / "docs" / "messages.md"
+PAGE = FILE.read_text(encoding="utf-8")
+
+
+def fenced(language: str) -> list[str]:
+    """Return the fenced blocks of a language on the page."""
+    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+
+
+def dumped(text: str) -> bytes:
+    """Return the bytes of a hex dump, whose offsets must be right."""
+    payload = b""
+    for line in text.splitlines():
+        offset, codes = line[:4], line[6:53]
+        assert int(offset, 16) == len(payload)
+        payload += bytes.fromhex(codes)
+    return payload
+
+
+def test_the_tables_are_current(capsys: pytest.CaptureFixture[str]) -> None:
+    """The tables of fields, limits and codes are those of the code, and the command says when they are not."""
+    assert fill(PAGE) == PAGE
+    assert main(["--check", "--page", str(FILE), str(ROOT / "schemas" / "json")]) == 0, capsys.readouterr().out
+    assert fill("<!-- table: codes -->\nold\n<!-- end -->") == f"<!-- table: codes -->\n{table('codes')}<!-- end -->"
+
+
+def test_a_stale_page_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`--page` with `--check` finds a stale table, and without it brings the page up to date."""
+    page, folder = tmp_path / "page.md", tmp_path / "json"
+    page.write_text("<!-- table: codes -->\n<!-- end -->\n")
+    assert main([str(folder)]) == 0
+    assert main(["--check", "--page", str(page), str(folder)]) == 1
+    assert "page.md: not up to date" in capsys.readouterr().out
+    assert main(["--page", str(page), str(folder)]) == 0
+    assert main(["--check", "--page", str(page), str(folder)]) == 0
+    assert "invalid_value" in page.read_text()
+
+
+def test_every_message_has_its_table() -> None:
+    """No message type, and neither the limits nor the codes, are missing on the page."""
+    named = set(re.findall(r"<!-- table: (\w+) -->", PAGE))
+    assert named >= {kind.__name__ for kind in MESSAGES} | {"Pose", "Delivery", "SessionSummary", "limits", "codes"}
+
+
+def test_the_example_is_what_encode_produces() -> None:
+    """The JSON example and the hex dump are the same message, to the byte."""
+    message = decode(fenced("json")[0].encode(), Detections)
+    payload = dumped(fenced("hex")[0])
+    assert encode(message) == payload
+    assert decode(payload, Detections, encoding=encoding_of(Detections)) == message
+    assert f"{len(payload)} bytes, as the Python package writes it" in PAGE
+
+
+def test_the_explained_bytes_are_where_they_are_said_to_be() -> None:
+    """Every row of the table below the dump quotes the bytes at its offset."""
+    payload = dumped(fenced("hex")[0])
+    rows = re.findall(r"^\| ([0-9a-f]{4}) \| ([0-9a-f ]+) \|", PAGE, re.MULTILINE)
+    assert len(rows) > 10
+    for offset, codes in rows:
+        assert payload[int(offset, 16) :].startswith(bytes.fromhex(codes)), offset
+    at = int(re.search(r"\| ([0-9a-f]{4}) \| [0-9a-f ]+ \| 12\.5 as float64", PAGE)[1], 16)
+    assert np.frombuffer(payload, "<f8", 1, at)[0] == 12.5
+
+
+def test_the_example_pose_is_valid() -> None:
+    """The pose on the page can be used as it is."""
+    pose = Pose(**json.loads(fenced("json")[1])["pose"])
+    assert pose.translation.shape == (3,)
+
+
+def test_all_keys_are_on_the_page() -> None:
+    """Every key that the code makes is in the table of keys."""
+    keys, stream = Keys(), "site/node/sensor"
+    made = [getattr(keys, topic)(stream) for topic in get_args(Topic)]
+    made += [keys.query(stream, query) for query in get_args(Query)]
+    made += [keys.owner(stream, "instance"), keys.alive("instance"), keys.status("instance")]
+    said = [re.sub(r"[<>]", "", key) for key in re.findall(r"^\| `(optipmb/v1/[^`]*)`", PAGE, re.MULTILINE)]
+    assert sorted(said) == sorted(made)
+    assert f"`{keys.all_queries('state')}`" in PAGE
+    assert f"`{keys.all_status()}`" in PAGE
+
+
+def test_encodings_on_the_page() -> None:
+    """The encoding strings on the page are those of the code."""
+    said = set(re.findall(r"`(application/[^`]*)`", PAGE))
+    assert said == {encoding_of(Detections), encoding_of(Detections, form="json")}
+
+
+def test_codes_on_the_page_are_meant() -> None:
+    """Each code of an invalid message can be met: a payload for each is refused with it."""
+    example = dumped(fenced("hex")[0])
+    cases = [
+        (example[:-1], "", "malformed"),
+        (example, "application/msgpack;optipmb.Tracks.v1", "wrong_type"),
+        (example, "application/msgpack;optipmb.Detections.v2", "unsupported_version"),
+        (bytes(2**26), "", "too_large"),
+        (b"\x80", "", "missing_field"),
+        (example.replace(b"world", b"earth"), "", "invalid_value"),
+    ]
+    assert {code for _, _, code in cases} == set(CODES)
+    for payload, encoding, code in cases:
+        with pytest.raises(MessageError) as caught:
+            decode(payload, Detections, encoding=encoding)
+        assert caught.value.code == code

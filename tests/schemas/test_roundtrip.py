@@ -1,0 +1,268 @@
+"""Messages survive the wire unchanged, to the bit."""
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from optipmb_schemas import (
+    MESSAGES,
+    Delivery,
+    Detections,
+    Message,
+    Points,
+    Pose,
+    Problem,
+    ResetRequest,
+    ServiceStatus,
+    SessionParameters,
+    SessionState,
+    SessionSummary,
+    Tracks,
+    decode,
+    encode,
+    encode_json,
+    encoding_of,
+)
+
+INT64 = 2**63 - 1
+FAR = 1e8
+
+chunk = st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,12}", fullmatch=True)
+stream = st.tuples(chunk.filter(lambda c: c not in {"owner", "service"}), chunk, chunk).map("/".join)
+count = st.integers(0, INT64)
+duration = st.floats(0, allow_infinity=False, allow_nan=False)
+text = st.text(st.characters(exclude_categories=["Cs"]), max_size=40)
+word = text.filter(bool)
+labels = st.lists(
+    st.text(st.characters(categories=["L", "N"]), min_size=1, max_size=20), min_size=1, max_size=6, unique=True
+)
+epoch = st.binary(min_size=16, max_size=16)
+session = st.binary(min_size=16, max_size=16).map(bytes.hex)
+
+
+def rows(shape: tuple[int, ...], low: float, high: float, *, above: bool = False) -> st.SearchStrategy[Any]:
+    """Return arrays of numbers."""
+    return arrays("f8", shape, elements=st.floats(low, high, exclude_min=above, allow_nan=False))
+
+
+def whole(size: int, low: int, high: int) -> st.SearchStrategy[Any]:
+    """Return columns of integers."""
+    return arrays("i8", (size,), elements=st.integers(low, high))
+
+
+@st.composite
+def poses(draw: st.DrawFn) -> Pose:
+    """Return poses."""
+    quaternion = draw(rows((4,), -1, 1).filter(lambda q: np.linalg.norm(q) > 0.1))
+    return Pose(translation=draw(rows((3,), -FAR, FAR)), quaternion=quaternion / np.linalg.norm(quaternion))
+
+
+@st.composite
+def headers(draw: st.DrawFn) -> dict[str, Any]:
+    """Return the fields that all stream messages have."""
+    return {"stream": draw(stream), "epoch": draw(epoch), "seq": draw(count), "stamp_ns": draw(count)}
+
+
+@st.composite
+def placed(draw: st.DrawFn) -> dict[str, Any]:
+    """Return the fields that all messages of a publisher have."""
+    frame = draw(st.sampled_from(["world", "sensor"]))
+    pose = draw(poses()) if frame == "sensor" else draw(st.none() | poses())
+    return {**draw(headers()), "frame": frame, "pose": pose}
+
+
+@st.composite
+def detections(draw: st.DrawFn) -> Detections:
+    """Return detections."""
+    m, names = draw(st.integers(0, 9)), draw(labels)
+    velocity = draw(st.none() | rows((m, 2), -1e4, 1e4))
+    if velocity is not None:
+        velocity[draw(arrays(np.bool_, m))] = np.nan
+    return Detections(
+        **draw(placed()),
+        labels=tuple(names),
+        label=draw(whole(m, 0, len(names) - 1)),
+        center=draw(rows((m, 3), -FAR, FAR)),
+        size=draw(rows((m, 3), 0, 1e4, above=True)),
+        yaw=draw(rows((m,), -1e4, 1e4)),
+        score=draw(rows((m,), 0, 1, above=True)),
+        velocity=velocity,
+        has_points=draw(st.none() | st.booleans()),
+    )
+
+
+@st.composite
+def points(draw: st.DrawFn) -> Points:
+    """Return clouds, small and large."""
+    shape = (draw(st.integers(0, 9) | st.just(700)), 3)  # 700 points are a large block, viewed instead of copied
+    fill = st.floats(-FAR, FAR, width=32)
+    return Points(**draw(placed()), xyz=draw(arrays("f4", shape, elements=fill, fill=fill)))
+
+
+@st.composite
+def tracks(draw: st.DrawFn) -> Tracks:
+    """Return tracks."""
+    n, names = draw(st.integers(0, 5)), draw(labels)
+    column = {
+        name: draw(rows((n,), low, high))
+        for name, low, high in [
+            ("yaw", -1e5, 1e5),
+            ("yaw_rate", -1e5, 1e5),
+            ("acceleration", -1e5, 1e5),
+            ("existence", 0, 1),
+            ("score", 0, 1),
+            ("age", 0, 1e12),
+            ("time_since_detection", 0, 1e12),
+        ]
+    }
+    delivery = st.builds(
+        Delivery,
+        instance=chunk,
+        received_ns=count,
+        published_ns=count,
+        queue_ms=duration,
+        decode_ms=duration,
+        step_ms=duration,
+    )
+    return Tracks(
+        **draw(headers()),
+        session=draw(session),
+        revision=draw(count),
+        profile=draw(chunk),
+        cloud_used=draw(st.booleans()),
+        gap=draw(count),
+        ignored=draw(count),
+        labels=tuple(names),
+        id=np.sort(np.array(draw(st.lists(count, min_size=n, max_size=n, unique=True)), dtype="i8")),
+        label=draw(whole(n, 0, len(names) - 1)),
+        center=draw(rows((n, 3), -FAR, FAR)),
+        size=draw(rows((n, 3), 0, 1e5, above=True)),
+        velocity=draw(rows((n, 2), -1e5, 1e5)),
+        covariance=draw(rows((n, 6, 6), -1e30, 1e30)),
+        detection=draw(whole(n, -1, INT64)),
+        delivery=draw(st.none() | delivery),
+        **column,
+    )
+
+
+problems = st.builds(
+    Problem,
+    stream=text,
+    instance=chunk,
+    code=word,
+    path=text,
+    expected=text,
+    received=text,
+    message=text,
+    seq=st.none() | count,
+    stamp_ns=st.none() | count,
+    count=count,
+)
+scalars = (
+    st.none() | st.booleans() | st.integers(-(2**63), INT64) | st.floats(allow_nan=False, allow_infinity=False) | text
+)
+values = st.dictionaries(
+    text, st.recursive(scalars, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(text, inner, max_size=3))
+)
+summaries = st.builds(
+    SessionSummary, stream=stream, profile=chunk, state=word, rate_hz=duration, age_s=st.none() | duration
+)
+messages: dict[type[Message], st.SearchStrategy[Message]] = {
+    Detections: detections(),
+    Points: points(),
+    Tracks: tracks(),
+    SessionState: st.builds(
+        SessionState,
+        stream=stream,
+        session=session,
+        state=st.sampled_from(["new", "running", "closed"]),
+        profile=chunk,
+        epoch=st.none() | epoch,
+        seq=st.none() | count,
+        frames=count,
+        queue=count,
+    ),
+    SessionParameters: st.builds(
+        SessionParameters,
+        profile=st.none() | chunk,
+        cloud_wait_s=st.none() | duration,
+        restart=st.booleans(),
+        values=st.none() | values,
+    ),
+    ResetRequest: st.builds(ResetRequest, close=st.booleans()),
+    Problem: problems,
+    ServiceStatus: st.builds(
+        ServiceStatus,
+        instance=chunk,
+        version=word,
+        started_ns=count,
+        uptime_s=duration,
+        state=word,
+        sessions=st.lists(summaries, max_size=3).map(tuple),
+        problems=st.lists(problems, max_size=3).map(tuple),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", MESSAGES)
+@settings(max_examples=50, deadline=None)
+@given(data=st.data())
+def test_every_message_comes_back_equal(kind: type[Message], data: st.DataObject) -> None:
+    """Decoding what was encoded gives an equal message, as msgpack and as JSON, with and without a named encoding."""
+    message = data.draw(messages[kind])
+    for form, payload in (("msgpack", encode(message)), ("json", encode_json(message))):
+        assert decode(payload, kind) == message
+        assert decode(payload, kind, encoding=encoding_of(kind, form=form)) == message
+
+
+@pytest.mark.parametrize("kind", MESSAGES)
+@settings(max_examples=20, deadline=None)
+@given(data=st.data())
+def test_equal_messages_have_equal_bytes(kind: type[Message], data: st.DataObject) -> None:
+    """A message and the one decoded from it encode to the same bytes."""
+    message = data.draw(messages[kind])
+    for write in (encode, encode_json):
+        payload = write(message)
+        assert write(decode(payload, kind)) == payload
+
+
+def test_negative_zero_and_unknown_velocity_survive(detections: Detections) -> None:
+    """The sign of zero and rows of NaN come back, also through JSON, where NaN is null."""
+    assert b"[null,null]" in encode_json(detections)
+    for payload in (encode(detections), encode_json(detections)):
+        received = decode(payload, Detections)
+        assert np.signbit(received.center[1, 2])
+        assert received.velocity is not None
+        assert np.isnan(received.velocity[1]).all()
+        assert np.signbit(received.velocity[0, 1])
+
+
+def test_order_of_map_keys_does_not_matter() -> None:
+    """Parameters that differ in the order of their values alone have equal bytes."""
+    one, other = SessionParameters(values={"a": 1, "b": 2}), SessionParameters(values={"b": 2, "a": 1})
+    assert encode(one) == encode(other)
+
+
+def test_messages_and_errors_cross_processes(examples: dict[str, Message]) -> None:
+    """Every message can be pickled."""
+    for message in examples.values():
+        assert pickle.loads(pickle.dumps(message)) == message  # noqa: S301 - made in this line
+
+
+def test_messages_that_differ_are_not_equal(detections: Detections) -> None:
+    """One number in an array, the sign of a zero or the type makes a difference."""
+    moved = detections.center.copy()
+    moved[1, 2] = 0.0  # was -0.0
+    assert detections.model_copy(update={"center": moved}) != detections
+    assert detections.model_copy(update={"seq": 8}) != detections
+    assert ResetRequest() != SessionParameters()
+
+
+def test_pydantic_writes_the_same_json(examples: dict[str, Message]) -> None:
+    """`model_dump_json`, as programs that know pydantic use it, gives a payload that decodes to the message."""
+    for message in examples.values():
+        assert decode(message.model_dump_json().encode(), type(message)) == message
