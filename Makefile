@@ -34,7 +34,7 @@ tests: install
 	$(BIN)/pytest
 
 schemas: install
-	$(BIN)/python -m optipmb_schemas.export --check schemas/json
+	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md schemas/json
 
 wheel: install
 	sh tests/wheel.sh $(PYTHON) $(BIN)

@@ -4,7 +4,9 @@ from typing import Literal
 
 from pydantic import Field
 
+from optipmb_schemas.errors import MessageError
 from optipmb_schemas.fields import (
+    MAX_TEXT,
     Count,
     Epoch,
     Flag,
@@ -79,6 +81,19 @@ class Problem(Message):
     seq: Count | None = Field(default=None, description="Number of the frame, when known.")
     stamp_ns: Stamp | None = Field(default=None, description="Stamp of the frame, when known.")
     count: Count = Field(default=1, description="How many equal problems this one stands for.")
+
+    @classmethod
+    def of(cls, error: MessageError, *, stream: str, instance: str) -> "Problem":
+        """Return the problem that reports `error`, its texts cut to their limits."""
+        return cls(
+            stream=stream[:MAX_TEXT],
+            instance=instance,
+            code=error.code,
+            path=error.path[:MAX_TEXT],
+            expected=error.expected[:MAX_TEXT],
+            received=error.received[:MAX_TEXT],
+            message=str(error)[:MAX_TEXT],
+        )
 
 
 class SessionSummary(Message):

@@ -84,7 +84,7 @@ class Detections(SensorMessage):
     score: Annotated[NDArray[np.float64], Array("f8", ("M",), 0, 1, above=True)] = Field(
         description="Confidence of the detector. Logits must be passed through a sigmoid first."
     )
-    velocity: Annotated[NDArray[np.float64], Array("f8", ("M", 2), -1e4, 1e4, unknown=True)] | None = Field(
+    velocity: Annotated[NDArray[np.float64], Array("f8", ("M", 2), -1e3, 1e3, unknown=True)] | None = Field(
         default=None,
         description="Velocity over ground in m/s along the x and y axes of `frame` (not relative to a moving sensor). "
         "A row of two NaN (JSON: null) is an object of unknown velocity. Absent: unknown for all.",

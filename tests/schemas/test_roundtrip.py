@@ -79,7 +79,7 @@ def placed(draw: st.DrawFn) -> dict[str, Any]:
 def detections(draw: st.DrawFn) -> Detections:
     """Return detections."""
     m, names = draw(st.integers(0, 9)), draw(labels)
-    velocity = draw(st.none() | rows((m, 2), -1e4, 1e4))
+    velocity = draw(st.none() | rows((m, 2), -1e3, 1e3))
     if velocity is not None:
         velocity[draw(arrays(np.bool_, m))] = np.nan
     return Detections(

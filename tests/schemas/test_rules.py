@@ -12,6 +12,7 @@ from optipmb_schemas import (
     MessageError,
     Points,
     Pose,
+    Problem,
     SessionParameters,
     Tracks,
     decode,
@@ -256,6 +257,17 @@ def test_received_values_are_cut(name: str) -> None:
     assert len(caught.value.received) <= 80
     assert caught.value.received.isascii()
     assert caught.value.received.isprintable()
+
+
+def test_every_error_becomes_a_problem() -> None:
+    """A problem tells all that an error says, cut to the limits of its texts."""
+    with pytest.raises(MessageError) as caught:
+        Pose(translation=[0, float("nan"), 0], quaternion=[1, 0, 0, 0])
+    problem = Problem.of(caught.value, stream="a/b/c", instance="host-1")
+    assert (problem.code, problem.path, problem.received) == ("invalid_value", "translation[1]", "nan")
+    assert problem.message == str(caught.value)
+    long = MessageError("malformed", "p" * 999, "e" * 999, "r" * 999)
+    assert len(Problem.of(long, stream="s" * 999, instance="host-1").message) == 500
 
 
 def test_messages_cannot_be_changed(detections: Detections) -> None:
