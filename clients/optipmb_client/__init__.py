@@ -1,1 +1,25 @@
-"""To be written."""
+"""The client: publish detections and receive tracks from programs of your own, replay and evaluate datasets.
+
+    from optipmb_client import Publisher, Subscriber
+
+The command `optipmb` does everything that needs no programming.
+"""
+
+from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
+from optipmb_client.publisher import Publisher
+from optipmb_client.subscriber import Received, Statistics, Subscriber
+from optipmb_client.transport import DEFAULT_ENDPOINT, Connection
+
+__all__ = [
+    "DEFAULT_ENDPOINT",
+    "ClientError",
+    "Connection",
+    "ConnectionFailed",
+    "Publisher",
+    "Received",
+    "ServiceRefused",
+    "ServiceUnavailable",
+    "Statistics",
+    "Subscriber",
+    "UsageError",
+]

@@ -1,1 +1,22 @@
-"""To be written."""
+"""The OptiPMB tracking service: detections and clouds come in over Zenoh, tracks go out, one session per sensor stream.
+
+    optipmb-service --listen tcp/0.0.0.0:7447
+
+From the outside in:
+
+    cli, settings, logs     the command
+    service                 the control loop: start, signals, timers, end
+    transport               Zenoh, behind the protocols of ports
+    registry, queries       streams and questions, found and sorted
+    lane, inbox             one stream: its queue, its worker's turn
+    session, timing         one density and all decisions about it; pure
+    convert, clouds, records, profiles, problems, meter
+
+Only `transport` knows Zenoh, only `session` knows the filter.
+"""
+
+from importlib.metadata import version
+
+__version__ = version("optipmb")
+
+__all__ = ["__version__"]

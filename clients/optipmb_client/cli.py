@@ -1,0 +1,86 @@
+"""The command `optipmb`. An error is one line on standard error and a status: 2 for what was asked, 1 for the rest."""
+
+import signal
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from types import FrameType
+from typing import Annotated, Any, NoReturn
+
+import typer
+from optipmb_schemas import MessageError
+
+from optipmb_client.arguments import spread
+from optipmb_client.commands.demo import demo
+from optipmb_client.commands.evaluate import evaluate
+from optipmb_client.commands.options import MANY
+from optipmb_client.commands.plot import plot
+from optipmb_client.commands.replay import replay
+from optipmb_client.commands.status import status
+from optipmb_client.commands.track import track
+from optipmb_client.datasets import DatasetError
+from optipmb_client.errors import ClientError, UsageError
+
+__all__ = ["app", "main", "run"]
+
+FAILED = 1
+WRONG = 2
+INTERRUPTED = 128 + signal.SIGINT
+TERMINATED = 128 + signal.SIGTERM
+
+# What the option parser raises for a wrong option: the base of its public subclass, as it has no public name itself.
+_OptionError: Any = typer.BadParameter.__base__
+
+app = typer.Typer(
+    name="optipmb", help="Track objects in 3D: offline, or through a tracking service.", add_completion=False
+)
+for command in (demo, track, replay, evaluate, plot, status):
+    app.command()(command)
+
+
+def _version(value: bool) -> None:  # noqa: FBT001  the parser calls it so
+    if value:
+        typer.echo(f"optipmb {version('optipmb')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    *,
+    _show: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Options before the command."""
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command line, without the program's name; return the exit status."""
+    try:
+        result = app(spread(arguments, MANY) or ["--help"], prog_name="optipmb", standalone_mode=False)
+        return int(result or 0)
+    except _OptionError as error:
+        return _fail(WRONG, error.format_message())
+    except (UsageError, DatasetError, MessageError) as error:
+        return _fail(WRONG, str(error))
+    except ClientError as error:
+        return _fail(FAILED, str(error))
+    except OSError as error:
+        return _fail(WRONG, f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail(INTERRUPTED, "interrupted")
+
+
+def main() -> NoReturn:
+    """Run the command line of this process and exit."""
+    signal.signal(signal.SIGTERM, _terminate)
+    sys.exit(run(sys.argv[1:]))
+
+
+def _terminate(_number: int, _frame: FrameType | None) -> NoReturn:
+    sys.exit(TERMINATED)  # as an exception, so that every session is closed and every child ended
+
+
+def _fail(status: int, text: str) -> int:
+    print("optipmb: " + " ".join(text.split()), file=sys.stderr)  # noqa: T201  this is the error line
+    return status

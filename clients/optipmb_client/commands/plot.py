@@ -1,0 +1,50 @@
+"""`optipmb plot`: a picture of tracks from above."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from optipmb_client.commands.evaluate import labels_of
+from optipmb_client.commands.options import (
+    AsJson,
+    DatasetName,
+    Detections,
+    Options,
+    Root,
+    Sequences,
+    Tracks,
+    open_sequences,
+    print_json,
+    say,
+)
+from optipmb_client.errors import UsageError
+
+
+def plot(  # noqa: PLR0913  these are the command's options
+    *,
+    dataset: DatasetName,
+    tracks: Tracks,
+    out: Annotated[Path, typer.Option("--out", help="The PNG file.")],
+    root: Root = None,
+    detections: Detections = None,
+    sequences: Sequences = None,
+    option: Options = None,
+    score: Annotated[float | None, typer.Option(help="Least mean score of a track; default: the best one.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Draw the tracks of one sequence from above, with what was missed and confused where the truth is known."""
+    from optipmb_client.drawing import draw_results  # noqa: PLC0415  loads the solvers of scipy
+    from optipmb_client.evaluation import default_rules, evaluate_files  # noqa: PLC0415  as above
+
+    _, chosen = open_sequences(dataset, root, detections, sequences, option)
+    if len(chosen) != 1:
+        raise UsageError(f"--sequences: one sequence makes a picture, received {len(chosen)}")
+    (sequence,) = chosen
+    truth = sequence.truth()
+    results = evaluate_files(chosen, tracks, labels_of(chosen), default_rules(dataset)) if truth is not None else []
+    draw_results(out, sequence, tracks, results, score)
+    if as_json:
+        print_json({"command": "plot", "dataset": dataset, "sequence": sequence.name, "picture": out})
+    else:
+        say(f"picture in {out}")

@@ -1,0 +1,291 @@
+"""The KITTI tracking benchmark.
+
+Conventions: the sensor frame of detections is the rectified camera frame with its axes named anew, z up (see
+`optipmb_client.camera`); the world is the same for the camera of frame 0. Clouds are in the velodyne frame. Frames are
+0.1 s apart. Truth boxes are ignored when largely invisible or cut by the image's border, as AB3DMOT's protocol has it.
+
+Layout, below a root that holds `training` or is itself such a folder: `calib/SSSS.txt`, `poses/SSSS.txt` or
+`oxts/SSSS.txt`, and, where there are any, `label_02/SSSS.txt` and `velodyne/SSSS/FFFFFF.bin`. Detections are
+`detections/DETECTOR/CLASS/SSSS.txt`, in the root or beside it.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+
+from optipmb_client.camera import SENSOR_FROM_CAMERA, Camera, sensor_from_kitti
+from optipmb_client.datasets.interface import (
+    Cloud,
+    DataSequence,
+    DetectionFrame,
+    Points,
+    Regions,
+    Truth,
+)
+from optipmb_client.datasets.kitti_files import (
+    Calibration,
+    read_calibration,
+    read_detections,
+    read_labels,
+    read_oxts,
+    read_poses,
+)
+from optipmb_client.files import DatasetError, read_bytes, read_rows
+from optipmb_client.geometry import Floats, Ints, Pose, pose_of, stack_poses, to_world
+from optipmb_client.results import KittiResultWriter, ResultWriter
+
+PERIOD_NS = 100_000_000
+
+SPLITS = {
+    "train": ("0000", "0002", "0003", "0004", "0005", "0007", "0009", "0011", "0017", "0020"),
+    "val": ("0001", "0006", "0008", "0010", "0012", "0013", "0014", "0015", "0016", "0018", "0019"),
+}
+"""AB3DMOT's splits of the training sequences."""
+
+_TYPE_CODES = {"Pedestrian": 1, "Car": 2, "Cyclist": 3}
+_DONT_CARE = "DontCare"
+_MAX_OCCLUSION = 2
+_SCAN_COLUMNS = 4
+_AXES = np.eye(4)
+_AXES[:3, :3] = SENSOR_FROM_CAMERA
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the files of a KITTI root are."""
+
+    base: Path
+    detector: Path
+    """The folder with one folder per class."""
+    probability: bool
+    """Scores are probabilities already, not logits."""
+    clouds: bool
+    """Clouds are wanted."""
+
+    def text(self, kind: str, sequence: str) -> Path:
+        """Return the path of one of the text files of a sequence."""
+        return self.base / kind / f"{sequence}.txt"
+
+
+class KittiSequence:
+    """One sequence; files are read when they are first needed, and once."""
+
+    def __init__(self, name: str, layout: Layout) -> None:
+        self.name = name
+        self._layout = layout
+        classes = [path.parent.name for path in sorted(layout.detector.glob(f"*/{name}.txt"))]
+        if not classes:
+            raise DatasetError(layout.detector / "CLASS" / f"{name}.txt", "detections of at least one class", "none")
+        self.labels = tuple(classes)
+
+    def __len__(self) -> int:
+        return len(self._world_from_camera)
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """The calibration of the recording."""
+        return read_calibration(self._layout.text("calib", self.name))
+
+    @property
+    def camera(self) -> Camera:
+        """Camera 2, in whose images the benchmark counts; its image size is that of most sequences."""
+        return Camera(self.calibration.projection)
+
+    @cached_property
+    def _world_from_camera(self) -> Floats:
+        """(F, 4, 4) in camera axes."""
+        poses, oxts = self._layout.text("poses", self.name), self._layout.text("oxts", self.name)
+        if poses.exists():
+            return read_poses(poses)
+        if oxts.exists():
+            return read_oxts(oxts, self.calibration)
+        raise DatasetError(poses, f"a pose file, or {oxts}", "neither")
+
+    @cached_property
+    def poses(self) -> tuple[Pose, ...]:
+        """World from sensor, one per frame, both z up."""
+        return tuple(pose_of(matrix) for matrix in _AXES @ self._world_from_camera @ _AXES.T)
+
+    @cached_property
+    def _scans(self) -> dict[int, Path]:
+        if not self._layout.clouds:
+            return {}
+        folder = self._layout.base / "velodyne" / self.name
+        return {int(path.stem): path for path in folder.glob("*.bin") if path.stem.isdigit()}
+
+    @property
+    def has_clouds(self) -> bool:
+        """Whether any frame has a point cloud."""
+        return bool(self._scans)
+
+    def frames(self) -> Iterator[DetectionFrame]:
+        """Yield every frame in order, also those without detections."""
+        count = len(self)
+        files = [
+            read_detections(self._layout.detector / label / f"{self.name}.txt", count, _TYPE_CODES.get(label))
+            for label in self.labels
+        ]
+        label = np.concatenate([np.full(len(file.frame), i, dtype=np.int64) for i, file in enumerate(files)])
+        frame = np.concatenate([file.frame for file in files])
+        order = np.argsort(frame, kind="stable")
+        center, size, yaw = sensor_from_kitti(
+            np.concatenate([file.bottom for file in files]),
+            np.concatenate([file.hwl for file in files]),
+            np.concatenate([file.rotation_y for file in files]),
+        )
+        score = np.concatenate([file.score for file in files])
+        if not self._layout.probability:
+            score = _sigmoid(score)
+        bounds = np.searchsorted(frame[order], np.arange(count + 1))
+        for index, pose in enumerate(self.poses):
+            rows: Ints = order[bounds[index] : bounds[index + 1]]
+            yield DetectionFrame(
+                index=index,
+                stamp_ns=index * PERIOD_NS,
+                pose=pose,
+                labels=self.labels,
+                label=label[rows],
+                center=center[rows],
+                size=size[rows],
+                yaw=yaw[rows],
+                score=score[rows],
+                cloud=self._cloud(index),
+            )
+
+    def _cloud(self, index: int) -> Cloud | None:
+        path = self._scans.get(index)
+        if path is None:
+            return None
+        pose = pose_of(_AXES @ self._world_from_camera[index] @ self.calibration.rectified_from_velodyne)
+        return Cloud(partial(read_scan, path), pose.translation, pose.quaternion)
+
+    def truth(self) -> Truth | None:
+        """Return the annotations in the world frame; None where the sequence has no label file."""
+        path = self._layout.text("label_02", self.name)
+        if not path.exists():
+            return None
+        file = read_labels(path, len(self))
+        types = np.asarray(file.type, dtype=np.str_)
+        kept = types != _DONT_CARE
+        labels = tuple(sorted(set(types[kept].tolist())))
+        center, size, yaw = sensor_from_kitti(file.bottom[kept], file.hwl[kept], file.rotation_y[kept])
+        rotation, translation = stack_poses(self.poses)
+        frame = file.frame[kept]
+        center, yaw = to_world(rotation[frame], translation[frame], center, yaw)
+        occlusion, truncation = file.occlusion[kept], file.truncation[kept]
+        count = len(frame)
+        return Truth(
+            labels=labels,
+            frame=frame,
+            id=file.id[kept],
+            label=np.searchsorted(labels, types[kept]).astype(np.int64) if labels else np.empty(0, dtype=np.int64),
+            center=center,
+            size=size,
+            yaw=yaw,
+            velocity=np.full((count, 2), np.nan),
+            occlusion=occlusion,
+            truncation=truncation,
+            covered=np.full(count, np.nan),
+            points=np.full(count, -1, dtype=np.int64),
+            box2d=file.box2d[kept],
+            ignored=(occlusion > _MAX_OCCLUSION) | (truncation > 0),
+            regions=Regions(file.frame[~kept], file.box2d[~kept]),
+        )
+
+
+def read_scan(path: Path) -> Points:
+    """Return the points (P, 3) of a velodyne file.
+
+    Raises:
+        DatasetError: the file cannot be read, or is no list of four 32-bit numbers per point.
+
+    """
+    data = read_bytes(path, "a velodyne scan")
+    if len(data) % (4 * _SCAN_COLUMNS):
+        raise DatasetError(path, "16 bytes per point", f"{len(data)} bytes")
+    return np.ascontiguousarray(np.frombuffer(data, dtype="<f4").reshape(-1, _SCAN_COLUMNS)[:, :3])
+
+
+class KittiDataset:
+    """A KITTI tracking root together with one detector's results."""
+
+    name = "kitti"
+    profile = "kitti"
+
+    def __init__(self, root: Path, detections: str | Path | None = None, *, clouds: bool = True) -> None:
+        base = root / "training" if (root / "training").is_dir() else root
+        if not (base / "calib").is_dir():
+            received = "a folder without them" if root.is_dir() else "no such folder"
+            raise DatasetError(root, "a KITTI tracking root (with training/calib or calib)", received)
+        detector = _find_detector(root, base, detections)
+        self._layout = Layout(base, detector, _are_probabilities(detector), clouds)
+
+    def sequences(self, names: Sequence[str]) -> list[KittiSequence]:
+        """Return the sequences of these names; `all` are those with detections, `train` and `val` the splits.
+
+        Raises:
+            DatasetError: a named sequence is not there, or none is.
+
+        """
+        present = self._present()
+        wanted: list[str] = []
+        for name in names:
+            wanted += present if name == "all" else SPLITS.get(name, (name,))
+        missing = sorted(set(wanted) - set(present))
+        if missing:
+            raise DatasetError(
+                self._layout.base,
+                f"calib and detections ({self._layout.detector}) of the sequences asked for",
+                f"none for {' '.join(missing)}; there are {' '.join(present) or 'none'}",
+            )
+        if not wanted:
+            raise DatasetError(self._layout.base, "at least one sequence", "none")
+        return [KittiSequence(name, self._layout) for name in dict.fromkeys(wanted)]
+
+    def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
+        """Return a writer of `out/SSSS.txt`."""
+        camera = KittiSequence(sequence.name, self._layout).camera
+        return KittiResultWriter(out / f"{sequence.name}.txt", camera)
+
+    def _present(self) -> list[str]:
+        calibrated = {path.stem for path in (self._layout.base / "calib").glob("*.txt")}
+        detected = {path.stem for path in self._layout.detector.glob("*/*.txt")}
+        return sorted(calibrated & detected)
+
+
+def _find_detector(root: Path, base: Path, detections: str | Path | None) -> Path:
+    """Return the folder of a detector, given its name, its path, or nothing when there is just one."""
+    folders = dict.fromkeys(place / "detections" for place in (root, base, base.parent, root.parent))
+    if detections is not None:
+        for place in (*(folder / detections for folder in folders), Path(detections)):
+            if any(place.glob("*/*.txt")):
+                return place
+        raise DatasetError(root, f"detections/{detections}/CLASS/SSSS.txt below or beside it", "no such files")
+    found = dict.fromkeys(path.parents[1].resolve() for folder in folders for path in folder.glob("*/*/*.txt"))
+    if len(found) != 1:
+        names = ", ".join(sorted(path.name for path in found))
+        raise DatasetError(
+            root, "the name of a detector, or just one in detections/", f"several: {names}" if found else "none"
+        )
+    return next(iter(found))
+
+
+def _are_probabilities(detector: Path) -> bool:
+    """Tell probabilities from logits: all scores of all files of the detector lie in (0, 1]."""
+    column = 6
+    for path in sorted(detector.glob("*/*.txt")):
+        for _, fields in read_rows(path, "a detection file", ","):
+            try:
+                if not 0.0 < float(fields[column]) <= 1.0:
+                    return False
+            except (IndexError, ValueError):
+                continue  # the reader of the file names the place when the file is used
+    return True
+
+
+def _sigmoid(logit: Floats) -> Floats:
+    # tanh does not overflow; the floor keeps hopeless scores inside (0, 1].
+    return np.asarray(np.maximum(0.5 * (1.0 + np.tanh(0.5 * logit)), 1e-12), dtype=np.float64)

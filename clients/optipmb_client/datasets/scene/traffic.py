@@ -1,0 +1,279 @@
+"""Road users that follow their routes: who is where at which time.
+
+Conventions: world frame, z up with the ground at 0, metres, seconds. Object 0 of the vehicles carries the sensor.
+
+Vehicles follow one another by the intelligent driver model (Treiber, Hennecke and Helbing, 2000), keep the speed that a
+bend allows, wait at the stop line until nobody whose way conflicts with theirs is on the crossing, and let pedestrians
+cross. A body lies on its path with both axles, as a car does that is steered at its front. None of this is a motion
+model of a tracker.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optipmb_client.datasets.scene.crossing import Crossing
+from optipmb_client.datasets.scene.paths import STEP, Path, interpolate, resample, smooth
+from optipmb_client.datasets.scene.routes import Route
+from optipmb_client.geometry import Bools, Floats, Ints
+
+_ACCELERATION = 1.6
+_COMFORT = 2.0
+_HARD = 6.0
+_HEADWAY = 1.2
+_STANDSTILL = 2.0
+"""Gap to the vehicle in front when both stand, in metres."""
+_AT_LINE = 0.6
+_LOOK_AHEAD = 45.0
+_FREE = 1e4
+_WALK_ACCELERATION = 1.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where some road users were at each frame."""
+
+    center: Floats
+    """(F, O, 2)"""
+    yaw: Floats
+    """(F, O)"""
+    velocity: Floats
+    """(F, O, 2)"""
+
+
+class Vehicles:
+    """The state of all driving vehicles and cyclists."""
+
+    def __init__(self, routes: list[Route], size: Floats) -> None:
+        self._routes = routes
+        longest = max(len(route.path.points) for route in routes)
+        # Shorter routes go on at their last point; nobody gets there before the scene ends.
+        self._points = np.stack(
+            [np.pad(r.path.points, ((0, longest - len(r.path.points)), (0, 0)), "edge") for r in routes]
+        )
+        self._limit = np.stack([np.pad(r.limit, (0, longest - len(r.limit)), "edge") for r in routes])
+        self._length, self._width = size[:, 0], size[:, 1]
+        self._s = np.array([route.start for route in routes])
+        self._all = np.arange(len(routes))
+        self._next = [0] * len(routes)
+        self._speed = self._limit[self._all, (self._s / STEP).astype(np.int64)] * 0.9
+
+    def state(self) -> tuple[Floats, Floats, Floats]:
+        """Return centres (N, 2), yaws (N,) and velocities (N, 2)."""
+        front, rear = self._axles()
+        along = front - rear
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        return 0.5 * (front + rear), np.arctan2(along[:, 1], along[:, 0]), self._speed[:, None] * along
+
+    def _axles(self) -> tuple[Floats, Floats]:
+        reach = 0.3 * self._length
+        return (
+            interpolate(self._points, self._all, self._s + reach),
+            interpolate(self._points, self._all, self._s - reach),
+        )
+
+    def step(self, h: float, crossing: Crossing) -> None:
+        """Drive on for h seconds."""
+        limit = self._limit[self._all, np.minimum((self._s / STEP).astype(np.int64), self._limit.shape[1] - 1)]
+        gap, lead = self._leaders()
+        acceleration = np.minimum(
+            _follow(self._speed, limit, gap, lead, _STANDSTILL),
+            _follow(self._speed, limit, self._lines(h, crossing), np.zeros(len(gap)), _AT_LINE),
+        )
+        speed = np.maximum(self._speed + h * np.clip(acceleration, -_HARD, _ACCELERATION), 0.0)
+        self._s = self._s + 0.5 * h * (self._speed + speed)
+        self._speed = speed
+
+    def _leaders(self) -> tuple[Floats, Floats]:
+        """Return the free way (N,) before each vehicle and the speed (N,) of what ends it."""
+        center, yaw, velocity = self.state()
+        heading = np.column_stack([np.cos(yaw), np.sin(yaw)])
+        # A vehicle is three discs along its length.
+        part = np.array([-1.0, 0.0, 1.0])
+        reach = 0.5 * np.maximum(self._length - self._width, 0.0)
+        discs = center[:, None] + part[None, :, None] * (reach[:, None] * heading)[:, None]
+        ahead = np.arange(1.0, _LOOK_AHEAD, 1.0)
+        way = interpolate(self._points, self._all[:, None], self._s[:, None] + 0.5 * self._length[:, None] + ahead)
+        close = np.full((len(center), len(ahead), len(center)), np.inf)
+        for k in range(3):
+            close = np.minimum(close, np.linalg.norm(way[:, :, None] - discs[None, None, :, k], axis=3))
+        touch = np.asarray(close < 0.5 * (self._width[:, None] + self._width)[:, None, :] + 0.35, dtype=np.bool_)
+        touch[self._all, :, self._all] = False
+        hit = touch.any(axis=2)
+        first = np.asarray(hit.argmax(axis=1), dtype=np.int64)
+        blocked = np.take_along_axis(hit, first[:, None], axis=1)[:, 0]
+        other = touch[self._all, first].argmax(axis=1)
+        lead = np.einsum("nd,nd->n", velocity[other], heading)
+        return np.where(blocked, ahead[first] + 0.3, _FREE), np.where(blocked, np.maximum(lead, 0.0), 0.0)
+
+    def _lines(self, h: float, crossing: Crossing) -> Floats:
+        """Return the way (N,) to the stop line of each vehicle that has no leave to cross it."""
+        front, rear = self._s + 0.5 * self._length, self._s - 0.5 * self._length
+        movements: dict[int, int] = {}
+        distance: dict[int, float] = {}
+        for i, route in enumerate(self._routes):
+            if self._next[i] < len(route.gates) and rear[i] > route.gates[self._next[i]].clear:
+                crossing.vehicles.pop(i, None)
+                self._next[i] += 1
+            if self._next[i] < len(route.gates):
+                gate = route.gates[self._next[i]]
+                movements[i], distance[i] = gate.movement, gate.stop - float(front[i])
+                if i in crossing.vehicles:
+                    crossing.vehicles[i] = (gate.movement, float(rear[i]) - gate.stop)
+        crossing.ask(movements, distance, {i: self._speed[i] ** 2 / (2.0 * 1.5) + 8.0 for i in distance})
+        crossing.grant(movements, h)
+        free = np.full(len(front), _FREE)
+        for i, gap in distance.items():
+            if i not in crossing.vehicles:
+                free[i] = max(gap, 0.05)
+        return free
+
+
+def _follow(speed: Floats, desired: Floats, gap: Floats, lead: Floats, standstill: float) -> Floats:
+    """Return the acceleration of the intelligent driver model."""
+    wanted = standstill + np.maximum(
+        0.0,
+        speed * _HEADWAY * (standstill / _STANDSTILL)
+        + speed * (speed - lead) / (2.0 * np.sqrt(_ACCELERATION * _COMFORT)),
+    )
+    free = 1.0 - (speed / np.maximum(desired, 0.1)) ** 4
+    return np.asarray(
+        _ACCELERATION * (np.maximum(free, -1.5) - (wanted / np.maximum(gap, 0.05)) ** 2), dtype=np.float64
+    )
+
+
+class Walkers:
+    """The state of all pedestrians."""
+
+    def __init__(self, routes: list[Route]) -> None:
+        self._routes = routes
+        self._s = [route.start for route in routes]
+        self._speed = [0.8 * float(r.limit[int(r.start / STEP)]) for r in routes]
+        self._gate = [sum(g.stop < r.start for g in r.gates) for r in routes]
+        self._pause = [sum(p.stop < r.start for p in r.pauses) for r in routes]
+        self._rest = [0.0] * len(routes)
+        self._waited = [0.0] * len(routes)
+
+    def state(self) -> tuple[Floats, Floats, Floats]:
+        """Return centres (N, 2), yaws (N,) and velocities (N, 2)."""
+        center, along = np.empty((len(self._s), 2)), np.empty((len(self._s), 2))
+        for i, route in enumerate(self._routes):
+            before, center[i], after = route.path.at(np.array([self._s[i] - 0.3, self._s[i], self._s[i] + 0.3]))
+            along[i] = (after - before) / max(float(np.hypot(*(after - before))), 1e-9)
+        return center, np.arctan2(along[:, 1], along[:, 0]), np.asarray(self._speed)[:, None] * along
+
+    def step(self, h: float, crossing: Crossing) -> None:
+        """Walk on for h seconds."""
+        crossing.impatient = set()
+        for i, route in enumerate(self._routes):
+            s = self._s[i]
+            stop = min(self._kerb(i, h, crossing), self._resting_place(i, h))
+            speed = self._speed[i]
+            index = min(int(s / STEP), len(route.limit) - 1)
+            wanted = min(route.limit[index], np.sqrt(max(0.0, 2.0 * _WALK_ACCELERATION * (stop - s - 0.05))))
+            new = speed + np.clip(wanted - speed, -2.0 * _WALK_ACCELERATION * h, _WALK_ACCELERATION * h)
+            self._s[i] = s + 0.5 * h * (speed + new)
+            self._speed[i] = new
+
+    def _kerb(self, i: int, h: float, crossing: Crossing) -> float:
+        """Return the arc length at which pedestrian i must stop for traffic."""
+        gates = self._routes[i].gates
+        if self._gate[i] < len(gates) and self._s[i] > gates[self._gate[i]].clear:
+            crossing.walkers.pop(i, None)
+            self._gate[i] += 1
+        if self._gate[i] >= len(gates):
+            return np.inf
+        gate = gates[self._gate[i]]
+        if i not in crossing.walkers and gate.stop - self._s[i] < 0.5:  # noqa: PLR2004 - half a metre before the kerb
+            self._waited[i] += h
+            if crossing.wait_on_foot(gate.movement, self._waited[i]):
+                crossing.walkers[i] = gate.movement
+                self._waited[i] = 0.0
+        return np.inf if i in crossing.walkers else gate.stop
+
+    def _resting_place(self, i: int, h: float) -> float:
+        """Return the arc length at which pedestrian i stands for a while."""
+        pauses = self._routes[i].pauses
+        if self._pause[i] >= len(pauses):
+            return np.inf
+        pause = pauses[self._pause[i]]
+        if pause.stop - self._s[i] < 0.2:  # noqa: PLR2004 - close enough to count as there
+            self._rest[i] += h
+            if self._rest[i] >= pause.seconds:
+                self._rest[i] = 0.0
+                self._pause[i] += 1
+                return np.inf
+        return pause.stop
+
+
+def simulate(
+    vehicles: list[Route], size: Floats, walkers: list[Route], times: Floats, step: float = 0.05
+) -> tuple[Motion, Motion]:
+    """Return the motion of vehicles and of pedestrians at equally spaced times (F,) that start at 0."""
+    cars, people, crossing = Vehicles(vehicles, size), Walkers(walkers), Crossing()
+    records: tuple[list[tuple[Floats, Floats, Floats]], list[tuple[Floats, Floats, Floats]]] = ([], [])
+    period = float(times[1] - times[0]) if len(times) > 1 else step
+    count = max(1, round(period / step))
+    for _ in times:
+        records[0].append(cars.state())
+        records[1].append(people.state())
+        for _ in range(count):
+            people.step(period / count, crossing)
+            cars.step(period / count, crossing)
+    driven, walked = (Motion(*(np.stack(column) for column in zip(*record, strict=True))) for record in records)
+    return driven, walked
+
+
+def drive_legs(legs: tuple[tuple[Floats, bool], ...], times: Floats, offset: float, reach: float) -> Motion:
+    """Return the motion (O = 1) of one vehicle that drives legs over and over, with a rest after each.
+
+    Args:
+        legs: corner points (K, 2) in the direction in which the car looks, and whether it is driven backwards.
+        times: (F,)
+        offset: how far into the round it is at time 0, in seconds.
+        reach: distance of the axles from the middle.
+
+    """
+    tracks = [_track(points) for points, _ in legs]
+    speed = [1.5 if backwards else 2.5 for _, backwards in legs]
+    rest = [1.5, 1.0, 1.0, 6.0]
+    spent = [_ride(stop - start, v, np.empty(0))[2] for (_, start, stop), v in zip(tracks, speed, strict=True)]
+    ends = np.cumsum([a + b for a, b in zip(spent, rest, strict=True)])
+    clock = (times + offset) % ends[-1]
+    leg: Ints = np.searchsorted(ends, clock, side="right").astype(np.int64)
+    center, yaw, velocity = np.empty((len(times), 1, 2)), np.empty((len(times), 1)), np.empty((len(times), 1, 2))
+    for k, ((path, start, stop), (_, backwards)) in enumerate(zip(tracks, legs, strict=True)):
+        rows: Bools = leg == k
+        driven, pace, _ = _ride(stop - start, speed[k], clock[rows] - (ends[k] - spent[k] - rest[k]))
+        s = stop - driven if backwards else start + driven
+        front, rear = path.at(s + reach), path.at(s - reach)
+        along = (front - rear) / np.linalg.norm(front - rear, axis=1, keepdims=True)
+        center[rows, 0] = 0.5 * (front + rear)
+        yaw[rows, 0] = np.arctan2(along[:, 1], along[:, 0])
+        velocity[rows, 0] = (-pace if backwards else pace)[:, None] * along
+    return Motion(center, yaw, velocity)
+
+
+def _track(points: Floats) -> tuple[Path, float, float]:
+    """Return a path through corner points that goes on straight at both ends, and the arc lengths of its end points."""
+    lead = 4.0
+    first, last = points[0] - points[1], points[-1] - points[-2]
+    longer = np.vstack(
+        [points[0] + lead * first / np.hypot(*first), points, points[-1] + lead * last / np.hypot(*last)]
+    )
+    path, arc = resample(longer)
+    bent, places = smooth(path, 1.0)
+    start, stop = np.interp(arc[[1, -2]], np.arange(len(places)) * STEP, places)
+    return bent, float(start), float(stop)
+
+
+def _ride(length: float, speed: float, time: Floats, acceleration: float = 0.9) -> tuple[Floats, Floats, float]:
+    """Return way and speed at times after starting from rest, and the time until rest after `length` metres."""
+    speed = min(speed, float(np.sqrt(acceleration * length)))
+    ramp = speed / acceleration
+    whole = length / speed + ramp
+    t = np.clip(time, 0.0, whole)
+    left = np.minimum(t, whole - t)
+    pace = np.minimum(speed, acceleration * left)
+    near = 0.5 * acceleration * np.minimum(left, ramp) ** 2 + speed * np.maximum(left - ramp, 0.0)
+    return np.where(t < 0.5 * whole, near, length - near), pace, whole

@@ -1,0 +1,75 @@
+"""The demonstration: a real service as a child process, a generated scene replayed through it, and what came of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from optipmb_client.child import ServiceProcess
+from optipmb_client.datasets import open_dataset
+from optipmb_client.drawing import draw_results
+from optipmb_client.errors import ClientError
+from optipmb_client.evaluation import ClearResult, combine, default_rules, evaluate_files
+from optipmb_client.recording import Preloaded
+from optipmb_client.replay import Pace, ReplayedSequence, replay
+from optipmb_client.transport import Connection
+
+__all__ = ["Demonstration", "demonstrate"]
+
+START_S = 100.0  # the first start after an installation compiles
+PATIENCE_S = 20.0
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """What the demonstration gave.
+
+    Attributes:
+        replayed: The replay: frames, latencies, file of the tracks.
+        figures: All classes together, tracks below the best threshold of their class left out.
+        picture: View of the tracks from above; None where matplotlib is not installed.
+    """
+
+    replayed: ReplayedSequence
+    figures: ClearResult
+    picture: Path | None
+
+
+def demonstrate(
+    out: Path, *, frames: int, speed: float, on_stage: Callable[[str], None], on_frame: Callable[[], None]
+) -> Demonstration:
+    """Start a service, replay one scene through it at `speed` times real time, end it, and judge the tracks.
+
+    `on_stage` is told what comes next, `on_frame` that a frame has come back.
+
+    Raises:
+        ServiceUnavailable: The service did not start.
+    """
+    dataset = open_dataset("scene", frames=frames)
+    on_stage(f"generating {frames / 10:.0f} s of traffic")
+    (scene,) = dataset.sequences(["0000"])
+    sequence = Preloaded(scene)  # generating takes the processor's time, which would show in the latencies
+    on_stage("starting the service (the first time, it compiles for up to a minute)")
+    with ServiceProcess(log=out / "service.log") as service:
+        service.wait_until_ready(START_S)
+        on_stage(f"replaying through {service.endpoint}, {speed:g} times as fast as recorded")
+        with Connection(service.endpoint) as connection:
+            (replayed,) = replay(
+                connection,
+                dataset,
+                [sequence],
+                out,
+                profile=dataset.profile,
+                pace=Pace(speed=speed, patience_s=PATIENCE_S),
+                on_frame=on_frame,
+            )
+    on_stage("comparing the tracks with the truth, drawing them")
+    labels = next(sequence.frames()).labels
+    results = evaluate_files([sequence], out, labels, default_rules(dataset.name))
+    figures = combine(result.sweep.results[result.sweep.best] for result in results)
+    picture: Path | None = out / "tracks.png"
+    try:
+        draw_results(out / "tracks.png", sequence, out, results)
+    except ClientError as error:  # the picture is worth having, not worth failing for
+        on_stage(str(error))
+        picture = None
+    return Demonstration(replayed, figures, picture)

@@ -1,0 +1,291 @@
+"""CLEAR MOT: misses, false tracks and changes of identity (Bernardin and Stiefelhagen, 2008).
+
+Conventions: counts are of boxes, that is of objects in frames. With GT truth boxes that are not ignored,
+
+    MOTA = 1 - (FN + FP + IDS) / GT
+
+MOTP is the mean of the measure over the true positives: the intersection over union, or the distance in metres. A
+figure that would be a quotient by zero is NaN. MT and ML count the truth objects followed in more than 80 % and in less
+than 20 % of their frames; FRAG counts how often following one goes on after a break.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from optipmb_client.datasets import Truth
+from optipmb_client.evaluation.cases import Case, Rules, prepare
+from optipmb_client.geometry import Bools, Ints
+from optipmb_client.results import ResultTable
+
+_MOSTLY = 0.8
+_HARDLY = 0.2
+
+
+class Switch(NamedTuple):
+    """A change of the track that follows a truth object."""
+
+    sequence: str
+    frame: int
+    truth: int
+    """Id of the object."""
+    old: int
+    """Id of the track until then."""
+    new: int
+    """Id of the track from this frame on."""
+
+
+class Miss(NamedTuple):
+    """A truth box that no track matched."""
+
+    sequence: str
+    frame: int
+    truth: int
+    """Id of the object."""
+
+
+@dataclass(frozen=True)
+class ClearResult:
+    """CLEAR figures of one class, in one sequence or in several together."""
+
+    truth: int
+    """Truth boxes that count (GT)."""
+    true: int
+    """Matched ones (TP)."""
+    false: int
+    """Track boxes that match nothing (FP)."""
+    fragments: int
+    """FRAG"""
+    objects: int
+    """Truth objects of which at least one box counts."""
+    mostly_tracked: int
+    mostly_lost: int
+    similarity: float
+    """Sum of the measure over the matched boxes."""
+    switches: tuple[Switch, ...]
+    misses: tuple[Miss, ...]
+
+    @property
+    def missed(self) -> int:
+        """Truth boxes that count and that nothing matches (FN)."""
+        return self.truth - self.true
+
+    @property
+    def mota(self) -> float:
+        """Multiple object tracking accuracy, at most 1."""
+        return 1.0 - _ratio(self.missed + self.false + len(self.switches), self.truth)
+
+    @property
+    def motp(self) -> float:
+        """Multiple object tracking precision: the mean measure of matched boxes."""
+        return _ratio(self.similarity, self.true)
+
+    @property
+    def precision(self) -> float:
+        """Share of true ones among the track boxes that count."""
+        return _ratio(self.true, self.true + self.false)
+
+    @property
+    def recall(self) -> float:
+        """Share of found ones among the truth boxes that count."""
+        return _ratio(self.true, self.truth)
+
+    def summary(self) -> dict[str, float | int | None]:
+        """Return the figures by their usual names; None for those that are not defined."""
+        figures = {
+            "MOTA": self.mota,
+            "MOTP": self.motp,
+            "precision": self.precision,
+            "recall": self.recall,
+            "GT": self.truth,
+            "TP": self.true,
+            "FP": self.false,
+            "FN": self.missed,
+            "IDS": len(self.switches),
+            "FRAG": self.fragments,
+            "MT": self.mostly_tracked,
+            "ML": self.mostly_lost,
+            "objects": self.objects,
+        }
+        return {name: None if np.isnan(value) else value for name, value in figures.items()}
+
+
+def evaluate_clear(
+    truth: Truth, tracks: ResultTable, name: str, rules: Rules | None = None, *, sequence: str = ""
+) -> ClearResult:
+    """Return the CLEAR figures of one class in one sequence.
+
+    Args:
+        truth: annotations.
+        tracks: results in the same frame of reference.
+        name: the class.
+        rules: how to compare; by default boxes that overlap by a quarter match.
+        sequence: name of the sequence, for the lists of switches and misses.
+
+    """
+    rules = rules or Rules()
+    return clear(prepare(truth, tracks, name, rules, sequence), rules)
+
+
+def clear(case: Case, rules: Rules) -> ClearResult:
+    """Return the CLEAR figures of a prepared case."""
+    match, similarity = match_frames(case, rules)
+    counts = ~case.ignored
+    hit = match >= 0
+    used = np.zeros(len(case.track_frame), dtype=np.bool_)
+    used[match[hit]] = True
+    switches: list[Switch] = []
+    fragments = objects = mostly = hardly = 0
+    for rows in _by_id(case.truth_id).values():
+        if not counts[rows].any():
+            continue
+        objects += 1
+        share = hit[rows][counts[rows]].mean()
+        mostly += int(share > _MOSTLY)
+        hardly += int(share < _HARDLY)
+        switches += _switches(case, rows, match, rules)
+        fragments += _fragments(hit[rows][counts[rows]])
+    missed = np.flatnonzero(counts & ~hit)
+    return ClearResult(
+        truth=int(counts.sum()),
+        true=int((counts & hit).sum()),
+        false=int((~used & ~case.excused).sum()),
+        fragments=fragments,
+        objects=objects,
+        mostly_tracked=mostly,
+        mostly_lost=hardly,
+        similarity=float(similarity[counts & hit].sum()),
+        switches=tuple(sorted(switches)),
+        misses=tuple(Miss(case.sequence, int(case.truth_frame[i]), int(case.truth_id[i])) for i in missed),
+    )
+
+
+def combine(results: Iterable[ClearResult]) -> ClearResult:
+    """Return the figures of several sequences together: counts add up."""
+    parts = list(results)
+    return ClearResult(
+        truth=sum(part.truth for part in parts),
+        true=sum(part.true for part in parts),
+        false=sum(part.false for part in parts),
+        fragments=sum(part.fragments for part in parts),
+        objects=sum(part.objects for part in parts),
+        mostly_tracked=sum(part.mostly_tracked for part in parts),
+        mostly_lost=sum(part.mostly_lost for part in parts),
+        similarity=sum(part.similarity for part in parts),
+        switches=tuple(switch for part in parts for switch in part.switches),
+        misses=tuple(miss for part in parts for miss in part.misses),
+    )
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """CLEAR figures over thresholds on the mean score of a track."""
+
+    thresholds: tuple[float, ...]
+    results: tuple[ClearResult, ...]
+
+    @property
+    def best(self) -> int:
+        """Index of the threshold with the highest MOTA, the lowest threshold of equals."""
+        mota = np.array([result.mota for result in self.results])
+        return int(np.argmax(np.nan_to_num(mota, nan=-np.inf)))
+
+
+def sweep(cases: list[Case], rules: Rules, steps: int = 40) -> Sweep:
+    """Return the figures of all cases together when only tracks with a mean score from a threshold on are kept.
+
+    The thresholds are the lowest mean score, which keeps all, and `steps - 1` further quantiles of the mean scores.
+    """
+    means = [case.mean_scores() for case in cases]
+    scores = np.concatenate([np.unique(mean) for mean in means]) if means else np.empty(0)
+    levels = np.quantile(scores, np.arange(steps) / steps) if len(scores) else np.zeros(1)
+    thresholds = np.unique(levels)
+    results = tuple(
+        combine(clear(case.keep(mean >= level), rules) for case, mean in zip(cases, means, strict=True))
+        for level in thresholds
+    )
+    return Sweep(tuple(thresholds.tolist()), results)
+
+
+def match_frames(case: Case, rules: Rules) -> tuple[Ints, np.ndarray]:
+    """Return the track row (T,) that each truth row matches, -1 for none, and the measure (T,) of the match.
+
+    In each frame the matches of most pairs with the least total cost are taken; with continuity, pairs that matched
+    before and still may are taken first.
+    """
+    match = np.full(len(case.truth_frame), -1, dtype=np.int64)
+    similarity = np.full(len(case.truth_frame), np.nan)
+    last: dict[int, int] = {}
+    order = np.argsort(case.truth_row, kind="stable")
+    frames = case.truth_frame[case.truth_row[order]]
+    bounds = np.flatnonzero(np.diff(frames, prepend=-1))
+    for pairs in np.split(order, bounds[1:]) if len(order) else []:
+        truth, track = case.truth_row[pairs], case.track_row[pairs]
+        chosen = np.zeros(len(pairs), dtype=np.bool_)
+        if rules.continuity:
+            chosen = np.array(
+                [
+                    last.get(t) == k
+                    for t, k in zip(case.truth_id[truth].tolist(), case.track_id[track].tolist(), strict=True)
+                ]
+            )
+        free = ~np.isin(truth, truth[chosen]) & ~np.isin(track, track[chosen])
+        chosen[np.flatnonzero(free)[_assign(truth[free], track[free], case.cost[pairs][free])]] = True
+        match[truth[chosen]] = track[chosen]
+        similarity[truth[chosen]] = case.similarity[pairs][chosen]
+        last.update(zip(case.truth_id[truth[chosen]].tolist(), case.track_id[track[chosen]].tolist(), strict=True))
+    return match, similarity
+
+
+def _assign(rows: Ints, columns: Ints, cost: np.ndarray) -> Ints:
+    """Return which pairs (row, column) to take so that most are taken, and of those ways the one of least cost."""
+    if not len(rows):
+        return np.empty(0, dtype=np.int64)
+    row_names, row = np.unique(rows, return_inverse=True)
+    column_names, column = np.unique(columns, return_inverse=True)
+    # A pair that may not match costs more than all others together, so it is taken only where nothing else is left.
+    table = np.full((len(row_names), len(column_names)), 1e6)
+    table[row, column] = cost
+    index = np.full(table.shape, -1, dtype=np.int64)
+    index[row, column] = np.arange(len(rows))
+    taken = index[linear_sum_assignment(table)]
+    return np.asarray(taken[taken >= 0], dtype=np.int64)
+
+
+def _switches(case: Case, rows: Ints, match: Ints, rules: Rules) -> list[Switch]:
+    """Return the changes of track on one object's rows, in order of frames."""
+    found: list[Switch] = []
+    old: int | None = None
+    for row in rows:
+        if case.ignored[row] or match[row] < 0:
+            old = old if rules.memory else None
+            continue
+        new = int(case.track_id[match[row]])
+        if old not in (None, new):
+            found.append(Switch(case.sequence, int(case.truth_frame[row]), int(case.truth_id[row]), old, new))
+        old = new
+    return found
+
+
+def _fragments(hit: Bools) -> int:
+    """Return how often following goes on after a break."""
+    first = np.flatnonzero(hit)
+    if not len(first):
+        return 0
+    return int(np.sum(np.diff(hit[first[0] :].astype(np.int64)) == 1))
+
+
+def _by_id(identity: Ints) -> dict[int, Ints]:
+    """Return the rows of each id, in order."""
+    rows: defaultdict[int, list[int]] = defaultdict(list)
+    for row, value in enumerate(identity.tolist()):
+        rows[value].append(row)
+    return {value: np.array(index, dtype=np.int64) for value, index in rows.items()}
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else float("nan")

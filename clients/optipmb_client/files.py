@@ -1,0 +1,119 @@
+"""Text files read with errors that name the place, and written so that nobody sees half a file."""
+
+import os
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class DatasetError(ValueError):
+    """Raised when data on disk, or an option that selects them, cannot be used.
+
+    `path` is the file, folder or option; `line` counts from 1 and is None where no line is meant; `expected` and
+    `received` say what should have been there and what was. The text of the error is one line.
+    """
+
+    def __init__(self, path: Path | str, expected: str, received: str, *, line: int | None = None) -> None:
+        self.path = str(path)
+        self.line = line
+        self.expected = expected
+        self.received = received
+        place = self.path if line is None else f"{self.path}:{line}"
+        super().__init__(f"{place}: expected {expected}, received {received}")
+
+
+def read_text(path: Path, what: str) -> str:
+    """Return the text of a file; `what` names its content in the error when it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise DatasetError(path, what, error.strerror or "an unreadable file") from error
+    except UnicodeDecodeError as error:
+        raise DatasetError(path, what, "bytes that are not text") from error
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """Return the bytes of a file; `what` names its content in the error when it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DatasetError(path, what, error.strerror or "an unreadable file") from error
+
+
+def read_rows(path: Path, what: str, separator: str | None = None) -> list[tuple[int, list[str]]]:
+    """Return (line number from 1, fields) of every line of a file that is not blank."""
+    lines = enumerate(read_text(path, what).splitlines(), start=1)
+    return [(number, line.split(separator)) for number, line in lines if line.strip()]
+
+
+def numbers(path: Path, rows: Iterable[tuple[int, list[str]]], columns: int, what: str) -> NDArray[np.float64]:
+    """Return fields as finite numbers (R, columns).
+
+    Raises:
+        DatasetError: a line has another number of fields, or a field is not a finite number; names the line.
+
+    """
+    values = np.empty((0, columns))
+    taken = list(rows)
+    for line, fields in taken:
+        if len(fields) != columns:
+            raise DatasetError(path, f"{columns} fields ({what})", f"{len(fields)} fields", line=line)
+    if taken:
+        try:
+            values = np.array([fields for _, fields in taken], dtype=np.float64)
+        except ValueError:
+            values = np.array([[_number(path, line, field) for field in fields] for line, fields in taken])
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        row, column = bad[0]
+        line, fields = taken[row]
+        raise DatasetError(path, "a finite number", repr(fields[column]), line=line)
+    return values
+
+
+def _number(path: Path, line: int, field: str) -> float:
+    try:
+        return float(field)
+    except ValueError as error:
+        raise DatasetError(path, "a number", repr(field), line=line) from error
+
+
+class AtomicText:
+    """A text file that appears under its name all at once, when it is closed.
+
+    Until then its lines stand in a temporary file in the same folder; `discard` removes that one and leaves what was
+    there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        self._temporary = Path(name)
+        self._file = os.fdopen(descriptor, "w", encoding="utf-8", newline="\n")
+
+    def write(self, text: str) -> None:
+        """Append text."""
+        self._file.write(text)
+
+    def close(self) -> None:
+        """Put the file in its place; a second call does nothing."""
+        if self._file.closed:
+            return
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        # A temporary file is private to its owner; the finished one is to be as readable as any other new file.
+        mask = os.umask(0)
+        os.umask(mask)
+        self._temporary.chmod(0o666 & ~mask)
+        self._temporary.replace(self.path)
+
+    def discard(self) -> None:
+        """Drop what was written, unless the file is already in its place."""
+        if not self._file.closed:
+            self._file.close()
+            self._temporary.unlink(missing_ok=True)

@@ -1,0 +1,170 @@
+"""Pictures of a sequence from above, as PNG files.
+
+Conventions: world frame, metres, x to the right and y up. Colours belong to track ids and are from a set that most
+people with a colour vision deficiency can tell apart (Okabe and Ito, 2008); after seven tracks they come round again,
+so every track also carries its id. matplotlib is an extra of the installation and is imported when the first picture is
+drawn.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optipmb_client.datasets import DataSequence, Truth
+from optipmb_client.errors import ClientError
+from optipmb_client.evaluation import ClearResult
+from optipmb_client.geometry import Floats, box_corners, stack_poses
+from optipmb_client.results import ResultTable
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F")
+_INK = "#222222"
+_TRUTH = "#B5B5B5"
+_MARGIN = 6.0
+_BREAK = 5
+"""A path is not drawn across more missing frames than this."""
+
+
+def draw_tracks(
+    path: Path,
+    sequence: DataSequence,
+    tracks: ResultTable,
+    truth: Truth | None = None,
+    results: Sequence[ClearResult] = (),
+) -> None:
+    """Draw the tracks of a sequence from above.
+
+    Args:
+        path: the PNG file.
+        sequence: what was tracked; its poses give the sensor's path.
+        tracks: the tracks in the world frame.
+        truth: annotations in the world frame, drawn thin below the tracks.
+        results: CLEAR figures of the classes; their misses and identity switches are marked.
+
+    Raises:
+        ClientError: matplotlib is not installed.
+
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - matplotlib is an extra
+        from matplotlib.figure import Figure  # noqa: PLC0415 - matplotlib is an extra
+    except ImportError as error:
+        raise ClientError("pictures need matplotlib, which is not installed: pip install 'optipmb[plot]'") from error
+    _, sensor = stack_poses(sequence.poses)
+    low, high = _extent([sensor, tracks.center, truth.center if truth else sensor])
+    width, height = np.maximum(11.0 / max(high - low) * (high - low), (7.5, 3.0)).tolist()
+    figure = Figure(figsize=(width + 0.6, height + 1.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.set_aspect("equal")
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_xlabel("x in the world frame (m)")
+    axes.set_ylabel("y in the world frame (m)")
+    axes.set_title(f"Sequence {sequence.name}: {len(np.unique(tracks.id))} tracks in {len(sequence)} frames")
+    axes.grid(visible=True, color="#EEEEEE", linewidth=0.6)
+    axes.set_axisbelow(True)
+    if truth is not None:
+        _draw_truth(axes, truth)
+    _draw_sensor(axes, sensor, sequence)
+    _draw_paths(axes, tracks, last_frame=len(sequence) - 1)
+    if truth is not None:
+        _draw_failures(axes, truth, results)
+    _legend(figure, axes)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
+def _extent(places: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """Return the corners (2,) of what is to be seen, at least a few metres apart."""
+    points = np.vstack([place[:, :2] for place in places] + [np.zeros((1, 2))] * (not sum(len(p) for p in places)))
+    low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
+    # A long street is to be wider than a line: the short side is at least a quarter of the long one.
+    lack = np.maximum(0.25 * float(max(high - low)) - (high - low), 0.0)
+    return low - 0.5 * lack, high + 0.5 * lack
+
+
+def _draw_truth(axes: "Axes", truth: Truth) -> None:
+    label = "truth"
+    for rows in _rows_by_id(truth.id):
+        axes.plot(*_broken(truth.frame[rows], truth.center[rows]), color=_TRUTH, linewidth=3.0, label=label, zorder=2)
+        label = "_"
+
+
+def _draw_sensor(axes: "Axes", sensor: Floats, sequence: DataSequence) -> None:
+    axes.plot(sensor[:, 0], sensor[:, 1], color=_INK, linewidth=1.2, linestyle=(0, (6, 3)), label="sensor", zorder=3)
+    if len(sequence):
+        axes.plot(*sensor[0, :2], "o", color=_INK, markersize=4, zorder=3)
+        axes.plot(*sensor[-1, :2], ">", color=_INK, markersize=6, zorder=3)
+
+
+def _draw_paths(axes: "Axes", tracks: ResultTable, last_frame: int) -> None:
+    label, box_label = "track (colour and number: its id)", "last box, a line to its front"
+    for rows in _rows_by_id(tracks.id):
+        identity = int(tracks.id[rows[0]])
+        colour = _COLOURS[identity % len(_COLOURS)]
+        axes.plot(*_broken(tracks.frame[rows], tracks.center[rows]), color=colour, linewidth=1.2, label=label, zorder=4)
+        end = rows[-1:]
+        corners = box_corners(tracks.center[end], tracks.size[end], tracks.yaw[end])[0, :4, :2]
+        front, middle = 0.5 * (corners[0] + corners[1]), tracks.center[end[0], :2]
+        alive = int(tracks.frame[end[0]]) == last_frame
+        axes.fill(*corners.T, facecolor=colour, alpha=0.35 if alive else 0.0, zorder=5)
+        axes.plot(
+            *np.vstack([corners, corners[:1]]).T,
+            color=colour,
+            linewidth=1.0 if alive else 0.5,
+            label=box_label,
+            zorder=5,
+        )
+        axes.plot(*np.vstack([middle, front]).T, color=colour, linewidth=1.0 if alive else 0.5, zorder=5)
+        axes.annotate(
+            str(identity),
+            (float(tracks.center[rows[0], 0]), float(tracks.center[rows[0], 1])),
+            xytext=(2, 2),
+            textcoords="offset points",
+            color=colour,
+            fontsize=7,
+            zorder=7,
+        )
+        label = box_label = "_"
+
+
+def _draw_failures(axes: "Axes", truth: Truth, results: Sequence[ClearResult]) -> None:
+    place = {(int(f), int(i)): row for row, (f, i) in enumerate(zip(truth.frame, truth.id, strict=True))}
+    misses = [place[miss.frame, miss.truth] for result in results for miss in result.misses]
+    if misses:
+        axes.plot(
+            *truth.center[misses, :2].T, "x", color=_INK, markersize=3, markeredgewidth=0.6, label="miss", zorder=6
+        )
+    label = "change of id"
+    for result in results:
+        for switch in result.switches:
+            x, y, _ = truth.center[place[switch.frame, switch.truth]].tolist()
+            axes.plot(x, y, "o", color=_INK, markerfacecolor="none", markersize=11, label=label, zorder=8)
+            axes.annotate(
+                f"{switch.old} to {switch.new}", (x, y), xytext=(8, -9), textcoords="offset points", fontsize=8
+            )
+            label = "_"
+
+
+def _legend(figure: "Figure", axes: "Axes") -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=max(1, len(labels)), frameon=False, fontsize=9)
+
+
+def _rows_by_id(identity: np.ndarray) -> list[np.ndarray]:
+    """Return the rows of each id, in the order of ids."""
+    order = np.argsort(identity, kind="stable")
+    bounds = np.flatnonzero(np.diff(identity[order])) + 1
+    return np.split(order, bounds) if len(order) else []
+
+
+def _broken(frame: np.ndarray, center: Floats) -> tuple[Floats, Floats]:
+    """Return the path of one object with a NaN where it was away."""
+    gaps = np.flatnonzero(np.diff(frame) > _BREAK) + 1
+    return np.insert(center[:, 0], gaps, np.nan), np.insert(center[:, 1], gaps, np.nan)

@@ -1,0 +1,255 @@
+"""Publishing detections and point clouds, for programs of your own.
+
+Conventions: lengths in metres, angles in radians, stamps in integer nanoseconds of the sensor's clock. `frame="sensor"`
+means that boxes and points are given in the sensor's own frame (x forward, y left, z up) and come with the pose of that
+frame in the world; `frame="world"` that they are in the fixed world frame already. Velocities are over ground, along
+the axes of the frame.
+
+A stream is named `site/node/sensor`. The service keeps one tracking session per stream.
+"""
+
+import operator
+import secrets
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from optipmb_schemas import PREFIX, Detections, Keys, MessageError, Points, Pose, encode, encoding_of
+
+from optipmb_client.transport import Connection
+
+__all__ = ["Publisher"]
+
+CACHE = 200  # detection messages kept for recovery: 10 s of a sensor at 20 Hz
+
+PoseLike = Pose | tuple[ArrayLike, ArrayLike]
+
+
+class Publisher:
+    """Publishes the detections of one sensor, and its point clouds where somebody uses them.
+
+    What is published is checked first: a wrong shape or value raises `MessageError`, with the path of the field, before
+    anything is sent. Detections are kept for about 10 s, so that a service that restarts or loses its link gets them
+    still. Publishing waits for nobody. One publisher may be used from several threads.
+
+    Args:
+        stream: Name of the stream, `site/node/sensor`. One publisher per stream at a time.
+        connect: Endpoint or endpoints of routers, such as `tcp/10.0.0.1:7447`; default: this machine.
+        config: A Zenoh configuration file, for TLS, passwords and the like.
+        frame: Frame of all boxes and points given to `publish`.
+        timeout: Seconds to wait for a router.
+        connection: Share an open connection (it stays open) in the place of `connect` and `config`.
+        cache: Number of detection messages kept for recovery.
+        prefix: First part of all keys, as configured in the service.
+
+    Raises:
+        ConnectionFailed: No router within `timeout`.
+        MessageError: `stream` is no stream name.
+    """
+
+    def __init__(
+        self,
+        stream: str,
+        connect: str | Sequence[str] | None = None,
+        *,
+        frame: Literal["sensor", "world"] = "sensor",
+        config: str | Path | None = None,
+        timeout: float = 5.0,
+        connection: Connection | None = None,
+        cache: int = CACHE,
+        prefix: str = PREFIX,
+    ) -> None:
+        keys = Keys(prefix)
+        detections, points = keys.detections(stream), keys.points(stream)
+        self.stream = stream
+        self.frame = frame
+        self.epoch = secrets.token_bytes(16)  # tells this run of the publisher from the next one
+        self.last_put_ns = 0  # monotonic time just before the newest detections were handed to the network
+        self._seq = 0
+        self._points_seq = 0
+        self._order = threading.Lock()  # sequence numbers go out in order
+        self._own = Connection(connect, config=config, timeout=timeout) if connection is None else None
+        link = connection or self._own
+        assert link is not None  # noqa: S101  one of the two is there: said for the type checker
+        self._detections = link.cached_sender(detections, encoding_of(Detections), cache=cache)
+        self._points = link.plain_sender(points, encoding_of(Points))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Withdraw the publisher; what was published before is sent. May be called twice."""
+        self._detections.close()
+        self._points.close()
+        if self._own is not None:
+            self._own.close()
+
+    @property
+    def points_wanted(self) -> bool:
+        """Whether anybody subscribes to the point clouds of this stream at the moment."""
+        return self._points.wanted
+
+    def publish(  # noqa: PLR0913  the fields of the message, by name
+        self,
+        *,
+        stamp_ns: int,
+        label: Sequence[str] | ArrayLike,
+        center: ArrayLike,
+        size: ArrayLike,
+        yaw: ArrayLike,
+        score: ArrayLike,
+        velocity: ArrayLike | None = None,
+        labels: Sequence[str] | None = None,
+        pose: PoseLike | None = None,
+        points: ArrayLike | None = None,
+        points_pose: PoseLike | None = None,
+        has_points: bool | None = None,
+    ) -> int:
+        """Publish the detections of one sensor frame, and its point cloud where there is one.
+
+        Args:
+            stamp_ns: Sensor time of the frame.
+            label: Class names of the M objects; or, with `labels`, indices (M,) into it.
+            center: (M, 3), geometric centres of the boxes.
+            size: (M, 3), length, width, height, all positive.
+            yaw: (M,), counter-clockwise from x.
+            score: (M,), in (0, 1].
+            velocity: (M, 2), over ground; a row of NaN where it is unknown. None: unknown for all.
+            labels: The class names that `label` points into.
+            pose: Pose of the sensor in the world, (translation (3,), unit quaternion w x y z (4,)); needed with
+                `frame="sensor"`.
+            points: (P, 3 or more), the cloud of this frame, sent where somebody subscribes to it. Rows that are not
+                finite (no return) are left out, further columns too.
+            points_pose: Pose of the frame the points are in, when it is another than that of the boxes.
+            has_points: Whether the service shall wait for a cloud of this stamp. Default: True when `points` are sent,
+                False when this publisher has sent clouds before, otherwise the service judges. True with `points` sends
+                them in any case.
+
+        Returns:
+            The sequence number of the frame.
+
+        Raises:
+            MessageError: Something in the arguments is no valid message. Nothing was sent.
+        """
+        names, index = _labelled(label, labels)
+        with self._order:  # sequence numbers go out in their order
+            cloud = None
+            if points is not None and (has_points or self.points_wanted):
+                cloud = self._encode_points(stamp_ns, points, pose if points_pose is None else points_pose)
+                has_points = True
+            elif has_points is None and self._points_seq > 0:
+                has_points = False
+            message = Detections(
+                stream=self.stream,
+                epoch=self.epoch,
+                seq=self._seq,
+                stamp_ns=_stamp(stamp_ns),
+                frame=self.frame,
+                pose=_pose(pose),
+                labels=names,
+                label=index,
+                center=_array(center, 3),
+                size=_array(size, 3),
+                yaw=_array(yaw),
+                velocity=None if velocity is None else _array(velocity, 2),
+                score=_array(score),
+                has_points=has_points,
+            )
+            payload = encode(message)
+            if cloud is not None:
+                self._points.put(cloud)
+                self._points_seq += 1
+            self.last_put_ns = time.monotonic_ns()
+            self._detections.put(payload)
+            self._seq += 1
+            return message.seq
+
+    def publish_points(self, *, stamp_ns: int, points: ArrayLike, pose: PoseLike | None = None) -> int | None:
+        """Publish a point cloud by itself, for programs that have it earlier than the detections.
+
+        Arguments as for `publish`, which is then called with `has_points=True`.
+
+        Returns:
+            Its sequence number, which counts clouds; None when nobody subscribes to clouds, and nothing was sent.
+
+        Raises:
+            MessageError: Something in the arguments is no valid message. Nothing was sent.
+        """
+        with self._order:
+            if not self.points_wanted:
+                return None
+            self._points.put(self._encode_points(stamp_ns, points, pose))
+            self._points_seq += 1
+            return self._points_seq - 1
+
+    def _encode_points(self, stamp_ns: int, points: ArrayLike, pose: PoseLike | None) -> bytes:
+        return encode(
+            Points(
+                stream=self.stream,
+                epoch=self.epoch,
+                seq=self._points_seq,
+                stamp_ns=_stamp(stamp_ns),
+                frame=self.frame,
+                pose=_pose(pose),
+                xyz=_finite(points),
+            )
+        )
+
+
+def _labelled(label: Any, labels: Sequence[str] | None) -> tuple[tuple[str, ...], Any]:
+    """Return class names and indices (M,) into them, from either form that `publish` takes."""
+    if labels is not None:
+        return tuple(labels), _array(label)
+    if isinstance(label, str) or not isinstance(label, Iterable):
+        raise MessageError("invalid_value", "label", "a list of class names", repr(label)[:80])
+    names = list(label)
+    for row, name in enumerate(names):
+        if not isinstance(name, str):
+            raise MessageError("invalid_value", f"label[{row}]", "a class name, or labels given too", repr(name)[:80])
+    index = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    return tuple(index), np.array([index[name] for name in names], dtype=np.int64)
+
+
+def _array(values: Any, columns: int | None = None) -> Any:
+    """Return lists as they are (errors then name the element), all else as arrays; without rows: (0, columns)."""
+    array = values if isinstance(values, list | tuple) else np.asarray(values)
+    empty = array.shape == (0,) if isinstance(array, np.ndarray) else not array
+    return np.zeros((0, columns)) if empty and columns is not None else array
+
+
+def _finite(points: ArrayLike) -> Any:
+    """Return x, y, z of the points that have a return: those whose coordinates are finite."""
+    given = _array(points, 3)
+    if not isinstance(given, np.ndarray) or given.ndim != 2 or given.dtype.kind != "f":  # noqa: PLR2004  rows of points
+        return given  # the message refuses what is wrong
+    xyz = np.ascontiguousarray(given[:, :3])
+    finite = np.isfinite(xyz)
+    return xyz if finite.all() else xyz[finite[:, 0] & finite[:, 1:].all(axis=1)]
+
+
+def _stamp(value: Any) -> Any:
+    """Return integers of any library as Python's; what is none is left for the message to refuse."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        return value
+
+
+def _pose(pose: PoseLike | None) -> Pose | None:
+    if pose is None or isinstance(pose, Pose):
+        return pose
+    try:
+        translation, quaternion = pose
+    except (TypeError, ValueError):
+        raise MessageError("invalid_value", "pose", "a pair: translation, quaternion", type(pose).__name__) from None
+    return Pose(translation=_array(translation), quaternion=_array(quaternion))

@@ -1,0 +1,120 @@
+"""Result files of the KITTI tracking benchmark: one `SSSS.txt` per sequence, one line per box.
+
+A line has 18 fields: frame, id, type, truncated, occluded, alpha, x1, y1, x2, y2, h, w, l, x, y, z, ry, score. Boxes
+are in the rectified camera frame of their own frame (x y z = centre of the bottom), image boxes in pixels, `truncated`
+and `occluded` are -1 (unknown). Every track is written, nothing is thresholded: one that no part of the image shows has
+the image box 0 0 0 0 and its 3D box as it is. Numbers have six decimals, so the same tracks always give the same bytes.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from optipmb_client.camera import Camera, alpha_of, kitti_from_sensor, sensor_from_kitti
+from optipmb_client.files import AtomicText, DatasetError, numbers, read_rows
+from optipmb_client.geometry import PoseLike, rotation_of, to_sensor
+from optipmb_client.results.rows import ResultTable, TrackRows
+
+_FIELDS = 18
+_TYPE = 2
+
+
+class KittiResultWriter:
+    """Writes the tracks of one sequence; use it as a context manager, or call `close` at the end."""
+
+    def __init__(self, path: Path, camera: Camera) -> None:
+        self._camera = camera
+        self._file = AtomicText(path)
+
+    @property
+    def path(self) -> Path:
+        """The finished file."""
+        return self._file.path
+
+    def add(self, index: int, pose: PoseLike, tracks: TrackRows) -> None:
+        """Write the tracks (world frame) of frame `index`, whose sensor stood at `pose`."""
+        center, yaw = to_sensor(
+            rotation_of(np.asarray(pose.quaternion)), np.asarray(pose.translation), tracks.center, tracks.yaw
+        )
+        image, _ = self._camera.boxes(center, tracks.size, yaw)
+        bottom, hwl, rotation_y = kitti_from_sensor(center, tracks.size, yaw)
+        alpha = alpha_of(bottom, rotation_y)
+        values = np.column_stack([alpha, image, hwl, bottom, rotation_y, tracks.score])
+        # Adding zero turns a rounded -0 into 0, so that equal numbers are written alike.
+        values = np.round(values, 6) + 0.0
+        for identity, label, row in zip(tracks.id, tracks.label, values, strict=True):
+            text = " ".join(f"{value:.6f}" for value in row)
+            self._file.write(f"{index} {identity} {tracks.labels[label]} -1 -1 {text}\n")
+
+    def close(self) -> None:
+        """Put the file in its place; a sequence without tracks leaves an empty file."""
+        self._file.close()
+
+    def discard(self) -> None:
+        """Drop what was written."""
+        self._file.discard()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.discard()
+
+
+def read_kitti_results(path: Path, labels: Sequence[str] = ()) -> ResultTable:
+    """Return the boxes of a result file in the sensor frame of each box's own frame, ordered by frame, then as written.
+
+    Args:
+        path: the file; 17 fields, without a score, are accepted too and mean score 1.
+        labels: names that come first in the table's labels; further names follow as they appear in the file.
+
+    Raises:
+        DatasetError: the file is missing, a line has another number of fields or a field that is no number, a frame is
+            negative, or one id stands twice in a frame.
+
+    """
+    what = "frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z ry score"
+    rows = read_rows(path, "a KITTI result file")
+    names = list(labels)
+    label = np.empty(len(rows), dtype=np.int64)
+    numeric: list[tuple[int, list[str]]] = []
+    for i, (line, fields) in enumerate(rows):
+        if len(fields) not in (_FIELDS - 1, _FIELDS):
+            raise DatasetError(path, f"{_FIELDS} fields ({what})", f"{len(fields)} fields", line=line)
+        if fields[_TYPE] not in names:
+            names.append(fields[_TYPE])
+        label[i] = names.index(fields[_TYPE])
+        score = fields[_FIELDS - 1 :] or ["1"]
+        numeric.append((line, [*fields[:_TYPE], *fields[_TYPE + 1 : _FIELDS - 1], *score]))
+    values = numbers(path, numeric, _FIELDS - 1, what)
+    frame, identity = values[:, 0].astype(np.int64), values[:, 1].astype(np.int64)
+    _check(path, [line for line, _ in rows], values, frame, identity)
+    center, size, yaw = sensor_from_kitti(values[:, 12:15], values[:, 9:12], values[:, 15])
+    order = np.argsort(frame, kind="stable")
+    return ResultTable(
+        labels=tuple(names),
+        frame=frame,
+        id=identity,
+        label=label,
+        center=center,
+        size=size,
+        yaw=yaw,
+        score=values[:, 16],
+        box2d=values[:, 5:9],
+    ).take(order)
+
+
+def _check(path: Path, lines: list[int], values: np.ndarray, frame: np.ndarray, identity: np.ndarray) -> None:
+    bad = np.flatnonzero((values[:, 0] != frame) | (frame < 0))
+    if len(bad):
+        raise DatasetError(path, "a frame number from 0", f"{values[bad[0], 0]:g}", line=lines[bad[0]])
+    seen: set[tuple[int, int]] = set()
+    for line, key in zip(lines, zip(frame.tolist(), identity.tolist(), strict=True), strict=True):
+        if key in seen:
+            raise DatasetError(path, "an id once per frame", f"id {key[1]} again in frame {key[0]}", line=line)
+        seen.add(key)

@@ -1,0 +1,212 @@
+"""Result files of the nuScenes tracking benchmark: `tracking_results.json`, all samples of all scenes of one run.
+
+The layout is the one of `optipmb_client.results.nuscenes_layout`. `tracking_id` is the name of the scene with the id of
+the track, so that no two scenes share one. Numbers have six decimals, samples are in order of time and boxes in the
+order of the tracks, so the same tracks always give the same bytes. A sample holds at most 500 boxes, as the benchmark
+demands: of more, those with the highest scores are written.
+
+Each scene is first a file of its own, `scenes/NAME.json`, in the same layout; when the last scene of a run is closed,
+they are joined in `tracking_results.json`. A run that is interrupted leaves the scenes that it finished.
+"""
+
+import json
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from optipmb_client.files import AtomicText, DatasetError, read_text
+from optipmb_client.geometry import Ints, PoseLike
+from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES, NUSCENES_META, Submission, read_submission
+from optipmb_client.results.rows import ResultTable, TrackRows
+
+NUSCENES_FILE = "tracking_results.json"
+NUSCENES_MAX_BOXES = 500
+"""Boxes in one sample that the benchmark accepts."""
+
+_DECIMALS = 6
+_DIGITS = 18
+_END = "\n}}\n"
+
+
+class NuScenesRun:
+    """The scenes that are tracked together, and the file that holds them all; may be used by several threads."""
+
+    def __init__(self, out: Path, scenes: Sequence[str], meta: Mapping[str, Any]) -> None:
+        self.path = out / NUSCENES_FILE
+        self._scenes = tuple(dict.fromkeys(scenes))
+        self._open = set(scenes)
+        self._lock = threading.Lock()
+        used = {name: bool(meta.get(name, name == "use_lidar")) for name in NUSCENES_META}
+        self._head = f'{{"meta": {json.dumps(used)}, "results": {{\n'
+
+    @property
+    def complete(self) -> bool:
+        """Whether the file is written."""
+        return not self._open
+
+    def writer(self, scene: str, samples: Sequence[str]) -> "NuScenesResultWriter":
+        """Return the writer of one scene with these sample tokens, in order of time."""
+        return NuScenesResultWriter(self.part(scene), scene, samples, self._head, self.done)
+
+    def part(self, scene: str) -> Path:
+        """Return the path of the file of one scene."""
+        return self.path.parent / "scenes" / f"{scene}.json"
+
+    def done(self, scene: str) -> None:
+        """Note that the file of a scene is in its place; the last one joins them all."""
+        with self._lock:
+            if scene not in self._open:
+                return
+            self._open.discard(scene)
+            if self._open:
+                return
+            whole = AtomicText(self.path)
+            try:
+                whole.write(self._head)
+                for i, name in enumerate(self._scenes):
+                    text = read_text(self.part(name), "the results of a scene")
+                    whole.write((",\n" if i else "") + text[len(self._head) : -len(_END)])
+                whole.write(_END)
+                whole.close()
+            finally:
+                whole.discard()
+
+
+class NuScenesResultWriter:
+    """Writes the tracks of one scene; use it as a context manager, or call `close` at the end."""
+
+    def __init__(self, path: Path, scene: str, samples: Sequence[str], head: str, done: Callable[[str], None]) -> None:
+        self._scene = scene
+        self._samples = samples
+        self._head = head
+        self._done = done
+        self._lines: dict[int, str] = {}
+        self._file = AtomicText(path)
+
+    @property
+    def path(self) -> Path:
+        """The finished file of the scene."""
+        return self._file.path
+
+    def add(self, index: int, pose: PoseLike, tracks: TrackRows) -> None:  # noqa: ARG002  boxes are global
+        """Write the tracks (world frame) of frame `index`; the benchmark wants no sensor frame, so no pose.
+
+        Raises:
+            DatasetError: a track is of a class that the benchmark does not have.
+
+        """
+        unknown = [name for name in np.asarray(tracks.labels)[tracks.label].tolist() if name not in NUSCENES_CLASSES]
+        if unknown:
+            raise DatasetError("--profile", f"the classes {', '.join(NUSCENES_CLASSES)}", f"tracks of {unknown[0]!r}")
+        rows = np.sort(np.argsort(-tracks.score, kind="stable")[:NUSCENES_MAX_BOXES])
+        half = 0.5 * tracks.yaw[rows]
+        # The official reader refuses unknown velocities, so they are written as standing still. Adding zero turns a
+        # rounded -0 into 0, so that equal numbers are written alike.
+        values = np.column_stack(
+            [
+                tracks.center[rows],
+                tracks.size[rows][:, [1, 0, 2]],
+                np.cos(half),
+                np.sin(half),
+                np.nan_to_num(tracks.velocity[rows]),
+                tracks.score[rows],
+            ]
+        )
+        token = self._samples[index]
+        boxes = [
+            {
+                "sample_token": token,
+                "translation": row[:3],
+                "size": row[3:6],
+                "rotation": [row[6], 0.0, 0.0, row[7]],
+                "velocity": row[8:10],
+                "tracking_id": f"{self._scene}-{identity}",
+                "tracking_name": tracks.labels[label],
+                "tracking_score": row[10],
+            }
+            for row, identity, label in zip(
+                (np.round(values, _DECIMALS) + 0.0).tolist(), tracks.id[rows], tracks.label[rows], strict=True
+            )
+        ]
+        self._lines[index] = json.dumps(boxes, allow_nan=False)
+
+    def close(self) -> None:
+        """Put the file in its place, with an empty list for every sample without tracks."""
+        lines = (f"{json.dumps(token)}: {self._lines.get(i, '[]')}" for i, token in enumerate(self._samples))
+        self._file.write(self._head + ",\n".join(lines) + _END)
+        self._file.close()
+        self._done(self._scene)
+
+    def discard(self) -> None:
+        """Drop what was written."""
+        self._file.discard()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.discard()
+
+
+def read_nuscenes_results(path: Path) -> Submission:
+    """Return a result file, or the one in a folder.
+
+    Raises:
+        DatasetError: it cannot be read, is not in the layout, or holds more boxes in a sample than the benchmark takes.
+
+    """
+    file = path / NUSCENES_FILE if path.is_dir() else path
+    results = read_submission(file, "tracking")
+    for token, rows in results.rows.items():
+        if len(rows) > NUSCENES_MAX_BOXES:
+            raise DatasetError(file, f"at most {NUSCENES_MAX_BOXES} boxes in results.{token}", f"{len(rows)}")
+    return results
+
+
+def result_table(results: Submission, scene: str, samples: Sequence[str]) -> ResultTable:
+    """Return the tracks of one scene in the world frame; frames count along `samples`.
+
+    Ids are the numbers behind the name of the scene, as the writer has them; other ids are numbered in order of
+    appearance.
+
+    Raises:
+        DatasetError: a sample is missing, or an id stands twice in a sample.
+
+    """
+    frames = [results.boxes(token) for token in samples]
+    names = [name for boxes in frames for name in boxes.id]
+    for token, boxes in zip(samples, frames, strict=True):
+        if len(set(boxes.id)) < len(boxes):
+            twice = next(name for i, name in enumerate(boxes.id) if name in boxes.id[:i])
+            raise DatasetError(results.path, f"a tracking_id once in results.{token}", f"{twice!r} again")
+    count = len(names)
+    return ResultTable(
+        labels=NUSCENES_CLASSES,
+        frame=np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames]),
+        id=_numbers(scene, names),
+        label=np.concatenate([np.empty(0, dtype=np.int64), *(boxes.label for boxes in frames)]),
+        center=np.concatenate([np.empty((0, 3)), *(boxes.center for boxes in frames)]),
+        size=np.concatenate([np.empty((0, 3)), *(boxes.size for boxes in frames)]),
+        yaw=np.concatenate([np.empty(0), *(boxes.yaw for boxes in frames)]),
+        score=np.concatenate([np.empty(0), *(boxes.score for boxes in frames)]),
+        box2d=np.full((count, 4), np.nan),
+    )
+
+
+def _numbers(scene: str, names: Sequence[str]) -> Ints:
+    prefix = f"{scene}-"
+    tails = [name.removeprefix(prefix) for name in names]
+    ours = all(
+        name.startswith(prefix) and len(tail) < _DIGITS and tail.isascii() and tail.isdigit() and str(int(tail)) == tail
+        for name, tail in zip(names, tails, strict=True)
+    )
+    if ours:
+        return np.array([int(tail) for tail in tails], dtype=np.int64)
+    number = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    return np.array([number[name] for name in names], dtype=np.int64)

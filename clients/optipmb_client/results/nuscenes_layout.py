@@ -1,0 +1,163 @@
+"""The submission layout of the nuScenes benchmarks, for detections and for tracks, as columns.
+
+A file is a map with `meta` and `results`; `results` has a list of boxes for every sample token. Boxes are in the global
+frame; a box has `translation` (x y z of its centre, metres), `size` (width, length, height), `rotation` (quaternion
+w x y z), `velocity` (x y over ground; null, NaN, or null within a list where unknown), a class, a score and, for
+tracks, a `tracking_id`. Columns have the size as length, width, height, and the heading as the direction of the box's x
+axis seen from above.
+"""
+
+import json
+import math
+from array import array
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from optipmb_client.files import DatasetError, read_text
+from optipmb_client.geometry import Floats, Ints
+
+NUSCENES_CLASSES = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck")
+"""The classes of the tracking benchmark; others that a file holds are left out."""
+NUSCENES_META = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
+"""What a submission states about its inputs."""
+
+Kind: TypeAlias = Literal["detection", "tracking"]
+_Row: TypeAlias = "array[float]"
+
+_WIDTH = 14
+_LABEL = {name: float(index) for index, name in enumerate(NUSCENES_CLASSES)}
+_LENGTHS = {"translation": 3, "size": 3, "rotation": 4}
+_PLANE = 2
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """The boxes of one sample."""
+
+    label: Ints
+    """(M,) index into `NUSCENES_CLASSES`."""
+    center: Floats
+    """(M, 3)"""
+    size: Floats
+    """(M, 3) length, width, height."""
+    yaw: Floats
+    """(M,)"""
+    velocity: Floats
+    """(M, 2); a row is NaN where the velocity is unknown."""
+    score: Floats
+    """(M,)"""
+    id: tuple[str, ...]
+    """M texts; empty texts for detections."""
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+
+@dataclass(frozen=True)
+class Submission:
+    """A file in the submission layout."""
+
+    path: Path
+    meta: Mapping[str, Any]
+    rows: Mapping[str, list[tuple[str, _Row]]]
+    """By sample token: id and numbers of each box."""
+
+    def __contains__(self, token: str) -> bool:
+        return token in self.rows
+
+    def boxes(self, token: str) -> Boxes:
+        """Return the boxes of one sample.
+
+        Raises:
+            DatasetError: the file does not have the sample, or a box has a number that cannot be one.
+
+        """
+        if token not in self.rows:
+            raise DatasetError(self.path, "every sample, if need be with an empty list", f"no sample {token}")
+        rows = self.rows[token]
+        values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, _WIDTH)
+        velocity = values[:, 12:14]
+        velocity[~np.isfinite(velocity).all(axis=1)] = np.nan
+        size, rotation = values[:, [5, 4, 6]], values[:, 7:11]
+        good = np.isfinite(values[:, :12]).all(axis=1) & (size > 0).all(axis=1) & (np.abs(rotation).max(axis=1) > 0)
+        if not good.all():
+            place = f"results.{token}[{int(np.argmin(good))}]"
+            raise DatasetError(self.path, f"finite numbers, a size above 0 and a rotation in {place}", "others")
+        return Boxes(
+            label=values[:, 0].astype(np.int64),
+            center=values[:, 1:4],
+            size=size,
+            yaw=quaternion_yaw(rotation),
+            velocity=velocity,
+            score=values[:, 11],
+            id=tuple(name for name, _ in rows),
+        )
+
+
+def quaternion_yaw(quaternion: Floats) -> Floats:
+    """Return the headings (N,) in [-pi, pi] of rotations (N, 4) w x y z of any length, seen from above."""
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    return np.asarray(np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z), dtype=np.float64)
+
+
+def read_submission(path: Path, kind: Kind) -> Submission:
+    """Return a file of detections or of tracks.
+
+    Raises:
+        DatasetError: it cannot be read or is not in the layout.
+
+    """
+    what = f"a nuScenes {kind} file"
+
+    def convert(record: dict[str, Any]) -> Any:
+        # Boxes become rows of numbers as soon as they are read: a million maps would take gigabytes.
+        return _row(path, record, kind) if "translation" in record else record
+
+    try:
+        content = json.loads(read_text(path, what), object_hook=convert)
+    except json.JSONDecodeError as error:
+        raise DatasetError(path, f"{what} (JSON)", error.msg, line=error.lineno) from error
+    results = content.get("results") if isinstance(content, dict) else None
+    if not isinstance(results, dict):
+        raise DatasetError(path, f"{what} with meta and results", "no map of results")
+    rows: dict[str, list[tuple[str, _Row]]] = {}
+    for token, boxes in results.items():
+        if not isinstance(boxes, list) or not all(isinstance(box, tuple) for box in boxes):
+            raise DatasetError(path, f"a list of boxes in results.{token}", "something else")
+        rows[token] = [box for box in boxes if box]
+    meta = content.get("meta")
+    return Submission(path, meta if isinstance(meta, dict) else {}, rows)
+
+
+def _row(path: Path, record: dict[str, Any], kind: Kind) -> tuple[str, _Row] | tuple[()]:
+    """Return id and numbers of a box; nothing when its class is not tracked."""
+    token = record.get("sample_token", "?")
+    try:
+        label = _LABEL.get(record[f"{kind}_name"])
+        if label is None:
+            return ()
+        numbers = [label]
+        for name, length in _LENGTHS.items():
+            values = record[name]
+            if len(values) != length:
+                raise DatasetError(path, f"{length} numbers in {name} (sample {token})", f"{len(values)}")
+            numbers += map(float, values)
+        numbers.append(float(record[f"{kind}_score"]))
+        numbers += _velocity(record.get("velocity"))
+        return str(record["tracking_id"]) if kind == "tracking" else "", array("d", numbers)
+    except KeyError as error:
+        raise DatasetError(path, f"{error.args[0]} in every box (sample {token})", "a box without") from error
+    except (TypeError, ValueError) as error:
+        if isinstance(error, DatasetError):
+            raise
+        raise DatasetError(path, f"numbers in every box (sample {token})", str(error)) from error
+
+
+def _velocity(value: Any) -> tuple[float, float]:
+    if value is None or len(value) < _PLANE or value[0] is None or value[1] is None:
+        return math.nan, math.nan
+    return float(value[0]), float(value[1])

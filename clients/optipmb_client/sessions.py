@@ -1,0 +1,95 @@
+"""Asking the service: parameters, reset and state of a stream's session, and the status of the services themselves."""
+
+import time
+from typing import TypeVar
+
+from optipmb_schemas import (
+    PREFIX,
+    Keys,
+    MessageError,
+    Problem,
+    ResetRequest,
+    ServiceStatus,
+    SessionParameters,
+    SessionState,
+    decode,
+    encode,
+    encoding_of,
+)
+
+from optipmb_client.errors import ServiceRefused, ServiceUnavailable
+from optipmb_client.transport import Answer, Connection
+
+__all__ = ["close_session", "find_services", "set_parameters"]
+
+QUERY_S = 2.0
+RETRY_S = 0.1
+
+Message = TypeVar("Message", SessionParameters, SessionState, ServiceStatus)
+
+
+def set_parameters(
+    connection: Connection,
+    stream: str,
+    parameters: SessionParameters,
+    *,
+    prefix: str = PREFIX,
+    patience_s: float = 10.0,
+) -> SessionParameters:
+    """Set the parameters of a stream's session, which starts it; return those in force.
+
+    Raises:
+        ServiceUnavailable: No service answered within `patience_s` seconds.
+        ServiceRefused: A service answered that it will not; the text says why.
+    """
+    key = Keys(prefix).query(stream, "parameters")
+    deadline = time.monotonic() + patience_s
+    while True:
+        asked = connection.query(key, encode(parameters), encoding_of(SessionParameters), timeout=QUERY_S)
+        if asked:
+            return _read(asked, SessionParameters)
+        if time.monotonic() >= deadline:
+            raise ServiceUnavailable(
+                f"no tracking service answered for {patience_s:g} s; is optipmb-service running, with the same prefix?"
+            )
+        time.sleep(RETRY_S)
+
+
+def close_session(connection: Connection, stream: str, *, prefix: str = PREFIX) -> SessionState | None:
+    """End the session of a stream and free what it holds; None when no service answers, or it says no."""
+    key = Keys(prefix).query(stream, "reset")
+    asked = connection.query(key, encode(ResetRequest(close=True)), encoding_of(ResetRequest), timeout=QUERY_S)
+    try:
+        return _read(asked, SessionState) if asked else None
+    except ServiceRefused:
+        return None
+
+
+def find_services(connection: Connection, *, prefix: str = PREFIX, patience_s: float = 1.0) -> list[ServiceStatus]:
+    """Return the status of every service that is alive, by instance; waits up to `patience_s` for a first one."""
+    keys = Keys(prefix)
+    deadline = time.monotonic() + patience_s
+    while not (alive := connection.alive(keys.all_alive())):
+        if time.monotonic() >= deadline:
+            return []
+        time.sleep(RETRY_S)
+    instances = [key.rsplit("/", 2)[1] for key in alive]
+    answers = [connection.query(keys.status(instance), timeout=QUERY_S) for instance in instances]
+    return [_read(answer, ServiceStatus) for answer in answers if answer]
+
+
+def _read(answers: tuple[Answer, ...], expected: type[Message]) -> Message:
+    """Return the first good answer.
+
+    Raises:
+        ServiceRefused: There is none; says what the first error was.
+    """
+    for answer in answers:
+        if answer.ok:
+            return decode(answer.payload, expected, encoding=answer.encoding)
+    first = answers[0]
+    try:
+        reason = decode(first.payload, Problem, encoding=first.encoding).message
+    except MessageError:
+        reason = first.payload[:200].decode(errors="replace")
+    raise ServiceRefused(f"the service refused: {reason}")

@@ -1,0 +1,181 @@
+"""Receiving tracks, for programs of your own.
+
+Tracks are in the fixed world frame: metres, radians, stamps in integer nanoseconds of the sensor's clock.
+"""
+
+import collections
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from optipmb_schemas import PREFIX, Keys, MessageError, Problem, Topic, Tracks, decode
+
+from optipmb_client.transport import Arrival, Connection, Inbox
+
+__all__ = ["Received", "Statistics", "Subscriber"]
+
+REMEMBERED = 65_536  # frames whose repetition is recognised
+
+
+@dataclass(frozen=True)
+class Received:
+    """Tracks, and the monotonic time (`time.monotonic_ns`) at which they arrived on this machine."""
+
+    tracks: Tracks
+    monotonic_ns: int
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What a subscriber has seen: messages given out, dropped (the program was too slow), repeated, unreadable."""
+
+    delivered: int
+    dropped: int
+    repeated: int
+    invalid: int
+    pending: int
+
+
+class Subscriber:
+    """Receives the tracks of one stream or of many.
+
+    Iterating gives `Tracks` messages as they come. The service may deliver a message again, after a restart for
+    example: repetitions are left out. A message with a higher `revision` for a frame (the service has since got a late
+    frame that came before it) is given out; one with a lower revision than already seen is not.
+
+    A subscriber that comes late first gets what the service keeps of each stream, some seconds.
+    A program that is too slow loses the oldest waiting messages, never anybody else's; `statistics` counts them.
+
+    Args:
+        pattern: Name of a stream, `site/node/sensor`, or a pattern with `*` in the place of names: `garage/*/*`.
+        connect: Endpoint or endpoints of routers, such as `tcp/10.0.0.1:7447`; default: this machine.
+        timeout: Iterating ends when nothing has come for so many seconds; None: never.
+        on_problem: Called with each `Problem` that the service reports for these streams (refused messages and the
+            like), by the thread that iterates.
+        queue: Number of messages that may wait.
+        config: A Zenoh configuration file, for TLS, passwords and the like.
+        connection: Share an open connection (it stays open) in the place of `connect` and `config`.
+        connect_timeout: Seconds to wait for a router.
+        prefix: First part of all keys, as configured in the service.
+
+    Raises:
+        ConnectionFailed: No router within `connect_timeout`.
+        MessageError: `pattern` is neither the name of a stream nor such a pattern.
+    """
+
+    def __init__(  # noqa: PLR0913  each option by its name, all but two seldom used
+        self,
+        pattern: str,
+        connect: str | Sequence[str] | None = None,
+        *,
+        timeout: float | None = None,
+        on_problem: Callable[[Problem], None] | None = None,
+        queue: int = 1024,
+        config: str | Path | None = None,
+        connection: Connection | None = None,
+        connect_timeout: float = 5.0,
+        prefix: str = PREFIX,
+    ) -> None:
+        keys = Keys(prefix)
+        tracks, problems = _expression(keys, pattern, "tracks"), _expression(keys, pattern, "problems")
+        self.timeout = timeout
+        self._on_problem = on_problem
+        self._seen = _Seen(REMEMBERED)
+        self._delivered = 0
+        self._repeated = 0
+        self._invalid = 0
+        self._inbox = Inbox(queue)
+        self._own = Connection(connect, config=config, timeout=connect_timeout) if connection is None else None
+        link = connection or self._own
+        assert link is not None  # noqa: S101  one of the two is there: said for the type checker
+        self._subscriptions = [link.subscribe(tracks, self._inbox)]
+        if on_problem is not None:
+            self._subscriptions.append(link.subscribe(problems, self._inbox))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the subscription; a loop over it gets what still waits, then ends. May be called twice."""
+        for subscription in self._subscriptions:
+            subscription.close()
+        self._inbox.close()
+        if self._own is not None:
+            self._own.close()
+
+    def __iter__(self) -> Iterator[Tracks]:
+        """Iterate over the messages until `timeout` or `close`."""
+        while (received := self.receive(self.timeout)) is not None:
+            yield received.tracks
+
+    def receive(self, timeout: float | None = None) -> Received | None:
+        """Return the next tracks, waiting up to `timeout` seconds (None: for ever); None when none came."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while True:
+            left = None if deadline is None else max(0.0, deadline - time.monotonic())
+            arrival = self._inbox.get(left)
+            if arrival is None:
+                return None
+            if (tracks := self._read(arrival)) is not None:
+                self._delivered += 1
+                return Received(tracks, arrival.monotonic_ns)
+
+    @property
+    def statistics(self) -> Statistics:
+        """Counts since the subscriber was made."""
+        return Statistics(
+            delivered=self._delivered,
+            dropped=self._inbox.dropped,
+            repeated=self._repeated,
+            invalid=self._invalid,
+            pending=self._inbox.pending,
+        )
+
+    def _read(self, arrival: Arrival) -> Tracks | None:
+        """Return the tracks that arrived; None for repetitions, problems, and what is no message of ours."""
+        try:
+            if arrival.key.endswith("/problems"):
+                problem = decode(arrival.payload, Problem, encoding=arrival.encoding)
+                if self._on_problem is not None:
+                    self._on_problem(problem)
+                return None
+            tracks = decode(arrival.payload, Tracks, encoding=arrival.encoding)
+        except MessageError:
+            self._invalid += 1
+            return None
+        if self._seen.before((tracks.stream, tracks.session, tracks.epoch, tracks.seq), tracks.revision):
+            self._repeated += 1
+            return None
+        return tracks
+
+
+class _Seen:
+    """The newest revision seen of each of the newest `capacity` frames."""
+
+    def __init__(self, capacity: int) -> None:
+        self._revisions: collections.OrderedDict[tuple[str, str, bytes, int], int] = collections.OrderedDict()
+        self._capacity = capacity
+
+    def before(self, frame: tuple[str, str, bytes, int], revision: int) -> bool:
+        """Whether this revision of the frame, or a newer one, has been seen; remembers it when not."""
+        if self._revisions.get(frame, -1) >= revision:
+            return True
+        self._revisions[frame] = revision
+        self._revisions.move_to_end(frame)
+        if len(self._revisions) > self._capacity:
+            self._revisions.popitem(last=False)
+        return False
+
+
+def _expression(keys: Keys, pattern: str, topic: Topic) -> str:
+    """Return the key expression of a topic of the streams that match a pattern with `*` in the place of names."""
+    keys.detections("/".join("any" if part == "*" else part for part in pattern.split("/")))  # checks the other names
+    return f"{keys.prefix}/{pattern}/{topic}"

@@ -1,0 +1,160 @@
+"""The command `optipmb-service`: run the service (the default), or print the settings in force.
+
+Exit status: 0 after SIGINT or SIGTERM, 1 when the network cannot be used, 2 for a wrong option, path or setting; an
+error is one clear line on stderr.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
+
+import typer
+from typer.main import get_command
+
+import optipmb
+from optipmb_service import __version__, logs
+from optipmb_service.profiles import Profiles
+from optipmb_service.service import leave, run
+from optipmb_service.settings import Loaded, SettingsInvalidError, load
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+WRONG_USE: Final = 2
+COMMANDS: Final = ("run", "config")
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    help="Track objects in detections that come in over Zenoh. Without a command: run.",
+)
+
+SettingsFile = Annotated[Path | None, typer.Option("--settings", metavar="FILE", help="Settings, a TOML file.")]
+Router = Annotated[
+    bool | None,
+    typer.Option("--router/--no-router", help="Be a Zenoh router oneself. Default: yes unless --connect is given."),
+]
+Listen = Annotated[
+    list[str] | None, typer.Option(metavar="ENDPOINT", help="Endpoint to listen on, repeatable; as tcp/127.0.0.1:7447.")
+]
+Connect = Annotated[
+    list[str] | None, typer.Option(metavar="ENDPOINT", help="Router to connect to, repeatable; as tcp/10.0.0.1:7447.")
+]
+Instance = Annotated[str | None, typer.Option(metavar="NAME", help="Name of this instance.")]
+Profile = Annotated[
+    str | None, typer.Option(metavar="NAME|FILE", help="Profile of streams that no pattern in the settings names.")
+]
+LogFormat = Annotated[str | None, typer.Option(metavar="console|json", help="Form of the log lines on stderr.")]
+LogLevel = Annotated[str | None, typer.Option(metavar="LEVEL", help="debug, info, warning or error.")]
+
+
+@app.command("run")
+def run_command(
+    settings: SettingsFile = None,
+    router: Router = None,
+    listen: Listen = None,
+    connect: Connect = None,
+    instance: Instance = None,
+    profile: Profile = None,
+    log_format: LogFormat = None,
+    log_level: LogLevel = None,
+) -> None:
+    """Run the service until SIGINT or SIGTERM. Prints one line, `ready …`, when it can be used; logs go to stderr."""
+    loaded = _load(settings, _given(router, listen, connect, instance, profile, log_format, log_level))
+    try:
+        profiles = Profiles.read(loaded.settings.profile, loaded.settings.profiles)
+    except optipmb.ParameterError as error:
+        _wrong(f"profile: {error}")
+    logs.configure(loaded.settings.log_format, loaded.settings.log_level)
+    logs.unknown_environment(loaded.unknown)
+    leave(asyncio.run(run(loaded.settings, profiles)))
+
+
+@app.command("config")
+def config_command(  # noqa: PLR0913 - one argument per option of the command
+    settings: SettingsFile = None,
+    router: Router = None,
+    listen: Listen = None,
+    connect: Connect = None,
+    instance: Instance = None,
+    profile: Profile = None,
+    log_format: LogFormat = None,
+    log_level: LogLevel = None,
+    *,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with where each value came from.")] = False,
+) -> None:
+    """Print the settings in force as TOML, each with where it came from, and do nothing else."""
+    loaded = _load(settings, _given(router, listen, connect, instance, profile, log_format, log_level))
+    values = loaded.settings.model_dump(mode="json")
+    values |= {"router": loaded.settings.is_router, "listen": list(loaded.settings.endpoints)}
+    if as_json:
+        typer.echo(json.dumps({"settings": values, "sources": loaded.sources}, indent=2))
+        return
+    plain = {name: value for name, value in values.items() if not isinstance(value, dict)}
+    for name, value in plain.items():
+        typer.echo(f"{name} = {_toml(value)}  # {loaded.sources[name]}")
+    for name in values.keys() - plain.keys():
+        typer.echo(f"\n[{name}]  # {loaded.sources[name]}")
+        for key, value in values[name].items():
+            typer.echo(f"{_toml(key) if name == 'profiles' else key} = {_toml(value)}")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:
+        typer.echo(f"optipmb-service {__version__}")
+        return
+    if given[:1] != ["--help"] and (not given or given[0].startswith("-")):
+        given = ["run", *given]
+    try:
+        status = get_command(app).main(given, prog_name="optipmb-service", standalone_mode=False)
+    except Exception as error:
+        # Errors of use are not of one public class in all versions of typer; all of them know this method.
+        describe = getattr(error, "format_message", None)
+        if describe is None:
+            raise
+        _wrong(describe())
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _given(
+    router: bool | None,  # noqa: FBT001 - an option that may be absent, passed on as it came
+    listen: list[str] | None,
+    connect: list[str] | None,
+    instance: str | None,
+    profile: str | None,
+    log_format: str | None,
+    log_level: str | None,
+) -> Mapping[str, Any]:
+    """Return the options as settings; None: not given."""
+    return {
+        "router": router,
+        "listen": listen or None,
+        "connect": connect or None,
+        "instance": instance,
+        "profile": profile,
+        "log_format": log_format,
+        "log_level": log_level,
+    }
+
+
+def _load(file: Path | None, options: Mapping[str, Any]) -> Loaded:
+    try:
+        return load(file, options)
+    except SettingsInvalidError as error:
+        _wrong(str(error))
+
+
+def _wrong(message: str) -> NoReturn:
+    typer.echo(f"optipmb-service: {' '.join(message.split())}", err=True)
+    raise SystemExit(WRONG_USE)
+
+
+def _toml(value: object) -> str:
+    """Return a value as TOML; for what settings hold, that is JSON."""
+    return json.dumps(value)

@@ -1,0 +1,121 @@
+"""Between the messages of the wire and the values of the tracker.
+
+Conventions: a message says itself whether its arrays are in the `world` or in the `sensor` frame; the tracker's frame
+is always the world (right-handed, z up, metres, radians), and so are the tracks that go out. Nothing is copied that can
+be viewed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import optipmb_schemas as schemas
+
+import optipmb
+
+if TYPE_CHECKING:
+    from optipmb_service.timing import Mark
+
+IDENTITY = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
+"""The pose of arrays that are in the world frame already."""
+
+
+def pose_of(message: schemas.Detections | schemas.Points) -> optipmb.Pose | None:
+    """Return world from sensor, or None for a message in the world frame.
+
+    Raises:
+        optipmb.FrameError: the pose is missing or no rigid motion.
+    """
+    if message.frame == "world":
+        return None
+    if message.pose is None:
+        raise optipmb.FrameError("pose", "the pose of the sensor", "nothing")
+    return optipmb.Pose(translation=message.pose.translation, quaternion=message.pose.quaternion)
+
+
+def cloud_of(message: schemas.Points) -> optipmb.PointCloud:
+    """Return the cloud as the tracker reads it.
+
+    Raises:
+        optipmb.FrameError: wrong shape or pose.
+    """
+    return optipmb.PointCloud(xyz=message.xyz, pose=pose_of(message) or IDENTITY)
+
+
+def frame_of(
+    parameters: optipmb.Parameters, message: schemas.Detections, points: schemas.Points | None
+) -> tuple[optipmb.Frame, int]:
+    """Return the frame, and how many objects were left out because the profile lacks their class.
+
+    Raises:
+        optipmb.FrameError: wrong shapes or values; `path` names the field and the element.
+    """
+    return optipmb.make_frame(
+        parameters,
+        stamp_ns=message.stamp_ns,
+        labels=message.labels,
+        label=message.label,
+        center=message.center,
+        size=message.size,
+        yaw=message.yaw,
+        score=message.score,
+        velocity=message.velocity,
+        pose=pose_of(message),
+        cloud=None if points is None else cloud_of(points),
+    )
+
+
+def unknown_labels(parameters: optipmb.Parameters, message: schemas.Detections) -> dict[str, int]:
+    """Return the classes that the profile lacks, with the number of objects of each in the message."""
+    missing = {index: name for index, name in enumerate(message.labels) if name not in parameters.classes}
+    if not missing:
+        return {}
+    counts = np.bincount(message.label, minlength=len(message.labels))
+    unknown: dict[str, int] = {}
+    for index, name in missing.items():
+        if counts[index]:
+            unknown[name] = unknown.get(name, 0) + int(counts[index])
+    return unknown
+
+
+def tracks_of(
+    tracks: optipmb.Tracks,
+    *,
+    stream: str,
+    mark: Mark,
+    session: str,
+    parameters: optipmb.Parameters,
+    cloud_used: bool,
+    gap: int,
+    ignored: int,
+) -> schemas.Tracks:
+    """Return the message for the tracks of a frame, without its delivery part."""
+    return schemas.Tracks(
+        stream=stream,
+        epoch=mark.epoch,
+        seq=mark.seq,
+        stamp_ns=mark.stamp_ns,
+        session=session,
+        revision=0,
+        profile=parameters.name,
+        cloud_used=cloud_used,
+        gap=gap,
+        ignored=ignored,
+        labels=tuple(parameters.classes),
+        id=tracks.id,
+        label=tracks.label,
+        center=tracks.center,
+        size=tracks.size,
+        yaw=tracks.yaw,
+        velocity=tracks.velocity,
+        yaw_rate=tracks.yaw_rate,
+        acceleration=tracks.acceleration,
+        existence=tracks.existence,
+        score=tracks.score,
+        covariance=tracks.covariance,
+        age=tracks.age,
+        time_since_detection=tracks.time_since_detection,
+        detection=tracks.detection,
+        delivery=None,
+    )

@@ -1,0 +1,174 @@
+"""A stream's bounded queue, and the threads that empty all of them: one worker at a time per stream, streams in turn.
+
+Readers put in, one worker takes out. What is not urgent keeps its order. Point clouds go before frames, so that no
+frame goes on without a cloud that has long arrived; when too many wait, the oldest is shed and counted.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections import deque
+from typing import TYPE_CHECKING, Final, Protocol
+
+from optipmb_service.ports import Packet
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Command = Callable[[], None]
+
+
+class Inbox:
+    """What waits for a stream's worker.
+
+    Args:
+        frames: most frames waiting.
+        clouds: most point clouds waiting.
+    """
+
+    def __init__(self, frames: int, clouds: int) -> None:
+        self._lock = threading.Lock()
+        self._urgent: deque[Command] = deque()
+        self._clouds: deque[Packet] = deque()
+        self._frames: deque[Packet | Command] = deque()
+        self._most_frames = frames
+        self._most_clouds = clouds
+        self._waiting = 0
+        self._scheduled = False
+        self._rung = False
+        self._closed = False
+        self.shed_frames = 0
+        self.shed_clouds = 0
+
+    @property
+    def idle(self) -> bool:
+        """Whether no worker is needed or at work."""
+        return not self._scheduled
+
+    @property
+    def waiting(self) -> int:
+        """Frames that wait."""
+        return self._waiting
+
+    def offer_frame(self, packet: Packet) -> bool | None:
+        """Put a frame last; True: a worker must be sent, None: closed."""
+        with self._lock:
+            if self._closed:
+                return None
+            if self._waiting >= self._most_frames:
+                self._shed()
+            self._frames.append(packet)
+            self._waiting += 1
+            return self._schedule()
+
+    def offer_cloud(self, packet: Packet) -> bool | None:
+        """Put a cloud last of the clouds; True: a worker must be sent, None: closed."""
+        with self._lock:
+            if self._closed:
+                return None
+            if len(self._clouds) >= self._most_clouds:
+                self._clouds.popleft()
+                self.shed_clouds += 1
+            self._clouds.append(packet)
+            return self._schedule()
+
+    def offer_command(self, command: Command, *, urgent: bool) -> bool | None:
+        """Put a command before everything, or after the frames that wait; True: a worker must be sent, None: closed."""
+        with self._lock:
+            if self._closed:
+                return None
+            (self._urgent if urgent else self._frames).append(command)
+            return self._schedule()
+
+    def ring(self) -> bool | None:
+        """Call for a worker though nothing came; True: it must be sent, None: closed."""
+        with self._lock:
+            if self._closed:
+                return None
+            self._rung = True
+            return self._schedule()
+
+    def take(self) -> tuple[str, Packet | Command] | None:
+        """Take what is next, with its kind: "command", "cloud" or "frame"; None when nothing waits."""
+        with self._lock:
+            self._rung = False
+            if self._urgent:
+                return "command", self._urgent.popleft()
+            if self._clouds:
+                return "cloud", self._clouds.popleft()
+            if not self._frames:
+                return None
+            item = self._frames.popleft()
+            if not isinstance(item, Packet):
+                return "command", item
+            self._waiting -= 1
+            return "frame", item
+
+    @property
+    def clouds_waiting(self) -> int:
+        """Clouds that wait."""
+        return len(self._clouds)
+
+    def leave(self, *, close: bool) -> bool | None:
+        """End a worker's turn: True: it must come again, None: the inbox was empty and is closed now, as asked."""
+        with self._lock:
+            if self._urgent or self._clouds or self._frames or self._rung:
+                return True
+            self._scheduled = False
+            self._closed = close
+            return None if close else False
+
+    def _schedule(self) -> bool:
+        first, self._scheduled = not self._scheduled, True
+        return first
+
+    def _shed(self) -> None:
+        """Drop the oldest frame; commands between the frames stay."""
+        for index, item in enumerate(self._frames):
+            if isinstance(item, Packet):
+                del self._frames[index]
+                self._waiting -= 1
+                self.shed_frames += 1
+                return
+
+
+class Worked(Protocol):
+    """What workers work on."""
+
+    def work(self) -> bool:
+        """Do a bounded piece of work; True: there is more."""
+
+
+class Pool:
+    """A few threads that work on whatever was submitted, first come first served.
+
+    They are daemons: a step that does not end must not keep the process.
+    """
+
+    _END: Final = None
+
+    def __init__(self, threads: int) -> None:
+        self._queue: queue.SimpleQueue[Worked | None] = queue.SimpleQueue()
+        self._threads = [
+            threading.Thread(target=self._run, name=f"worker-{number}", daemon=True) for number in range(threads)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def submit(self, worked: Worked) -> None:
+        """Have a thread call `work`; what is being worked on must not be submitted."""
+        self._queue.put(worked)
+
+    def close(self, timeout: float) -> bool:
+        """End the threads after what was submitted; False when some did not end in time (s)."""
+        for _ in self._threads:
+            self._queue.put(self._END)
+        for thread in self._threads:
+            thread.join(timeout / len(self._threads))
+        return not any(thread.is_alive() for thread in self._threads)
+
+    def _run(self) -> None:
+        while (worked := self._queue.get()) is not self._END:
+            if worked.work():
+                self._queue.put(worked)

@@ -1,0 +1,73 @@
+"""Which parameters a stream is tracked with: the profiles that the settings name, chosen by patterns of stream names.
+
+All profiles are read once, at the start, so that a bad file ends the start and not a session. Over the network only
+these and the profiles that come with the tracker can be asked for, never a path.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING
+
+import optipmb_schemas as schemas
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """The profiles in force.
+
+    Attributes:
+        default: name of the profile of streams that no pattern names, as the settings give it.
+        patterns: pairs of stream pattern and profile name, the first that matches holds.
+        known: all profiles by the name that the settings give, and by the name inside the file.
+    """
+
+    default: str
+    patterns: tuple[tuple[str, str], ...]
+    known: Mapping[str, optipmb.Parameters]
+
+    @classmethod
+    def read(cls, default: str, patterns: Mapping[str, str]) -> Profiles:
+        """Load every profile named, and those that come with the tracker.
+
+        Raises:
+            optipmb.ParameterError: one of them cannot be read or is not valid.
+        """
+        known: dict[str, optipmb.Parameters] = {}
+        for name in (default, *patterns.values(), *optipmb.profiles()):
+            if name not in known:
+                known[name] = _loaded(name)
+        for parameters in tuple(known.values()):
+            known.setdefault(parameters.name, parameters)
+        return cls(default, tuple(patterns.items()), known)
+
+    def of(self, stream: str) -> optipmb.Parameters:
+        """Return the parameters of a stream, `site/node/sensor`."""
+        for pattern, name in self.patterns:
+            if fnmatchcase(stream, pattern):
+                return self.known[name]
+        return self.known[self.default]
+
+    def named(self, name: str) -> optipmb.Parameters | None:
+        """Return a profile by its name, None when there is none."""
+        return self.known.get(name)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names that can be asked for."""
+        return tuple(sorted({parameters.name for parameters in self.known.values()}))
+
+
+def _loaded(name: str) -> optipmb.Parameters:
+    parameters = optipmb.load_profile(name)
+    try:
+        schemas.SessionParameters(profile=parameters.name)
+    except schemas.MessageError as error:
+        raise optipmb.ParameterError("name", error.expected, error.received) from error
+    return parameters

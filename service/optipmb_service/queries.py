@@ -1,0 +1,217 @@
+"""Answers to queries: the state of sessions, resets, parameters, the status of the service.
+
+What concerns a session is run by the worker of its stream, so that nothing else happens to it meanwhile: a question
+about the state goes before the frames that wait, a reset or a change of parameters takes its turn among them. The query
+thread itself only sorts. An error is a reply too: a `Problem`, as an error reply.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING, Literal, TypeVar
+
+import optipmb_schemas as schemas
+import structlog
+
+from optipmb_service.ports import TransportError
+from optipmb_service.problems import problem_of
+from optipmb_service.records import RefusedError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import optipmb
+    from optipmb_service.lane import Lane
+    from optipmb_service.ports import Request
+    from optipmb_service.registry import Registry
+
+log = structlog.get_logger("optipmb_service")
+
+NO_SESSION = "0" * 32
+"""Session id in the state of a stream that has none."""
+
+_T = TypeVar("_T", bound=schemas.Message)
+
+
+class Queries:
+    """Answers every request, and finishes it whatever happens.
+
+    Args:
+        registry: the streams.
+        status: makes the status of the service.
+    """
+
+    def __init__(self, registry: Registry, status: Callable[[], schemas.ServiceStatus]) -> None:
+        self._registry = registry
+        self._status = status
+        self._keys = registry.keys
+
+    def about_service(self, request: Request) -> None:
+        """Answer with the status of the service."""
+        key = self._keys.status(self._registry.instance)
+        _guarded(request, lambda: request.answer(key, self._status()))
+
+    def about_streams(self, request: Request) -> None:
+        """Answer what concerns sessions, here or on the worker of the stream."""
+        name = request.key.rpartition("/")[2]
+        if "*" in request.key:
+            self._answer_many(request)
+            return
+        stream = request.key.removeprefix(f"{self._keys.prefix}/").removesuffix(f"/q/{name}")
+        try:
+            self._keys.tracks(stream)
+        except schemas.MessageError as error:
+            nowhere = self._problem("", error)
+            _guarded(request, lambda: request.refuse(nowhere))
+            return
+        commands: dict[str, tuple[Callable[[Lane, Request], None], bool]] = {
+            "state": (self._state, True),
+            "reset": (self._reset, False),
+            "parameters": (self._parameters, False),
+        }
+        if name not in commands:
+            unknown = schemas.MessageError("invalid_value", "key", f"one of q/{', q/'.join(commands)}", f"q/{name}")
+            _guarded(request, lambda: request.refuse(self._problem(stream, unknown)))
+            return
+        command, urgent = commands[name]
+        taken = self._registry.command(
+            stream, lambda lane: _guarded(request, lambda: command(lane, request)), urgent=urgent
+        )
+        if not taken:
+            full = schemas.MessageError("too_large", "key", "fewer new streams at once", "another one")
+            _guarded(request, lambda: request.refuse(self._problem(stream, full)))
+
+    def _answer_many(self, request: Request) -> None:
+        """Answer a question about the state of all streams that a key expression includes; many answer nothing else."""
+        lanes = [lane for lane in self._registry.lanes() if request.matches(self._keys.query(lane.stream, "state"))]
+        if not lanes:
+            request.finish()
+            return
+        left = _Countdown(len(lanes), request.finish)
+        for lane in lanes:
+            if not self._registry.command(lane.stream, self._one_of_many(request, left), urgent=True):
+                left.one()
+
+    def _one_of_many(self, request: Request, left: _Countdown) -> Callable[[Lane], None]:
+        def command(lane: Lane) -> None:
+            try:
+                self._state(lane, request)
+            except TransportError as error:
+                log.warning("reply_failed", key=request.key, error=str(error))
+            finally:
+                left.one()
+
+        return command
+
+    # Run by the workers
+
+    def _state(self, lane: Lane, request: Request) -> None:
+        request.answer(self._keys.query(lane.stream, "state"), lane.state() or self._nothing(lane.stream, "new"))
+
+    def _reset(self, lane: Lane, request: Request) -> None:
+        asked = self._payload(lane, request, schemas.ResetRequest, schemas.ResetRequest())
+        if asked is None:
+            return
+        session = lane.session
+        state = self._nothing(lane.stream, "closed" if asked.close else "new")
+        if session is not None and asked.close:
+            lane.close_session("query")
+            state = session.state(shed=lane.inbox.shed_frames, closed=True)
+        elif session is not None:
+            lane.deliver(session.reset())
+            state = lane.state() or state
+        request.answer(self._keys.query(lane.stream, "reset"), state)
+
+    def _parameters(self, lane: Lane, request: Request) -> None:
+        empty = schemas.SessionParameters()
+        asked = self._payload(lane, request, schemas.SessionParameters, empty)
+        if asked is None:
+            return
+        parameters = None
+        if asked.profile is not None:
+            parameters = self._registry.profiles.named(asked.profile)
+            if parameters is None:
+                expected = f"one of {', '.join(self._registry.profiles.names)}"
+                error = schemas.MessageError("invalid_value", "profile", expected, repr(asked.profile))
+                request.refuse(self._problem(lane.stream, error))
+                return
+        if asked != empty and lane.session is None and lane.open_session() is None:
+            full = schemas.MessageError(
+                "too_large", "stream", "a stream that is tracked already", "no room for another"
+            )
+            request.refuse(self._problem(lane.stream, full, code="refused"))
+            return
+        session = lane.session
+        if session is not None and asked != empty:
+            try:
+                lane.deliver(session.configure(parameters, asked.cloud_wait_s, restart=asked.restart))
+            except RefusedError as error:
+                refusal = schemas.MessageError("invalid_value", error.path, error.expected, error.received)
+                request.refuse(self._problem(lane.stream, refusal, code="refused"))
+                return
+        request.answer(self._keys.query(lane.stream, "parameters"), self._in_force(lane))
+
+    def _in_force(self, lane: Lane) -> schemas.SessionParameters:
+        session = lane.session
+        parameters: optipmb.Parameters = session.parameters if session else self._registry.profiles.of(lane.stream)
+        return schemas.SessionParameters(
+            profile=parameters.name,
+            cloud_wait_s=session.cloud_wait_s if session else self._registry.cloud_wait_s,
+            values=parameters.model_dump(mode="json"),
+        )
+
+    def _nothing(self, stream: str, state: Literal["new", "closed"]) -> schemas.SessionState:
+        """Return the state of a stream that has no session."""
+        return schemas.SessionState(
+            stream=stream, session=NO_SESSION, state=state, profile=self._registry.profiles.of(stream).name
+        )
+
+    def _payload(self, lane: Lane, request: Request, expected: type[_T], empty: _T) -> _T | None:
+        """Return what was sent along, `empty` when nothing was, None after a refusal."""
+        if not request.payload:
+            return empty
+        try:
+            return schemas.decode(request.payload, expected, encoding=request.encoding, limits=self._registry.limits)
+        except schemas.MessageError as error:
+            request.refuse(self._problem(lane.stream, error))
+            return None
+
+    def _problem(self, stream: str, error: schemas.MessageError, *, code: str = "") -> schemas.Problem:
+        return problem_of(
+            code or error.code,
+            stream=stream,
+            instance=self._registry.instance,
+            path=error.path,
+            expected=error.expected,
+            received=error.received,
+            message=f"Query: {error.path or 'payload'}: expected {error.expected}, received {error.received}.",
+        )
+
+
+class _Countdown:
+    """Calls `last` when `one` has been called so many times, by any threads."""
+
+    def __init__(self, count: int, last: Callable[[], None]) -> None:
+        self._lock = threading.Lock()
+        self._left = count
+        self._last = last
+
+    def one(self) -> None:
+        with self._lock:
+            self._left -= 1
+            done = self._left == 0
+        if done:
+            self._last()
+
+
+def _guarded(request: Request, answer: Callable[[], None]) -> None:
+    """Answer, and finish the request whatever happens: an asker must not wait for its timeout."""
+    began_ns = time.monotonic_ns()
+    try:
+        answer()
+    except TransportError as error:
+        log.warning("reply_failed", key=request.key, error=str(error))
+    finally:
+        request.finish()
+        log.debug("query", key=request.key, took_ms=(time.monotonic_ns() - began_ns) / 1e6)

@@ -1,0 +1,256 @@
+"""All streams of the service: finds the lane of a message, makes and frees lanes, and sees to those that fell silent.
+
+Called by the readers, the workers, the query thread and the control loop; one lock guards the tables, and nothing slow
+is done under it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Any, Final
+
+import optipmb_schemas as schemas
+import structlog
+
+import optipmb
+from optipmb_service.lane import Circle, Lane
+from optipmb_service.problems import problem_of
+from optipmb_service.records import SECOND, Life, Policy
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from optipmb_service.inbox import Pool
+    from optipmb_service.ports import Outlet, Packet
+    from optipmb_service.problems import Desk
+    from optipmb_service.profiles import Profiles
+    from optipmb_service.session import Session
+    from optipmb_service.settings import Settings
+
+log = structlog.get_logger("optipmb_service")
+
+MAX_UNPROVEN: Final = 256
+"""Lanes at once of streams that have not sent a valid message yet."""
+
+MAX_LIVES: Final = 65_536
+"""Streams without a session whose past is remembered."""
+
+MAX_KEYS: Final = 8192
+"""Keys whose stream is remembered."""
+
+
+class Registry:
+    """The streams of one service.
+
+    Args:
+        settings: what is in force.
+        profiles: the parameters that can be had.
+        outlet: where results go.
+        desk: where problems go.
+        pool: the workers.
+        arm: has `Lane.wake` called at a monotonic time (ns).
+        tracker: makes the trackers of sessions.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        profiles: Profiles,
+        outlet: Outlet,
+        desk: Desk,
+        pool: Pool,
+        arm: Callable[[Lane, int], None],
+        tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
+    ) -> None:
+        self.profiles = profiles
+        self.instance = settings.instance
+        self.keys = schemas.Keys(settings.prefix)
+        self.limits = settings.limits.limits()
+        self.cloud_wait_s = settings.cloud_wait_s
+        self._settings = settings
+        self._desk = desk
+        self._pool = pool
+        self._lock = threading.Lock()
+        self._lanes: dict[str, Lane] = {}
+        self._sessions = 0
+        self._lives: OrderedDict[str, Life] = OrderedDict()
+        self._streams: dict[str, str] = {}
+        self._past_frames = 0
+        self._past_refused = 0
+        self._circle = Circle(
+            instance=settings.instance,
+            limits=self.limits,
+            policy=Policy(
+                gap_limit_ns=round(settings.gap_limit_s * SECOND),
+                cloud_wait_ns=round(settings.cloud_wait_s * SECOND),
+                cloud_memory_ns=round(settings.cloud_memory_s * SECOND),
+                clouds=settings.queue_clouds,
+            ),
+            queue_frames=settings.queue_frames,
+            queue_clouds=settings.queue_clouds,
+            outlet=outlet,
+            desk=desk,
+            parameters_of=profiles.of,
+            admit=self._admit,
+            release=self._release,
+            discard=self._discard,
+            submit=pool.submit,
+            arm=arm,
+            tracker=tracker,
+        )
+
+    # Messages, from the readers
+
+    def frame(self, packet: Packet) -> None:
+        """Hand detections to their stream; never waits."""
+        if (stream := self._stream_of(packet)) is not None:
+            self._offer(stream, lambda lane: lane.inbox.offer_frame(packet))
+
+    def cloud(self, packet: Packet) -> None:
+        """Hand a point cloud to its stream; never waits."""
+        if (stream := self._stream_of(packet)) is not None:
+            self._offer(stream, lambda lane: lane.inbox.offer_cloud(packet))
+
+    def command(self, stream: str, command: Callable[[Lane], None], *, urgent: bool) -> bool:
+        """Have a worker run a command for a stream; False when the service takes no more streams."""
+        return self._offer(stream, lambda lane: lane.inbox.offer_command(lambda: command(lane), urgent=urgent))
+
+    # What is there
+
+    def lanes(self) -> list[Lane]:
+        """Return the lanes that have a session, by stream name."""
+        with self._lock:
+            lanes = sorted(self._lanes.items())
+        return [lane for _, lane in lanes if lane.session is not None]
+
+    def lane(self, stream: str) -> Lane | None:
+        """Return the lane of a stream that has a session."""
+        with self._lock:
+            lane = self._lanes.get(stream)
+        return lane if lane is not None and lane.session is not None else None
+
+    def totals(self) -> tuple[int, int]:
+        """Return the frames tracked and the messages refused since the start."""
+        with self._lock:
+            frames, refused, lanes = self._past_frames, self._past_refused, list(self._lanes.values())
+        for lane in lanes:
+            refused += lane.refused
+            if (session := lane.session) is not None:
+                frames += session.counters.frames
+                refused += session.counters.refused
+        return frames, refused
+
+    @property
+    def busy(self) -> bool:
+        """Whether something waits to be worked on."""
+        with self._lock:
+            lanes = list(self._lanes.values())
+        return any(not lane.inbox.idle for lane in lanes)
+
+    # What the control loop has done now and then
+
+    def sweep(self, now_ns: int) -> None:
+        """Log streams that fell silent, close sessions that have been idle for long."""
+        for lane in self.lanes():
+            age_s = lane.meter.age_s(now_ns)
+            if age_s is not None and age_s > self._settings.stale_s and not lane.stale:
+                lane.stale = True
+                log.warning("stream_stale", stream=lane.stream, age_s=round(age_s, 3))
+            if now_ns - lane.meter.active_ns > self._settings.idle_s * SECOND:
+                self.command(lane.stream, self._close_idle, urgent=False)
+
+    def finish(self) -> None:
+        """Process what is held for clouds, in every session; the workers do it."""
+        for lane in self.lanes():
+            self.command(lane.stream, _flush, urgent=False)
+
+    def _close_idle(self, lane: Lane) -> None:
+        # Asked again: a message may have come between the sweep and the worker's turn.
+        if time.monotonic_ns() - lane.meter.active_ns > self._settings.idle_s * SECOND:
+            lane.close_session("idle")
+
+    # Lanes
+
+    def _offer(self, stream: str, offer: Callable[[Lane], bool | None]) -> bool:
+        while True:
+            lane = self._lane(stream)
+            if lane is None:
+                self._refuse(stream)
+                return False
+            sent = offer(lane)
+            if sent is not None:
+                break
+            # The lane has closed since it was found: once more, with a new one.
+            self._discard(lane)
+        if sent:
+            self._pool.submit(lane)
+        return True
+
+    def _lane(self, stream: str) -> Lane | None:
+        with self._lock:
+            lane = self._lanes.get(stream)
+            if lane is None and len(self._lanes) - self._sessions < MAX_UNPROVEN:
+                lane = self._lanes[stream] = Lane(stream, self._circle)
+            return lane
+
+    def _discard(self, lane: Lane) -> None:
+        with self._lock:
+            if self._lanes.get(lane.stream) is lane:
+                del self._lanes[lane.stream]
+                self._past_refused += lane.refused
+
+    def _admit(self, stream: str) -> Life | None:
+        with self._lock:
+            if self._sessions >= self._settings.max_sessions:
+                return None
+            self._sessions += 1
+            return self._lives.pop(stream, Life())
+
+    def _release(self, session: Session) -> None:
+        with self._lock:
+            self._sessions -= 1
+            self._past_frames += session.counters.frames
+            self._past_refused += session.counters.refused
+            self._lives[session.stream] = session.life
+            if len(self._lives) > MAX_LIVES:
+                self._lives.popitem(last=False)
+
+    def _refuse(self, stream: str) -> None:
+        with self._lock:
+            self._past_refused += 1
+        self._report("shed", stream, f"fewer than {MAX_UNPROVEN} new streams at once", "another one")
+
+    def _stream_of(self, packet: Packet) -> str | None:
+        stream = self._streams.get(packet.key)
+        if stream is None:
+            try:
+                stream = self.keys.stream_of(packet.key)
+            except schemas.MessageError as error:
+                with self._lock:
+                    self._past_refused += 1
+                self._report("invalid_value", "", error.expected, error.received)
+                return None
+            if len(self._streams) >= MAX_KEYS:
+                self._streams.clear()
+            self._streams[packet.key] = stream
+        return stream
+
+    def _report(self, code: str, stream: str, expected: str, received: str) -> None:
+        message = f"Key: expected {expected}, received {received}."
+        problem = problem_of(
+            code,
+            stream=stream,
+            instance=self.instance,
+            path="key",
+            expected=expected,
+            received=received,
+            message=message,
+        )
+        self._desk.report(problem, time.monotonic_ns())
+
+
+def _flush(lane: Lane) -> None:
+    if lane.session is not None:
+        lane.deliver(lane.session.flush())

@@ -1,0 +1,230 @@
+"""The control loop: starts everything in order, keeps the timers, ends everything in order.
+
+asyncio runs on the main thread and does little: signals, the deadlines of frames that wait for their clouds, and once a
+second the streams that fell silent and the summaries of problems. Messages never pass through it; they go from a reader
+thread to a stream's inbox to a worker thread.
+
+Start: read the profiles, compile the kernels, open Zenoh, subscribe, answer queries, say alive, print the ready line.
+End (SIGINT, SIGTERM): withdraw the alive token, stop receiving, track what was received as long as the grace lasts,
+close.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import optipmb_schemas as schemas
+import structlog
+
+import optipmb
+from optipmb_service import __version__
+from optipmb_service.inbox import Pool
+from optipmb_service.ports import TransportError
+from optipmb_service.problems import Desk
+from optipmb_service.queries import Queries
+from optipmb_service.registry import Registry
+from optipmb_service.transport import Transport
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from optipmb_service.lane import Lane
+    from optipmb_service.profiles import Profiles
+    from optipmb_service.settings import Settings
+
+log = structlog.get_logger("optipmb_service")
+
+_T = TypeVar("_T")
+
+HOUSEKEEPING_S: Final = 0.5
+DRAIN_POLL_S: Final = 0.01
+JOIN_S: Final = 0.3
+
+
+class Service:
+    """A service on the network, without signals or a loop of its own: `run` adds these, tests use it as it is.
+
+    Args:
+        settings: what is in force.
+        profiles: the parameters that can be had.
+        arm: has `Lane.wake` called at a monotonic time (ns).
+        tracker: makes the trackers of sessions.
+
+    Raises:
+        TransportError: the network cannot be used.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        profiles: Profiles,
+        arm: Callable[[Lane, int], None],
+        tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
+    ) -> None:
+        self._settings = settings
+        self._started_ns = time.time_ns()
+        self._began_ns = time.monotonic_ns()
+        self._state = "starting"
+        self._transport = Transport(settings)
+        self._desk = Desk(self._transport.publish_problem, _log_problem)
+        self._pool = Pool(settings.threads)
+        self._registry = Registry(settings, profiles, self._transport, self._desk, self._pool, arm, tracker)
+        self._queries = Queries(self._registry, self.status)
+
+    def start(self) -> None:
+        """Receive, answer, and say so."""
+        self._transport.watch()
+        self._transport.subscribe(self._registry.frame, self._registry.cloud)
+        self._transport.serve(self._queries.about_streams, self._queries.about_service)
+        self._state = "ready"
+        self._transport.announce()
+
+    def housekeeping(self) -> None:
+        """Do what is due about once a second."""
+        now_ns = time.monotonic_ns()
+        self._registry.sweep(now_ns)
+        self._desk.flush(now_ns)
+
+    def stop(self) -> bool:
+        """Track what was received, within the grace, and close; False when a step would not end."""
+        self._state = "stopping"
+        ends = time.monotonic() + self._settings.grace_s
+        self._transport.stop(JOIN_S)
+        self._registry.finish()
+        while self._registry.busy and time.monotonic() < ends:
+            time.sleep(DRAIN_POLL_S)
+        ended = self._pool.close(JOIN_S)
+        self._desk.flush(time.monotonic_ns())
+        self._transport.close()
+        return ended
+
+    def status(self) -> schemas.ServiceStatus:
+        """Return the answer to `q/status`."""
+        now_ns = time.monotonic_ns()
+        frames, refused = self._registry.totals()
+        summaries = (lane.summary(now_ns) for lane in self._registry.lanes())
+        return schemas.ServiceStatus(
+            instance=self._settings.instance,
+            version=__version__,
+            started_ns=self._started_ns,
+            uptime_s=(now_ns - self._began_ns) / 1e9,
+            state=self._state,
+            sessions=tuple(summary for summary in summaries if summary is not None),
+            frames=frames,
+            refused=refused,
+            problems=self._desk.newest(),
+        )
+
+
+async def run(settings: Settings, profiles: Profiles) -> int:
+    """Run the service until SIGINT or SIGTERM.
+
+    Returns:
+        The exit status: 0, or 1 when the network could not be used.
+    """
+    loop = asyncio.get_running_loop()
+    asked = asyncio.Event()
+
+    def ask(name: str) -> None:
+        log.info("stop_asked" if not asked.is_set() else "stop_asked_again", signal=name)
+        asked.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ask, number.name)
+
+    def arm(lane: Lane, at_ns: int) -> None:
+        # The loop's time and the deadlines are one clock, the monotonic one.
+        loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, lane.wake)
+
+    log.info("starting", instance=settings.instance, version=__version__, profiles=profiles.names)
+    await _unless(asked, optipmb.warm_up)
+    if asked.is_set():
+        return 0
+    if not settings.is_router:
+        log.info("connecting", endpoints=settings.connect)
+    try:
+        service = await _unless(asked, lambda: Service(settings, profiles, arm))
+    except TransportError as error:
+        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+        return 1
+    if service is None:
+        return 0
+    service.start()
+    endpoints = ",".join((*settings.endpoints, *settings.connect))
+    print(f"ready instance={settings.instance} endpoints={endpoints}", flush=True)  # noqa: T201 - what starters wait for
+    log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+    while not asked.is_set():
+        await _passed(asked, HOUSEKEEPING_S)
+        service.housekeeping()
+    ended = await asyncio.to_thread(service.stop)
+    log.info("stopped", drained=ended)
+    return 0
+
+
+def leave(status: int) -> None:
+    """End the process; at once where a thread is stuck in machine code, which would crash an orderly end."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if any(thread.daemon and thread.is_alive() for thread in threading.enumerate()):
+        os._exit(status)
+    sys.exit(status)
+
+
+async def _passed(event: asyncio.Event, seconds: float) -> None:
+    """Wait for the event, at most so long."""
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(event.wait(), seconds)
+
+
+async def _unless(asked: asyncio.Event, work: Callable[[], _T]) -> _T | None:
+    """Do blocking work on a thread; None when the end was asked for before it was done, the work is then abandoned."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[_T] = loop.create_future()
+
+    def settle(value: _T | None, error: BaseException | None) -> None:
+        if done.cancelled():
+            return
+        if error is not None:
+            done.set_exception(error)
+        else:
+            done.set_result(value)  # type: ignore[arg-type]  # without an error there is a value
+
+    def call() -> None:
+        value: _T | None = None
+        error: BaseException | None = None
+        try:
+            value = work()
+        except BaseException as raised:  # noqa: BLE001 - handed to whoever awaits it
+            error = raised
+        with contextlib.suppress(RuntimeError):  # the loop has ended: the work was abandoned
+            loop.call_soon_threadsafe(settle, value, error)
+
+    # A daemon: neither compiling nor waiting for a router can be interrupted, and neither may keep the process.
+    threading.Thread(target=call, name="start", daemon=True).start()
+    stop = loop.create_task(asked.wait())
+    waits: set[asyncio.Future[Any]] = {done, stop}
+    await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    stop.cancel()
+    if not done.done():
+        done.cancel()
+        return None
+    return done.result()
+
+
+def _log_problem(problem: schemas.Problem, count: int) -> None:
+    log.warning(
+        "problem",
+        stream=problem.stream,
+        code=problem.code,
+        path=problem.path,
+        expected=problem.expected,
+        received=problem.received,
+        count=count,
+    )

@@ -1,0 +1,257 @@
+"""The settings of the service: a TOML file, over it the environment, over that the options of the command line.
+
+Times are in seconds. Every setting is described where it stands; `docs/operation.md` prints the same table, and so does
+``optipmb-service config``. Environment variables are ``OPTIPMB_`` and the name in capitals, nested names after ``__``
+(``OPTIPMB_LIMITS__MAX_BYTES``); lists are written with commas there, tables as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import tomllib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from optipmb_schemas import DEFAULT, Limits
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    NoDecode,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    SettingsError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+PREFIX: Final = "OPTIPMB_"
+DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"
+
+Source = Literal["option", "environment", "file", "default"]
+
+
+class SettingsInvalidError(ValueError):
+    """The settings cannot be used; the text is one clear line."""
+
+
+def _default_instance() -> str:
+    """Return a name that two services on one host do not share."""
+    host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()) or "host"
+    return f"{host}-{os.getpid()}"
+
+
+def _endpoint(value: str) -> str:
+    if not re.fullmatch(r"[a-z0-9]+/[^\s/#?]+:\d+([?#]\S*)?|[a-z0-9-]+/\S+", value):
+        raise ValueError(f"an endpoint looks like {DEFAULT_LISTEN}, received {value!r}")
+    return value
+
+
+def _prefix(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*", value):
+        raise ValueError(f"chunks of [A-Za-z0-9_.-] separated by '/', received {value!r}")
+    return value
+
+
+def _listed(value: Any) -> Any:
+    """Take a text for a list: JSON, or names separated by commas."""
+    if not isinstance(value, str):
+        return value
+    if not value.startswith("["):
+        return [part.strip() for part in value.split(",") if part.strip()]
+    try:
+        return json.loads(value)
+    except ValueError as error:
+        raise ValueError(f"names separated by commas, or a JSON list, received {value!r}") from error
+
+
+Endpoint = Annotated[str, AfterValidator(_endpoint)]
+Endpoints = Annotated[tuple[Endpoint, ...], NoDecode, BeforeValidator(_listed)]
+
+
+class LimitSettings(BaseModel):
+    """Bounds on what one message may hold; what is larger is refused before memory is taken for it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_bytes: int = Field(default=DEFAULT.max_bytes, ge=1024, le=2**30, description="bytes of a msgpack payload")
+    max_json_bytes: int = Field(
+        default=DEFAULT.max_json_bytes, ge=1024, le=2**30, description="bytes of a JSON payload"
+    )
+    max_points: int = Field(default=DEFAULT.max_points, ge=0, description="points of one cloud")
+    max_detections: int = Field(default=DEFAULT.max_detections, ge=1, description="detections of one frame")
+
+    def limits(self) -> Limits:
+        """Return the limits for the decoder."""
+        return Limits(**self.model_dump())
+
+
+class Settings(BaseSettings):
+    """What the service runs with."""
+
+    model_config = SettingsConfigDict(
+        frozen=True, extra="forbid", env_prefix=PREFIX, env_nested_delimiter="__", allow_inf_nan=False
+    )
+
+    instance: str = Field(
+        default_factory=_default_instance,
+        pattern=r"^[A-Za-z0-9_.-]{1,64}$",
+        description="name of this instance, one key chunk; default: the host's name and the process number",
+    )
+    prefix: Annotated[str, AfterValidator(_prefix)] = Field(
+        default="optipmb/v1", description="first chunks of every key"
+    )
+    router: bool | None = Field(
+        default=None,
+        description="whether this process is a Zenoh router itself; default: yes unless `connect` is given",
+    )
+    listen: Endpoints | None = Field(
+        default=None, description=f"endpoints to listen on; default: `{DEFAULT_LISTEN}` as a router, none as a client"
+    )
+    connect: Endpoints = Field(default=(), description="endpoints of the routers to connect to; retried for ever")
+    shared_memory: bool = Field(
+        default=False,
+        description="Zenoh's implicit shared memory; faster for clouds on one host, but it may lose messages and leaves"
+        " files in /dev/shm after a kill",
+    )
+    profile: str = Field(
+        default="nuscenes", min_length=1, description="profile of streams that no pattern names, a name or a TOML file"
+    )
+    profiles: dict[str, str] = Field(
+        default_factory=dict,
+        description="table of stream pattern (as `site/*/lidar*`) to profile name or file; the first match holds",
+    )
+    cloud_wait_s: float = Field(default=0.1, ge=0, le=60, description="longest wait of a frame for its point cloud")
+    cloud_memory_s: float = Field(
+        default=2.0,
+        ge=0,
+        le=3600,
+        description="frames that do not say whether a cloud comes wait if one came this lately, in stamps",
+    )
+    gap_limit_s: float = Field(
+        default=5.0, gt=0, le=86400, description="a larger step of the stamps, ahead or back, starts the session anew"
+    )
+    queue_frames: int = Field(
+        default=256, ge=1, le=65536, description="frames waiting per stream; the oldest is shed beyond it"
+    )
+    queue_clouds: int = Field(
+        default=16, ge=1, le=1024, description="point clouds kept per stream; the oldest is shed beyond it"
+    )
+    workers: int = Field(default=0, ge=0, le=256, description="threads that track; 0: one per processor, at most 8")
+    max_sessions: int = Field(
+        default=1000, ge=1, le=100_000, description="streams tracked at once; further ones are refused"
+    )
+    idle_s: float = Field(
+        default=600.0, gt=0, description="a session without a message for this long is closed and freed"
+    )
+    stale_s: float = Field(default=2.0, gt=0, description="a stream without a frame for this long is logged as stale")
+    grace_s: float = Field(default=1.0, ge=0, le=60, description="at the end, time for the frames already received")
+    log_format: Literal["console", "json"] = Field(default="console", description="form of the log lines on stderr")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="least level that is logged"
+    )
+    limits: LimitSettings = Field(default=LimitSettings(), description="bounds on what one message may hold")
+
+    @property
+    def is_router(self) -> bool:
+        """Whether this process routes for others."""
+        return not self.connect if self.router is None else self.router
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Endpoints to listen on."""
+        if self.listen is not None:
+            return self.listen
+        return (DEFAULT_LISTEN,) if self.is_router else ()
+
+    @property
+    def threads(self) -> int:
+        """Number of worker threads."""
+        return self.workers or min(8, os.cpu_count() or 1)
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Take values given to the constructor alone: `load` reads the file and the environment in its order."""
+        del settings_cls, env_settings, dotenv_settings, file_secret_settings
+        return (init_settings,)
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """Settings and, for every one of them, where its value came from."""
+
+    settings: Settings
+    sources: dict[str, Source]
+    unknown: tuple[str, ...] = ()
+    """Environment variables that look like settings and are none."""
+
+
+def load(file: Path | None = None, options: Mapping[str, Any] | None = None) -> Loaded:
+    """Merge the file, the environment and the options (None: not given), and check the result.
+
+    Raises:
+        SettingsInvalidError: the file cannot be read, or a value is not allowed.
+    """
+    layers: list[tuple[Source, dict[str, Any]]] = [
+        ("file", _read(file) if file is not None else {}),
+        ("environment", _environment()),
+        ("option", {name: value for name, value in (options or {}).items() if value is not None}),
+    ]
+    values: dict[str, Any] = {}
+    sources: dict[str, Source] = dict.fromkeys(Settings.model_fields, "default")
+    for source, layer in layers:
+        for name, value in layer.items():
+            old = values.get(name)
+            # A nested table is merged name by name; the table of profiles is one value, its order has a meaning.
+            if name == "limits" and isinstance(old, dict) and isinstance(value, dict):
+                values[name] = {**old, **value}
+            else:
+                values[name] = value
+            sources[name] = source
+    try:
+        settings = Settings(**values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        path = ".".join(str(part) for part in first["loc"]) or "settings"
+        source = sources.get(str(first["loc"][0]) if first["loc"] else "", "default")
+        where = f" (from the {source})" if source != "default" else ""
+        message = first["msg"].removeprefix("Value error, ")
+        raise SettingsInvalidError(f"setting {path}{where}: {message}") from error
+    if not settings.endpoints and not settings.connect:
+        raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
+    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields}
+    unknown = (name for name in os.environ if name.startswith(PREFIX) and name.split("__")[0] not in known)
+    return Loaded(settings, sources, tuple(sorted(unknown)))
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
+        raise SettingsInvalidError(f"settings file {file}: {reason}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsInvalidError(f"settings file {file}: not TOML: {error}") from error
+
+
+def _environment() -> dict[str, Any]:
+    try:
+        return EnvSettingsSource(Settings)()
+    except SettingsError as error:
+        match = re.search(r'field "(\w+)"', str(error))
+        name = f"{PREFIX}{match[1].upper()}" if match else "environment"
+        raise SettingsInvalidError(
+            f"{name}: lists and tables are written as JSON, as '[\"tcp/0.0.0.0:7447\"]'"
+        ) from error

@@ -1,0 +1,356 @@
+"""Zenoh, and nothing else: the one module of the service that imports it.
+
+Conventions: payloads are bytes, keys are text. Rules that avoid Zenoh's known traps:
+
+- Nothing runs in Zenoh's callbacks. Every subscription is a FIFO channel that one thread always drains; what it calls
+  must only put the message into a queue. The thread reads the channel's handler, not the subscription: a subscription
+  that is being read cannot be undeclared.
+- References to publishers, tokens and subscriptions are kept: Zenoh withdraws what nobody refers to.
+- Closing goes from the outside in: the alive token, subscriptions and queryables (their threads read on until the
+  channels are closed and empty), publishers and owner tokens, the session.
+- Implicit shared memory is off unless asked for: it loses messages when a receiver stalls, and leaves files behind.
+- Messages wait 50 ms before congestion drops them (500 ms for large ones): with the defaults, large messages are lost
+  whenever the machine is busy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import threading
+import time
+from typing import TYPE_CHECKING, Final, Protocol, TypeVar, cast
+
+import optipmb_schemas as schemas
+import structlog
+import zenoh
+import zenoh.ext
+
+from optipmb_service.ports import Packet, TransportError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from optipmb_service.ports import Request
+    from optipmb_service.settings import Settings
+
+CHANNEL: Final = 4096
+"""Messages between Zenoh and a draining thread; more than any publisher's history."""
+
+HISTORY_S: Final = 10.0
+"""Age of the detections fetched from the publishers' caches when the service starts or a publisher appears."""
+
+TRACKS_CACHE: Final = 128
+"""Tracks kept per stream for subscribers that lost some or come late: 5 s and more at the usual rates."""
+
+HEARTBEAT_S: Final = 0.2
+"""How long the loss of the newest tracks may stay unnoticed."""
+
+WAIT_BEFORE_DROP_US: Final = 50_000
+WAIT_BEFORE_DROP_FRAGMENTS_US: Final = 500_000
+
+RETRY_MS: Final = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2}
+
+MESSAGE_HEADROOM: Final = 4
+"""A message up to this many times the limit is received and answered by a problem; a larger one is dropped by Zenoh."""
+
+
+log = structlog.get_logger("optipmb_service")
+
+_T = TypeVar("_T")
+
+
+# What is used of Zenoh's objects, typed: its own stubs leave parts untyped.
+class _Undeclared(Protocol):
+    def undeclare(self) -> object: ...
+
+
+class _Closed(Protocol):
+    def close(self) -> object: ...
+
+
+class _Dropped(Protocol):
+    def drop(self) -> object: ...
+
+
+class _Publisher(_Undeclared, Protocol):
+    def put(self, payload: bytes) -> object: ...
+
+
+def configuration(settings: Settings) -> zenoh.Config:
+    """Return Zenoh's configuration for the settings.
+
+    Raises:
+        TransportError: an endpoint that Zenoh cannot use.
+    """
+    values: dict[str, object] = {
+        "mode": "router" if settings.is_router else "client",
+        "listen/endpoints": list(settings.endpoints),
+        "connect/endpoints": list(settings.connect),
+        "connect/timeout_ms": -1,
+        "connect/retry": RETRY_MS,
+        "scouting/multicast/enabled": False,
+        "scouting/delay": 0,
+        "timestamping/enabled": True,
+        "transport/shared_memory/enabled": settings.shared_memory,
+        "transport/link/rx/max_message_size": MESSAGE_HEADROOM * settings.limits.max_bytes,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
+        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": WAIT_BEFORE_DROP_FRAGMENTS_US,
+    }
+    if settings.is_router:
+        values["connect/exit_on_failure"] = False  # a router starts without the routers that it looks for
+    config = zenoh.Config()
+    for key, value in values.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise TransportError(f"setting {key}: {_line(error)}") from error
+    return config
+
+
+class Transport:
+    """A Zenoh session with what the service declares on it.
+
+    Args:
+        settings: endpoints, prefix, instance.
+
+    Raises:
+        TransportError: an endpoint is in use or unusable. As a client it does not raise but wait for a router.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._keys = schemas.Keys(settings.prefix)
+        self._prefix = settings.prefix
+        self._instance = settings.instance
+        self._max_bytes = settings.limits.max_bytes
+        try:
+            self._session = zenoh.open(configuration(settings))
+        except zenoh.ZError as error:
+            raise TransportError(_opening(settings, error)) from error
+        self._readers: list[tuple[_Undeclared, threading.Thread]] = []
+        self._claims: set[Claim] = set()
+        self._lock = threading.Lock()
+        self._alive: _Undeclared | None = None
+
+    # Receiving
+
+    def subscribe(self, on_frame: Callable[[Packet], None], on_cloud: Callable[[Packet], None]) -> None:
+        """Hand over the detections and point clouds of all streams, each on a thread of its own."""
+        detections = zenoh.ext.declare_advanced_subscriber(
+            self._session,
+            self._keys.all("detections"),
+            zenoh.handlers.FifoChannel(CHANNEL),
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_age=HISTORY_S),
+            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+        )
+        self._read("detections", detections, detections.handler, lambda sample: self._receive(sample, on_frame))
+        points = self._session.declare_subscriber(self._keys.all("points"), zenoh.handlers.FifoChannel(CHANNEL // 16))
+        self._read("points", points, points.handler, lambda sample: self._receive(sample, on_cloud))
+
+    def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
+        """Hand over the queries about streams and those about this instance, each on a thread of its own."""
+        for key, answer in (
+            (f"{self._prefix}/*/*/*/q/*", about_streams),
+            (self._keys.status(self._instance), about_service),
+        ):
+            queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(CHANNEL // 16))
+            self._read("queries", queryable, queryable.handler, _answering(answer))
+
+    def watch(self) -> None:
+        """Log the nodes and routers that this session is linked to, as they come and go."""
+        listener = self._session.info.declare_transport_events_listener(
+            zenoh.handlers.FifoChannel(CHANNEL // 16), history=True
+        )
+        self._read("links", listener, listener.handler, _log_link)
+
+    def _read(self, name: str, declared: _Undeclared, handler: Iterable[_T], receive: Callable[[_T], None]) -> None:
+        def drain() -> None:
+            with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
+                for item in handler:
+                    try:
+                        receive(item)
+                    except Exception:
+                        log.exception("internal_error", reader=name)  # one message must not end the reading
+
+        thread = threading.Thread(target=drain, name=f"reader-{name}", daemon=True)
+        thread.start()
+        self._readers.append((declared, thread))
+
+    def _receive(self, sample: zenoh.Sample, receive: Callable[[Packet], None]) -> None:
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        wall_ns, now_ns = time.time_ns(), time.monotonic_ns()
+        size = len(sample.payload)
+        payload = sample.payload.to_bytes() if size <= self._max_bytes else None
+        receive(Packet(str(sample.key_expr), payload, size, str(sample.encoding), wall_ns, now_ns))
+
+    # Sending
+
+    def announce(self) -> None:
+        """Say that this instance is alive; to be called when it is ready."""
+        self._alive = self._session.liveliness().declare_token(self._keys.alive(self._instance))
+
+    def claim(self, stream: str) -> Claim:
+        """Become the owner of a stream.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        try:
+            publisher = zenoh.ext.declare_advanced_publisher(
+                self._session,
+                self._keys.tracks(stream),
+                encoding=schemas.encoding_of(schemas.Tracks),
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.DATA_HIGH,
+                express=True,
+                cache=zenoh.ext.CacheConfig(TRACKS_CACHE),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
+                publisher_detection=True,
+            )
+            token = self._session.liveliness().declare_token(self._keys.owner(stream, self._instance))
+        except zenoh.ZError as error:
+            raise TransportError(_line(error)) from error
+        claim = Claim(publisher, token, self._forget)
+        with self._lock:
+            self._claims.add(claim)
+        return claim
+
+    def publish_problem(self, problem: schemas.Problem) -> None:
+        """Send a problem on its stream's key; one without a stream has no key and is not sent."""
+        if not problem.stream:
+            return
+        with contextlib.suppress(zenoh.ZError):  # at the end: the session is closed
+            self._session.put(
+                self._keys.problems(problem.stream),
+                schemas.encode(problem),
+                encoding=schemas.encoding_of(problem),
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+
+    # The end
+
+    def stop(self, timeout: float) -> None:
+        """Receive nothing any more; what was received before is handed over within `timeout` seconds."""
+        if self._alive is not None:
+            _undeclare(self._alive)
+            self._alive = None
+        for declared, _ in self._readers:
+            _undeclare(declared)
+        for _, thread in self._readers:
+            thread.join(timeout)
+        self._readers.clear()
+
+    def close(self) -> None:
+        """Withdraw everything and close the session."""
+        self.stop(timeout=0.2)
+        with self._lock:
+            claims = tuple(self._claims)
+        for claim in claims:
+            claim.release()
+        with contextlib.suppress(zenoh.ZError):
+            cast("_Closed", self._session).close()
+
+    def _forget(self, claim: Claim) -> None:
+        with self._lock:
+            self._claims.discard(claim)
+
+
+class Claim:
+    """A stream that this instance tracks."""
+
+    def __init__(self, publisher: _Publisher, token: _Undeclared, forget: Callable[[Claim], None]) -> None:
+        self._publisher = publisher
+        self._token = token
+        self._forget = forget
+
+    def publish(self, payload: bytes) -> None:
+        """Send encoded tracks.
+
+        Raises:
+            TransportError: the publisher is withdrawn.
+        """
+        try:
+            self._publisher.put(payload)
+        except zenoh.ZError as error:
+            raise TransportError(_line(error)) from error
+
+    def release(self) -> None:
+        """Withdraw the publisher and the token."""
+        _undeclare(self._token)
+        _undeclare(self._publisher)
+        self._forget(self)
+
+
+class Question:
+    """A query; not finished, it keeps its asker waiting until the timeout."""
+
+    def __init__(self, query: zenoh.Query) -> None:
+        self._query = query
+        self.key = str(query.key_expr)
+        payload = query.payload
+        self.payload = None if payload is None else payload.to_bytes()
+        self.encoding = "" if query.encoding is None else str(query.encoding)
+
+    def matches(self, key: str) -> bool:
+        """Tell whether the key expression that was asked includes a key."""
+        return bool(self._query.key_expr.intersects(zenoh.KeyExpr(key)))
+
+    def answer(self, key: str, message: schemas.Message) -> None:
+        """Reply.
+
+        Raises:
+            TransportError: the asker or the session is gone.
+        """
+        try:
+            self._query.reply(key, schemas.encode(message), encoding=schemas.encoding_of(message))
+        except zenoh.ZError as error:
+            raise TransportError(_line(error)) from error
+
+    def refuse(self, problem: schemas.Problem) -> None:
+        """Reply with an error.
+
+        Raises:
+            TransportError: the asker or the session is gone.
+        """
+        try:
+            self._query.reply_err(schemas.encode(problem), encoding=schemas.encoding_of(problem))
+        except zenoh.ZError as error:
+            raise TransportError(_line(error)) from error
+
+    def finish(self) -> None:
+        """Tell the asker that nothing follows."""
+        cast("_Dropped", self._query).drop()
+
+
+def _answering(answer: Callable[[Request], None]) -> Callable[[zenoh.Query], None]:
+    return lambda query: answer(Question(query))
+
+
+def _log_link(event: zenoh.TransportEvent) -> None:
+    came = event.kind == zenoh.SampleKind.PUT
+    log.info(
+        "peer_connected" if came else "peer_lost", peer=str(event.transport.zid), kind=str(event.transport.whatami)
+    )
+
+
+def _undeclare(declared: _Undeclared) -> None:
+    with contextlib.suppress(zenoh.ZError):  # the session may be closed already
+        declared.undeclare()
+
+
+def _line(error: zenoh.ZError) -> str:
+    """Return Zenoh's words without the places in its sources."""
+    text = re.sub(r" at /\S+?:\d+\.?", "", str(error))
+    return " ".join(text.split()).rstrip(".")[:300]
+
+
+def _opening(settings: Settings, error: zenoh.ZError) -> str:
+    """Return one line for a session that could not be opened."""
+    text = _line(error)
+    where = ", ".join((*settings.endpoints, *settings.connect))
+    if "Address already in use" in text:
+        return f"cannot listen on {where}: the address is in use; is another optipmb-service running?"
+    return f"cannot open {where}: {text}"

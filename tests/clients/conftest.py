@@ -1,0 +1,14 @@
+"""What several tests of the client need."""
+
+from collections.abc import Iterator
+
+import pytest
+from routers import free_endpoint, open_router
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    """The endpoint of a router without any service."""
+    address = free_endpoint()
+    with open_router(address):
+        yield address

@@ -1,0 +1,436 @@
+"""Publisher and Subscriber through a real router; plain Zenoh sessions play the other side."""
+
+import re
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import zenoh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from optipmb_client import Connection, ConnectionFailed, Publisher, Subscriber
+from optipmb_client.transport import Inbox
+from optipmb_schemas import Detections, MessageError, Points, Problem, Tracks, decode, encode, encoding_of
+from routers import free_endpoint, open_client
+
+STREAM = "garage/robot-1/lidar"
+POSE = ([1.0, 2.0, 3.0], [1.0, 0.0, 0.0, 0.0])
+ONE = {"label": ["Car"], "center": [[1, 2, 0]], "size": [[4, 2, 1.5]], "yaw": [0.1], "score": [0.9]}
+SESSION = "0123456789abcdef0123456789abcdef"
+
+
+@pytest.fixture
+def link(endpoint: str) -> Iterator[Connection]:
+    """A connection to the router."""
+    with Connection(endpoint) as connection:
+        yield connection
+
+
+def listen(connection: Connection, topic: str) -> Inbox:
+    """Everything that is published on a topic from now on."""
+    inbox = Inbox(10_000)
+    connection.subscribe(f"optipmb/v1/*/*/*/{topic}", inbox)
+    return inbox
+
+
+def tracks(seq: int, *, revision: int = 0, session: str = SESSION, epoch: bytes = bytes(16)) -> Tracks:
+    """A tracks message without tracks."""
+    none = np.zeros(0)
+    return Tracks(
+        stream=STREAM,
+        epoch=epoch,
+        seq=seq,
+        stamp_ns=seq,
+        session=session,
+        revision=revision,
+        profile="kitti",
+        cloud_used=False,
+        labels=("Car",),
+        id=none.astype(np.int64),
+        label=none.astype(np.int64),
+        center=np.zeros((0, 3)),
+        size=np.zeros((0, 3)),
+        yaw=none,
+        velocity=np.zeros((0, 2)),
+        yaw_rate=none,
+        acceleration=none,
+        existence=none,
+        score=none,
+        covariance=np.zeros((0, 6, 6)),
+        age=none,
+        time_since_detection=none,
+        detection=none.astype(np.int64),
+    )
+
+
+def problem(message: str) -> Problem:
+    """Give a problem with a text."""
+    return Problem(stream=STREAM, instance="test", code="malformed", message=message)
+
+
+class Service:
+    """The other side of a subscriber: puts payloads on the stream's keys."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+
+    def put(self, topic: str, payload: bytes, encoding: str = "") -> None:
+        """Publish bytes on a topic of the stream."""
+        self._session.put(
+            f"optipmb/v1/{STREAM}/{topic}", payload, encoding=encoding or None, priority=zenoh.Priority.DATA_HIGH
+        )
+
+    def tracks(self, *messages: Tracks) -> None:
+        """Publish tracks."""
+        for message in messages:
+            self.put("tracks", encode(message), encoding_of(Tracks))
+
+
+@pytest.fixture
+def service(endpoint: str) -> Iterator[Service]:
+    """The other side, with a session of its own."""
+    with open_client(endpoint) as session:
+        yield Service(session)
+
+
+def test_detections_arrive_as_published(link: Connection) -> None:
+    """What `publish` was given is what a receiver decodes, with the publisher's epoch and numbers from 0."""
+    inbox = listen(link, "detections")
+    with Publisher(STREAM, connection=link) as publisher:
+        for stamp in (5, 6):
+            publisher.publish(stamp_ns=stamp, velocity=[[np.nan, np.nan]], pose=POSE, **ONE)
+        arrivals = [inbox.get(10.0), inbox.get(10.0)]
+    first, second = (decode(a.payload, Detections, encoding=a.encoding) for a in arrivals if a)
+    assert (first.seq, second.seq, first.stamp_ns, second.stamp_ns) == (0, 1, 5, 6)
+    assert first.epoch == second.epoch == publisher.epoch
+    assert (first.stream, first.frame, first.labels) == (STREAM, "sensor", ("Car",))
+    assert first.pose is not None
+    assert first.pose.translation.tolist() == [1.0, 2.0, 3.0]
+    assert first.center.tolist() == [[1.0, 2.0, 0.0]]
+    assert first.size.tolist() == [[4.0, 2.0, 1.5]]
+    assert (first.yaw.tolist(), first.score.tolist(), first.label.tolist()) == ([0.1], [0.9], [0])
+    assert first.velocity is not None
+    assert np.isnan(first.velocity).all()
+    assert first.has_points is None
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.sampled_from(["Car", "Pedestrian", "Cyclist"]), max_size=6))
+def test_class_names_and_indices_say_the_same(names: list[str]) -> None:
+    """Names per object, and indices into a list of names, give detections of the same classes."""
+    sent: list[bytes] = []
+    known = ["Cyclist", "Car", "Pedestrian"]
+    count = len(names)
+    boxes = {
+        "center": np.zeros((count, 3)),
+        "size": np.ones((count, 3)),
+        "yaw": np.zeros(count),
+        "score": np.ones(count),
+    }
+    with offline_publisher(sent, "world") as publisher:
+        publisher.publish(stamp_ns=0, label=names, **boxes)
+        publisher.publish(stamp_ns=1, label=[known.index(name) for name in names], labels=known, **boxes)
+    for payload in sent:
+        message = decode(payload, Detections)
+        assert [message.labels[index] for index in message.label] == names
+
+
+class Recorder:
+    """In the place of a connection: keeps what is sent."""
+
+    def __init__(self, sent: list[bytes], *, wanted: bool) -> None:
+        self.wanted = wanted
+        self.put = sent.append
+
+    def sender(self, *_: object, **__: object) -> "Recorder":
+        """Give the sender of any key."""
+        return self
+
+    cached_sender = plain_sender = sender
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def offline_publisher(sent: list[bytes], frame: str = "sensor", *, wanted: bool = True) -> Publisher:
+    """Give a publisher whose messages end in a list."""
+    return Publisher(STREAM, connection=cast("Connection", Recorder(sent, wanted=wanted)), frame=cast("Any", frame))
+
+
+BAD = [
+    ({"score": [1.5]}, "score[0]"),
+    ({"score": [float("nan")]}, "score[0]"),
+    ({"size": [[4, 0, 1.5]]}, "size[0][1]"),
+    ({"center": [[1, 2]]}, "center"),
+    ({"yaw": [0.0, 1.0]}, "yaw"),
+    ({"label": [7]}, "label[0]"),
+    ({"label": [1], "labels": ["Car"]}, "label"),
+    ({"pose": None}, "pose"),
+    ({"pose": ([0, 0, 0], [2.0, 0, 0, 0])}, "quaternion"),
+    ({"stamp_ns": -1}, "stamp_ns"),
+    ({"label": "Car"}, "label"),
+    ({"label": 1}, "label"),
+    ({"center": [[1, 2, 3], [1, 2]]}, "center[1]"),
+    ({"center": 5}, "center"),
+    ({"size": None}, "size"),
+    ({"pose": np.eye(4)}, "pose"),
+    ({"pose": 5}, "pose"),
+    ({"points": [[1, 2, 3], [1, 2]]}, "xyz[1]"),
+    ({"points": [[1, 2, float("nan")]]}, "xyz[0][2]"),
+    ({"stamp_ns": 1.5}, "stamp_ns"),
+    ({"velocity": [[np.inf, 0]]}, "velocity[0][0]"),
+    ({"points": np.zeros((4, 2), np.float32)}, "xyz"),
+    ({"points": "nonsense"}, "xyz"),
+    ({"points_pose": ([0, 0], [1.0, 0, 0, 0]), "points": np.zeros((4, 3), np.float32)}, "translation"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "path"), BAD, ids=[next(iter(wrong)) + str(n) for n, (wrong, _) in enumerate(BAD)])
+def test_a_wrong_argument_is_named_and_nothing_is_sent(wrong: dict[str, object], path: str) -> None:
+    """Bad values raise MessageError with the path of the field; nothing goes out, and no number is used up."""
+    sent: list[bytes] = []
+    with offline_publisher(sent) as publisher:
+        with pytest.raises(MessageError, match=re.escape(path)):
+            publisher.publish(**({"stamp_ns": 0, "pose": POSE} | ONE | wrong))  # type: ignore[arg-type]  # wrong on purpose
+        assert sent == []
+        assert publisher.publish(stamp_ns=0, pose=POSE, **ONE) == 0
+
+
+def test_an_unknown_frame_is_refused() -> None:
+    """`frame` is sensor or world."""
+    with offline_publisher([], "car") as publisher, pytest.raises(MessageError, match="frame"):
+        publisher.publish(stamp_ns=0, pose=POSE, **ONE)
+
+
+@pytest.mark.parametrize("stream", ["a/b", "a/b/c/d", "a/b/ c", "a/*/c", "", "owner/b/c"])
+def test_a_name_that_is_no_stream_is_refused_before_connecting(stream: str) -> None:
+    """A bad stream name raises MessageError at once, whether or not there is a network."""
+    with pytest.raises(MessageError, match="stream"):
+        Publisher(stream, free_endpoint(), timeout=30.0)
+
+
+def test_unreachable_network_is_one_clear_error() -> None:
+    """Publisher and Subscriber raise ConnectionFailed within their timeout."""
+    address = free_endpoint()
+    begun = time.monotonic()
+    with pytest.raises(ConnectionFailed, match="optipmb-service"):
+        Publisher(STREAM, address, timeout=0.3)
+    with pytest.raises(ConnectionFailed, match="optipmb-service"):
+        Subscriber(STREAM, address, connect_timeout=0.3)
+    assert time.monotonic() - begun < 3.0
+
+
+def test_a_cloud_is_sent_before_its_detections() -> None:
+    """With points, the cloud goes first, with the same stamp, and the detections announce it."""
+    sent: list[bytes] = []
+    points = np.arange(12, dtype=np.float32).reshape(3, 4)
+    with offline_publisher(sent) as publisher:
+        publisher.publish(stamp_ns=7, pose=POSE, points=points, points_pose=([9, 9, 9], [1.0, 0, 0, 0]), **ONE)
+    cloud, boxes = decode(sent[0], Points), decode(sent[1], Detections)
+    assert (cloud.stamp_ns, boxes.stamp_ns, boxes.has_points, cloud.seq) == (7, 7, True, 0)
+    assert cloud.epoch == boxes.epoch
+    assert cloud.xyz.tolist() == points[:, :3].tolist()
+    assert cloud.pose is not None
+    assert cloud.pose.translation.tolist() == [9.0, 9.0, 9.0]
+
+
+def test_points_without_a_return_are_left_out() -> None:
+    """Rows with a coordinate that is not finite are not sent; the others are, in order."""
+    sent: list[bytes] = []
+    points = np.array([[1, 1, 1], [np.nan, 0, 0], [2, 2, 2], [0, np.inf, 0]], dtype=np.float32)
+    with offline_publisher(sent) as publisher:
+        publisher.publish(stamp_ns=7, pose=POSE, points=points, **ONE)
+    assert decode(sent[0], Points).xyz.tolist() == [[1, 1, 1], [2, 2, 2]]
+
+
+def test_clouds_that_nobody_wants_are_not_sent_unless_insisted() -> None:
+    """Without a subscriber to clouds the detections do not announce one; `has_points=True` sends it in any case."""
+    sent: list[bytes] = []
+    points = np.zeros((3, 3), dtype=np.float32)
+    with offline_publisher(sent, wanted=False) as publisher:
+        publisher.publish(stamp_ns=7, pose=POSE, points=points, **ONE)
+        assert [decode(payload, Detections).has_points for payload in sent] == [None]
+        publisher.publish(stamp_ns=8, pose=POSE, points=points, has_points=True, **ONE)
+        assert decode(sent[1], Points).stamp_ns == 8
+        assert decode(sent[2], Detections).has_points is True
+        assert publisher.publish_points(stamp_ns=9, points=points, pose=POSE) is None
+        assert len(sent) == 3
+
+
+def test_a_frame_without_cloud_says_so_once_the_stream_has_clouds() -> None:
+    """Before the first cloud has_points is left open; after it, a frame without one says that none comes."""
+    sent: list[bytes] = []
+    with offline_publisher(sent) as publisher:
+        publisher.publish(stamp_ns=1, pose=POSE, **ONE)
+        assert publisher.publish_points(stamp_ns=2, points=np.zeros((1, 3), np.float32), pose=POSE) == 0
+        publisher.publish(stamp_ns=3, pose=POSE, **ONE)
+    assert decode(sent[0], Detections).has_points is None
+    assert decode(sent[2], Detections).has_points is False
+
+
+def test_arrays_of_other_kinds_are_taken() -> None:
+    """Integers of numpy, float32 arrays, empty lists and objects with `__array__` are all valid arguments."""
+
+    class Tensor:
+        def __array__(self, dtype: object = None, *, copy: bool | None = None) -> np.ndarray:
+            return np.ones((1, 3), np.float32)
+
+    sent: list[bytes] = []
+    with offline_publisher(sent, "world") as publisher:
+        publisher.publish(stamp_ns=np.int64(3), label=[], center=[], size=[], yaw=[], score=[], velocity=[])
+        publisher.publish(stamp_ns=4, label=["Car"], center=Tensor(), size=Tensor(), yaw=np.zeros(1, "f4"), score=[1])
+    assert decode(sent[0], Detections).center.shape == (0, 3)
+    assert decode(sent[1], Detections).center.tolist() == [[1.0, 1.0, 1.0]]
+
+
+def test_numbers_stay_in_order_from_many_threads(link: Connection) -> None:
+    """Frames published by several threads at once carry each number once, and go out in the order of the numbers."""
+    inbox = listen(link, "detections")
+    with Publisher(STREAM, connection=link, cache=400) as publisher:
+
+        def publish() -> None:
+            for _ in range(50):
+                publisher.publish(stamp_ns=0, pose=POSE, **ONE)
+
+        threads = [threading.Thread(target=publish) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        arrivals = [inbox.get(10.0) for _ in range(200)]
+    assert [decode(a.payload, Detections).seq for a in arrivals if a] == list(range(200))
+
+
+def test_a_late_service_gets_the_frames_kept(link: Connection) -> None:
+    """A service that comes after the frames receives the newest `cache` of them."""
+    with Publisher(STREAM, connection=link, cache=3) as publisher:
+        for stamp in range(10):
+            publisher.publish(stamp_ns=stamp, pose=POSE, **ONE)
+        inbox = listen(link, "detections")
+        arrivals = [inbox.get(10.0) for _ in range(3)]
+    assert [decode(a.payload, Detections).seq for a in arrivals if a] == [7, 8, 9]
+
+
+def test_publishing_after_close_is_one_clear_error(endpoint: str) -> None:
+    """A closed publisher raises ConnectionFailed, and may be closed again."""
+    publisher = Publisher(STREAM, endpoint)
+    publisher.close()
+    publisher.close()
+    with pytest.raises(ConnectionFailed, match="closed"):
+        publisher.publish(stamp_ns=0, pose=POSE, **ONE)
+
+
+@pytest.mark.parametrize("pattern", [STREAM, "garage/*/*", "*/*/*", "*/robot-1/lidar"])
+def test_subscriber_takes_names_and_patterns(link: Connection, service: Service, pattern: str) -> None:
+    """The name of a stream and every pattern of it receive its tracks; the loop ends after the timeout."""
+    with Subscriber(pattern, connection=link, timeout=0.5) as subscriber:
+        settle(subscriber, service)
+        service.tracks(tracks(1), tracks(2))
+        assert [message.seq for message in subscriber] == [1, 2]
+
+
+def settle(subscriber: Subscriber, service: Service) -> None:
+    """Wait until what the service puts arrives at the subscriber: its declaration has reached the other session."""
+    deadline = time.monotonic() + 10.0
+    number = 0
+    while time.monotonic() < deadline:
+        service.tracks(tracks(number, session="f" * 32))
+        number += 1
+        if subscriber.receive(0.05) is not None:
+            break
+    while subscriber.receive(0.2) is not None:
+        pass
+
+
+@pytest.mark.parametrize("pattern", ["garage/*", "garage/**", "a/b/c/d", "gar*/a/b", "$*/a/b", ""])
+def test_a_pattern_that_is_none_is_refused(pattern: str) -> None:
+    """Only whole names may be replaced by a star."""
+    with pytest.raises(MessageError, match="stream"):
+        Subscriber(pattern, free_endpoint(), connect_timeout=30.0)
+
+
+def test_repeated_messages_are_left_out_and_newer_revisions_kept(link: Connection, service: Service) -> None:
+    """The same frame again, or an older revision of it, is not given out; a newer revision, session or epoch is."""
+    with Subscriber(STREAM, connection=link, timeout=0.5) as subscriber:
+        settle(subscriber, service)
+        before = subscriber.statistics.repeated
+        service.tracks(
+            tracks(1),
+            tracks(1),
+            tracks(2, revision=1),
+            tracks(2),
+            tracks(2, revision=2),
+            tracks(1, session="a" * 32),
+            tracks(1, epoch=bytes(15) + b"x"),
+        )
+        received = [(m.seq, m.revision, m.session, m.epoch) for m in subscriber]
+        assert received == [
+            (1, 0, SESSION, bytes(16)),
+            (2, 1, SESSION, bytes(16)),
+            (2, 2, SESSION, bytes(16)),
+            (1, 0, "a" * 32, bytes(16)),
+            (1, 0, SESSION, bytes(15) + b"x"),
+        ]
+        assert subscriber.statistics.repeated - before == 2
+
+
+def test_garbage_between_tracks_is_counted_and_passed_over(link: Connection, service: Service) -> None:
+    """Bytes that are no message, and messages of another type, do not disturb the loop."""
+    with Subscriber(STREAM, connection=link, timeout=0.5) as subscriber:
+        settle(subscriber, service)
+        service.put("tracks", b"\xff\xff garbage", encoding_of(Tracks))
+        service.put("tracks", encode(problem("x")), encoding_of(Problem))
+        service.put("tracks", b"", "")
+        service.tracks(tracks(1))
+        assert [message.seq for message in subscriber] == [1]
+        assert subscriber.statistics.invalid == 3
+
+
+def test_problems_go_to_the_callback(link: Connection, service: Service) -> None:
+    """Problems of the stream reach `on_problem` from the loop, in order with the tracks."""
+    seen: list[str] = []
+    with Subscriber(STREAM, connection=link, timeout=0.5, on_problem=lambda p: seen.append(p.message)) as subscriber:
+        settle(subscriber, service)
+        deadline = time.monotonic() + 10.0
+        while not seen and time.monotonic() < deadline:
+            service.put("problems", encode(problem("first")), encoding_of(Problem))
+            subscriber.receive(0.05)
+        service.put("problems", encode(problem("second")), encoding_of(Problem))
+        service.put("problems", b"garbage", encoding_of(Problem))
+        list(subscriber)
+    assert seen[0] == "first"
+    assert seen[-1] == "second"
+
+
+def test_a_slow_program_loses_its_oldest_messages_and_counts_them(link: Connection, service: Service) -> None:
+    """Of 100 messages with room for 4, the newest 4 are given out; the others are counted as dropped."""
+    with Subscriber(STREAM, connection=link, timeout=0.5, queue=4) as subscriber:
+        settle(subscriber, service)
+        before = subscriber.statistics.dropped
+        service.tracks(*(tracks(number) for number in range(100)))
+        deadline = time.monotonic() + 10.0
+        while subscriber.statistics.dropped - before < 96 and time.monotonic() < deadline:
+            time.sleep(0.01)  # reading would make room, which is what must not happen here
+        assert [message.seq for message in subscriber] == [96, 97, 98, 99]
+        assert subscriber.statistics.dropped - before == 96
+
+
+def test_closing_ends_a_loop_in_another_thread(link: Connection) -> None:
+    """`close` ends a loop that waits without a timeout."""
+    subscriber = Subscriber(STREAM, connection=link)
+    loop = threading.Thread(target=lambda: list(subscriber))
+    loop.start()
+    subscriber.close()
+    loop.join(10.0)
+    assert not loop.is_alive()
+
+
+def test_receive_waits_no_longer_than_asked(link: Connection) -> None:
+    """`receive` with a timeout returns None when it has passed."""
+    with Subscriber(STREAM, connection=link) as subscriber:
+        begun = time.monotonic()
+        assert subscriber.receive(0.1) is None
+        assert 0.09 < time.monotonic() - begun < 2.0

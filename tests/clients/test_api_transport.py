@@ -1,0 +1,231 @@
+"""The transport against a real router in the same process."""
+
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+
+import pytest
+import zenoh
+from optipmb_client.errors import ConnectionFailed
+from optipmb_client.transport import DEFAULT_ENDPOINT, Arrival, Connection, Inbox
+from routers import free_endpoint, open_client, open_router
+
+
+def test_unreachable_router_is_one_error_within_the_timeout() -> None:
+    """Nobody listening gives ConnectionFailed naming the endpoint, no later than the timeout plus a second."""
+    address = free_endpoint()
+    begun = time.monotonic()
+    with pytest.raises(ConnectionFailed, match=address) as caught:
+        Connection(address, timeout=0.5)
+    assert time.monotonic() - begun < 1.5
+    assert caught.value.endpoints == (address,)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("endpoint", ["nonsense", ""])
+def test_an_endpoint_that_is_none_is_the_same_error(endpoint: str) -> None:
+    """A malformed endpoint is refused at once, with an example of a good one."""
+    with pytest.raises(ConnectionFailed, match=re.escape(DEFAULT_ENDPOINT)):
+        Connection([endpoint], timeout=5.0)
+
+
+def test_a_missing_configuration_file_is_the_same_error(tmp_path: object) -> None:
+    """A configuration file that is not there is named."""
+    with pytest.raises(ConnectionFailed, match=r"no Zenoh configuration file at .*absent"):
+        Connection(config=f"{tmp_path}/absent.json5")
+
+
+def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:
+    """Opening a connection before its router is no error when the router comes in time."""
+    address = free_endpoint()
+    opened: list[zenoh.Session] = []
+    timer = threading.Timer(0.4, lambda: opened.append(open_router(address)))
+    timer.start()
+    try:
+        with Connection(address, timeout=20.0) as connection:
+            assert not connection.closed
+    finally:
+        timer.join()
+        opened[0].close()
+
+
+def test_what_is_sent_just_before_closing_arrives(endpoint: str) -> None:
+    """Closing a connection flushes: the last small and the last large message are both received."""
+    inbox = Inbox(10)
+    with Connection(endpoint) as receiver:
+        receiver.subscribe("a/*", inbox)
+        with Connection(endpoint) as sender:
+            large = sender.plain_sender("a/large", "zenoh/bytes")
+            deadline = time.monotonic() + 10.0
+            while not large.wanted and time.monotonic() < deadline:
+                time.sleep(0.01)  # the subscription is on its way to this session; there is no event for it
+            large.put(bytes(1_900_000))
+            sender.cached_sender("a/small", "zenoh/bytes", cache=10).put(b"x")
+        arrivals = [inbox.get(10.0), inbox.get(10.0)]
+    assert {arrival.key: len(arrival.payload) for arrival in arrivals if arrival} == {
+        "a/large": 1_900_000,
+        "a/small": 1,
+    }
+
+
+def test_a_late_subscriber_gets_the_history_of_the_cache(endpoint: str) -> None:
+    """A subscriber that comes after the messages gets the newest ones that the publisher keeps, in order."""
+    inbox = Inbox(100)
+    with Connection(endpoint) as sender, Connection(endpoint) as receiver:
+        small = sender.cached_sender("a/small", "application/msgpack;optipmb.Detections.v1", cache=3)
+        for number in range(5):
+            small.put(b"%d" % number)
+        receiver.subscribe("a/*", inbox)
+        arrivals = [inbox.get(10.0) for _ in range(3)]
+    assert [arrival.payload for arrival in arrivals if arrival] == [b"2", b"3", b"4"]
+    assert {arrival.encoding for arrival in arrivals if arrival} == {"application/msgpack;optipmb.Detections.v1"}
+
+
+def test_an_unread_inbox_neither_blocks_the_publisher_nor_the_closing(endpoint: str) -> None:
+    """A reader that never reads costs its own oldest messages only: puts and closing stay fast, drops are counted."""
+    inbox = Inbox(10)
+    with Connection(endpoint) as sender:
+        receiver = Connection(endpoint)
+        receiver.subscribe("a/*", inbox)
+        small = sender.cached_sender("a/small", "zenoh/bytes", cache=1)
+        for number in range(5000):
+            small.put(b"%d" % number)
+        deadline = time.monotonic() + 10.0
+        while inbox.dropped < 1000 and time.monotonic() < deadline:
+            time.sleep(0.01)  # the inbox has one reader, which must not read here
+        begun = time.monotonic()
+        receiver.close()
+        assert time.monotonic() - begun < 5.0
+    assert inbox.pending == 10
+    assert inbox.dropped >= 1000
+
+
+def test_nothing_arrives_after_closing(endpoint: str) -> None:
+    """Whatever is still under way when a connection is closed, its inboxes stay as they are from then on."""
+    for _ in range(5):
+        inbox = Inbox(100_000)
+        with Connection(endpoint) as sender:
+            receiver = Connection(endpoint)
+            subscription = receiver.subscribe("a/*", inbox)
+            small = sender.cached_sender("a/small", "zenoh/bytes", cache=1)
+            for number in range(3000):
+                small.put(b"%d" % number)
+            receiver.close()
+            assert not subscription.alive
+            assert receiver.closed
+
+
+def test_a_closed_connection_is_one_clear_error(endpoint: str) -> None:
+    """Whatever is asked of a closed connection raises ConnectionFailed in one line; closing again does nothing."""
+    connection = Connection(endpoint)
+    sender = connection.cached_sender("a/b", "zenoh/bytes", cache=1)
+    connection.close()
+    connection.close()
+    attempts: list[Callable[[], object]] = [
+        lambda: connection.cached_sender("a/b", "zenoh/bytes", cache=1),
+        lambda: connection.plain_sender("a/b", "zenoh/bytes"),
+        lambda: connection.subscribe("a/b", Inbox(1)),
+        lambda: connection.query("a/b"),
+        lambda: connection.alive("a/b"),
+        lambda: sender.put(b""),
+    ]
+    for attempt in attempts:
+        with pytest.raises(ConnectionFailed) as caught:
+            attempt()
+        assert "\n" not in str(caught.value)
+        assert ".rs" not in str(caught.value)
+
+
+def test_full_inbox_drops_the_oldest() -> None:
+    """Of n entries in an inbox of k, the newest k are read, in order."""
+    inbox = Inbox(3)
+    for number in range(7):
+        inbox.put(Arrival("k", b"%d" % number, "", number))
+    inbox.close()
+    read = []
+    while (arrival := inbox.get()) is not None:
+        read.append(arrival.monotonic_ns)
+    assert read == [4, 5, 6]
+    assert inbox.dropped == 4
+
+
+def test_closing_an_inbox_wakes_its_reader() -> None:
+    """A reader that waits without a timeout returns None when the inbox is closed."""
+    inbox = Inbox(1)
+    results: list[object] = []
+    reader = threading.Thread(target=lambda: results.append(inbox.get(None)))
+    reader.start()
+    inbox.close()
+    reader.join(10.0)
+    assert results == [None]
+
+
+def test_a_query_nobody_serves_has_no_answers(endpoint: str) -> None:
+    """No service: no answers, at once, no error."""
+    with Connection(endpoint) as connection:
+        assert connection.query("nobody/here", timeout=5.0) == ()
+        assert connection.alive("nobody/*") == ()
+
+
+def test_replies_and_error_replies_are_told_apart(endpoint: str) -> None:
+    """A reply and an error reply both come back, with their encodings."""
+    with Connection(endpoint) as connection, open_client(endpoint) as server:
+        ready = server.declare_queryable("q/x", zenoh.handlers.FifoChannel(10))
+
+        def serve() -> None:
+            for query in ready:
+                with query:
+                    if query.payload is None:
+                        query.reply(query.key_expr, b"fine", encoding="application/msgpack;optipmb.SessionState.v1")
+                    else:
+                        query.reply_err(b"no", encoding="application/msgpack;optipmb.Problem.v1")
+
+        threading.Thread(target=serve, daemon=True).start()
+        deadline = time.monotonic() + 10.0
+        while not (good := connection.query("q/x")) and time.monotonic() < deadline:
+            pass
+        (bad,) = connection.query("q/x", b"payload", "application/msgpack;optipmb.ResetRequest.v1")
+    assert [(answer.ok, answer.payload) for answer in good] == [(True, b"fine")]
+    assert (bad.ok, bad.payload, bad.encoding) == (False, b"no", "application/msgpack;optipmb.Problem.v1")
+
+
+def test_replies_of_two_services_are_both_kept(endpoint: str) -> None:
+    """Two that answer at the same key give two answers."""
+    with Connection(endpoint) as connection, open_client(endpoint) as one, open_client(endpoint) as two:
+        for name, server in ((b"one", one), (b"two", two)):
+            questions = server.declare_queryable("q/x", zenoh.handlers.FifoChannel(10))
+            threading.Thread(target=answer_with, args=(questions, name), daemon=True).start()
+        deadline = time.monotonic() + 10.0
+        while len(answers := connection.query("q/x")) < 2 and time.monotonic() < deadline:
+            pass
+    assert {answer.payload for answer in answers} == {b"one", b"two"}
+
+
+def answer_with(questions: Iterable[zenoh.Query], text: bytes) -> None:
+    """Answer every query with a text."""
+    for query in questions:
+        with query:
+            query.reply(query.key_expr, text)
+
+
+FORGETFUL = """
+import sys
+from optipmb_client.transport import Connection, Inbox
+connection = Connection(sys.argv[1])
+connection.subscribe("a/*", Inbox(10))
+connection.cached_sender("a/b", "zenoh/bytes", cache=10).put(b"last words")
+"""
+
+
+def test_a_program_that_forgets_to_close_ends_and_loses_nothing(endpoint: str) -> None:
+    """A process with an open connection, subscription and publisher exits by itself; its last message is delivered."""
+    inbox = Inbox(10)
+    with Connection(endpoint) as receiver:
+        receiver.subscribe("a/*", inbox)
+        subprocess.run([sys.executable, "-c", FORGETFUL, endpoint], timeout=60, check=True)
+        arrival = inbox.get(10.0)
+    assert arrival is not None
+    assert arrival.payload == b"last words"

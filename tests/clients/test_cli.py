@@ -1,0 +1,247 @@
+"""The command line: options with several values, one-line errors, exit statuses, signals."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from commands import optipmb, start
+from fake_service import Behaviour, FakeService
+from hypothesis import given
+from hypothesis import strategies as st
+from optipmb_client.arguments import spread
+from optipmb_client.cli import run
+from routers import free_endpoint
+
+SMALL = ["--dataset", "scene", "--option", "frames=8", "--option", "vehicles=4", "--option", "clouds=0"]
+NAMES = st.text(st.characters(categories=("L", "N")), min_size=1, max_size=4)
+
+
+@given(st.lists(NAMES, min_size=1), st.data())
+def test_every_way_to_give_several_values_means_the_same(names: list[str], data: st.DataObject) -> None:
+    """Values after one flag, joined by commas, after an equals sign or after repeated flags are the same list."""
+    arguments: list[str] = []
+    rest = list(names)
+    while rest:
+        taken = data.draw(st.integers(1, len(rest)))
+        group, rest = rest[:taken], rest[taken:]
+        match data.draw(st.sampled_from(["values", "commas", "equals", "repeated"])):
+            case "values":
+                arguments += ["--x", *group]
+            case "commas":
+                arguments += ["--x", ",".join(group)]
+            case "equals":
+                arguments += [f"--x={','.join(group)}"]
+            case _:
+                arguments += [part for name in group for part in ("--x", name)]
+    assert spread(arguments, ["--x"]) == [part for name in names for part in ("--x", name)]
+
+
+@given(st.lists(st.sampled_from(["track", "--out", "dir", "-v", "a,b", "--y=1,2", "--", "--json"])))
+def test_other_arguments_are_left_as_they_are(arguments: list[str]) -> None:
+    """Without one of the options, nothing changes."""
+    assert spread(arguments, ["--x"]) == arguments
+
+
+@pytest.mark.parametrize(
+    ("given_", "expected"),
+    [
+        (["track", "--x", "a", "b", "--out", "o"], ["track", "--x", "a", "--x", "b", "--out", "o"]),
+        (["--x", "--out", "o"], ["--x", "--out", "o"]),
+        (["--x"], ["--x"]),
+        (["--x", "a", "--", "b"], ["--x", "a", "--", "b"]),
+        (["--x="], ["--x", ""]),
+    ],
+)
+def test_the_values_of_an_option_end_where_the_next_one_begins(given_: list[str], expected: list[str]) -> None:
+    """A dash ends the values; a flag without values stays for the parser to refuse."""
+    assert spread(given_, ["--x"]) == expected
+
+
+WRONG = [
+    ["track"],
+    ["nonsense"],
+    ["--nonsense"],
+    ["track", "--dataset", "nonsense"],
+    ["track", "--dataset", "kitti"],
+    ["track", "--dataset", "kitti", "--root", "/nowhere"],
+    ["track", *SMALL, "--sequences"],
+    ["track", *SMALL, "--sequences", "nonsense"],
+    ["track", *SMALL, "--profile", "nonsense"],
+    ["track", *SMALL, "--classes", "Tram"],
+    ["track", *SMALL, "--option", "frames"],
+    ["track", *SMALL, "--option", "nonsense=1"],
+    ["track", *SMALL, "--out", "/dev/null/here"],
+    ["replay", *SMALL, "--speed", "fast"],
+    ["replay", *SMALL, "--speed", "-1"],
+    ["replay", *SMALL, "--speed", "nan"],
+    ["replay", *SMALL, "--streams", "0"],
+    ["status", "--prefix", "a b"],
+    ["evaluate", *SMALL, "--tracks", "/nowhere"],
+    ["evaluate", *SMALL, "--tracks", "/nowhere", "--iou", "2"],
+    ["evaluate", *SMALL, "--tracks", "/nowhere", "--iou", "0.5", "--distance", "2"],
+    ["plot", *SMALL, "--tracks", "/nowhere", "--out", "a.png"],
+    ["plot", *SMALL, "--tracks", "/nowhere", "--out", "a.png", "--sequences", "0000", "0001"],
+    ["demo", "--frames", "1"],
+]
+
+
+@pytest.mark.parametrize("arguments", WRONG, ids=" ".join)
+def test_what_is_wrong_is_said_in_one_line(
+    arguments: list[str],
+    endpoint: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A wrong option, name or path gives exit status 2 and one line on standard error that starts with the program."""
+    monkeypatch.chdir(tmp_path)
+    if arguments[0] in {"replay", "status"}:
+        arguments = [*arguments, "--connect", endpoint]
+    assert run(arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    (line,) = printed.err.splitlines()
+    assert line.startswith("optipmb: ")
+    assert len(line) > 15
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["replay", "status"])
+def test_no_router_is_status_1(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nobody listening: one line that names the endpoint, status 1."""
+    address = free_endpoint()
+    options = [*SMALL, "--wait", "0.3"] if command == "replay" else ["--timeout", "0.3"]
+    assert run([command, *options, "--connect", address]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert address in line
+
+
+@pytest.mark.parametrize("command", ["replay", "status"])
+def test_no_service_is_status_1(command: str, endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A router without a service: one line, status 1."""
+    options = [*SMALL, "--wait", "0.3"] if command == "replay" else ["--timeout", "0.3"]
+    assert run([command, *options, "--connect", endpoint]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "service" in line
+
+
+def test_missing_frames_are_status_1(endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Frames without tracks give status 1 and a line with their number; the results are printed all the same."""
+    behaviour = Behaviour(lambda message, tracks: [] if message.seq in {2, 3} else [tracks])
+    with FakeService(endpoint, behaviour):
+        assert run(["replay", *SMALL, "--connect", endpoint, "--out", str(tmp_path), "--json"]) == 1
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["missing"] == 2
+    assert printed.err.splitlines() == ["optipmb: 2 of 8 frames have no tracks"]
+
+
+def test_json_is_the_only_output(endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With --json standard output is one JSON document, and standard error is empty when all went well."""
+    with FakeService(endpoint):
+        assert run(["replay", *SMALL, "--connect", endpoint, "--out", str(tmp_path), "--json"]) == 0
+    printed = capsys.readouterr()
+    result = json.loads(printed.out)
+    assert printed.err == ""
+    assert result["sequences"][0]["returned"] == 8
+    assert Path(result["sequences"][0]["file"]).is_file()
+
+
+def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
+    """--version prints it; no arguments are a call for help; help of every command works."""
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("optipmb ")
+    assert run([]) == 0
+    text = capsys.readouterr().out
+    for command in ("demo", "track", "replay", "evaluate", "plot", "status"):
+        assert command in text
+        assert run([command, "--help"]) == 0
+        assert "--json" in capsys.readouterr().out
+
+
+def test_help_does_not_load_the_tracker() -> None:
+    """`optipmb --help` imports neither the tracker's compiler nor the plotting library."""
+    code = (
+        "import sys; from optipmb_client.cli import run; run(['--help']); "
+        "sys.exit(','.join({'numba', 'matplotlib', 'optipmb', 'scipy'} & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_a_replay_cleanly(endpoint: str, tmp_path: Path, number: int, status: int) -> None:
+    """Ctrl-C and SIGTERM end a replay within seconds: its session is closed, no file or traceback is left."""
+    with FakeService(endpoint) as service:
+        process = start(
+            *("replay", "--dataset", "scene", "--option", "clouds=0", "--speed", "1"),
+            *("--connect", endpoint, "--out", tmp_path),
+        )
+        deadline = time.monotonic() + 60.0
+        while not service.seen.detections and time.monotonic() < deadline:
+            time.sleep(0.01)  # the fake has no event for its first frame
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)
+    assert process.returncode == status, err
+    assert out == ""
+    assert "Traceback" not in err
+    assert len(service.seen.closed) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_closed_pipe_is_no_error(endpoint: str, tmp_path: Path) -> None:
+    """`optipmb ... | head -0` leaves no traceback."""
+    with FakeService(endpoint):
+        process = start("replay", *SMALL, "--connect", endpoint, "--out", tmp_path)
+        assert process.stdout is not None
+        process.stdout.close()
+        assert process.stderr is not None
+        assert "Traceback" not in process.stderr.read()
+        process.stderr.close()
+        process.wait(60)
+
+
+def test_tracks_are_evaluated_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What track writes, evaluate and plot read: figures per class, in a table or as JSON, and a PNG."""
+    data = ["--dataset", "scene", "--option", "frames=30", "--option", "clouds=0"]
+    tracks = ["--tracks", str(tmp_path)]
+    assert run(["track", *data, "--out", str(tmp_path), "--json"]) == 0
+    capsys.readouterr()
+    assert run(["evaluate", *data, *tracks]) == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head.split()[:4] == ["class", "score", "from", "MOTA"]
+    assert [row.split()[0] for row in rows if not row.startswith(" ")] == ["Car", "Pedestrian", "Cyclist"]
+    assert run(["evaluate", *data, *tracks, "--class", "Car", "Cyclist", "--iou", "0.25", "--json"]) == 0
+    classes = json.loads(capsys.readouterr().out)["classes"]
+    assert list(classes) == ["Car", "Cyclist"]
+    assert 0.7 < classes["Car"]["best"]["MOTA"] <= 1.0
+    assert classes["Car"]["all"]["GT"] == classes["Car"]["sequences"]["0000"]["GT"] > 100
+    picture = tmp_path / "picture.png"
+    assert run(["plot", *data, *tracks, "--out", str(picture)]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_configuration_file_is_used(endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """--config names a Zenoh configuration whose endpoints hold; one that is not there is named."""
+    config = tmp_path / "client.json5"
+    config.write_text(f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}}}')
+    with FakeService(endpoint):
+        assert run(["status", "--config", str(config), "--timeout", "10"]) == 0
+    assert "fake" in capsys.readouterr().out
+    assert run(["status", "--config", str(tmp_path / "absent")]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert str(tmp_path / "absent") in line
+
+
+def test_track_says_what_it_did(tmp_path: Path) -> None:
+    """Without --json a line per sequence and the folder of the results are printed."""
+    done = optipmb("track", *SMALL, "--sequences", "0000", "0001", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("0000: 8 frames, ")
+    assert lines[1].startswith("0001: 8 frames, ")
+    assert lines[2] == f"results in {tmp_path}"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0000.txt", "0001.txt"]

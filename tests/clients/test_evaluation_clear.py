@@ -1,0 +1,263 @@
+"""CLEAR MOT on hand-made cases with known answers, and on the real truth."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from optipmb_client.datasets import DatasetError, Regions, Truth, open_dataset
+from optipmb_client.evaluation import (
+    ClearResult,
+    Rules,
+    Switch,
+    combine,
+    default_rules,
+    evaluate_clear,
+    evaluate_files,
+    prepare,
+    sweep,
+)
+from optipmb_client.results import ResultTable
+from real_data import kitti_root
+
+Row = tuple[int, int, float]
+"""Frame, id and place along x."""
+
+
+def truth_of(rows: Iterable[Row], *, ignored: Iterable[Row] = (), label: str = "Car", extra: str = "Van") -> Truth:
+    """Give truth cars of 4 m along x; the ignored rows are those that are in both."""
+    table = sorted(rows)
+    count = len(table)
+    hidden = set(ignored)
+    return Truth(
+        labels=(label, extra),
+        frame=np.array([f for f, _, _ in table], dtype=np.int64),
+        id=np.array([i for _, i, _ in table], dtype=np.int64),
+        label=np.zeros(count, dtype=np.int64),
+        center=np.array([[x, 0.0, 0.0] for _, _, x in table]).reshape(-1, 3),
+        size=np.tile([4.0, 2.0, 1.5], (count, 1)),
+        yaw=np.zeros(count),
+        velocity=np.full((count, 2), np.nan),
+        occlusion=np.zeros(count, dtype=np.int64),
+        truncation=np.zeros(count, dtype=np.int64),
+        covered=np.full(count, np.nan),
+        points=np.full(count, -1, dtype=np.int64),
+        box2d=np.full((count, 4), np.nan),
+        ignored=np.array([row in hidden for row in table], dtype=np.bool_),
+        regions=Regions(np.empty(0, dtype=np.int64), np.empty((0, 4))),
+    )
+
+
+def tracks_of(rows: Iterable[Row], scores: dict[int, float] | None = None) -> ResultTable:
+    """Give tracks of the same cars."""
+    table = sorted(rows)
+    count = len(table)
+    return ResultTable(
+        labels=("Car",),
+        frame=np.array([f for f, _, _ in table], dtype=np.int64),
+        id=np.array([i for _, i, _ in table], dtype=np.int64),
+        label=np.zeros(count, dtype=np.int64),
+        center=np.array([[x, 0.0, 0.0] for _, _, x in table]).reshape(-1, 3),
+        size=np.tile([4.0, 2.0, 1.5], (count, 1)),
+        yaw=np.zeros(count),
+        score=np.array([(scores or {}).get(i, 1.0) for _, i, _ in table]),
+        box2d=np.tile([0.0, 0.0, 100.0, 100.0], (count, 1)),
+    )
+
+
+def figures(result: ClearResult) -> tuple[int, int, int, int, int]:
+    """Give GT, TP, FP, FN and IDS."""
+    return result.truth, result.true, result.false, result.missed, len(result.switches)
+
+
+TWO = [(f, i, 10.0 * i + f) for f in range(10) for i in (1, 2)]
+"""Two cars side by side for ten frames, 10 m apart."""
+
+
+def test_truth_as_tracks_is_perfect() -> None:
+    """MOTA, MOTP, precision and recall are 1, everybody is mostly tracked, and there is nothing to look at."""
+    result = evaluate_clear(truth_of(TWO), tracks_of(TWO), "Car")
+    assert figures(result) == (20, 20, 0, 0, 0)
+    assert (result.mota, result.precision, result.recall) == (1.0, 1.0, 1.0)
+    assert result.motp == pytest.approx(1.0)
+    assert (result.mostly_tracked, result.mostly_lost, result.fragments, result.objects) == (2, 0, 0, 2)
+    assert result.switches == result.misses == ()
+
+
+def test_no_results_miss_everything() -> None:
+    """Without tracks MOTA is 0, precision and MOTP are not defined, and every box is listed as missed."""
+    result = evaluate_clear(truth_of(TWO), tracks_of([]), "Car")
+    assert figures(result) == (20, 0, 0, 20, 0)
+    assert result.mota == 0.0
+    assert result.summary()["precision"] is None
+    assert result.summary()["MOTP"] is None
+    assert (result.mostly_lost, len(result.misses)) == (2, 20)
+
+
+def test_no_truth_makes_everything_false() -> None:
+    """Without truth all tracks are false, and MOTA is not defined."""
+    result = evaluate_clear(truth_of([]), tracks_of(TWO), "Car")
+    assert figures(result) == (0, 0, 20, 0, 0)
+    assert result.summary()["MOTA"] is None
+
+
+def test_nothing_at_all_does_no_harm() -> None:
+    """Neither truth nor tracks, and also no case at all."""
+    assert figures(evaluate_clear(truth_of([]), tracks_of([]), "Car")) == (0, 0, 0, 0, 0)
+    assert sweep([], Rules()).results[0].truth == 0
+
+
+def test_ids_shuffled_in_every_frame_are_all_switches() -> None:
+    """Two objects whose ids change places in each of ten frames: 18 switches, named with frame and ids."""
+    swapped = [(f, 3 - i if f % 2 else i, x) for f, i, x in TWO]
+    result = evaluate_clear(truth_of(TWO), tracks_of(swapped), "Car", sequence="0001")
+    assert figures(result) == (20, 20, 0, 0, 18)
+    assert result.mota == pytest.approx(1.0 - 18 / 20)
+    assert result.switches[:2] == (Switch("0001", 1, 1, 1, 2), Switch("0001", 1, 2, 2, 1))
+
+
+def test_one_id_change_is_one_switch_at_its_frame() -> None:
+    """Car 2 is followed by track 2 until frame 5 and by track 9 from frame 6 on."""
+    tracks = [(f, 9 if i == 2 and f > 5 else i, x) for f, i, x in TWO]
+    result = evaluate_clear(truth_of(TWO), tracks_of(tracks), "Car")
+    assert result.switches == (Switch("", 6, 2, 2, 9),)
+
+
+def test_a_break_is_a_fragment_and_with_memory_a_change_over_it_counts() -> None:
+    """Lost for three frames and found again under another id: a switch with memory, none without it."""
+    tracks = [(f, 9 if f > 5 else 1, x) for f, i, x in TWO if i == 1 and f not in (3, 4, 5)]
+    truth = truth_of(row for row in TWO if row[1] == 1)
+    with_memory = evaluate_clear(truth, tracks_of(tracks), "Car", Rules(memory=True))
+    without = evaluate_clear(truth, tracks_of(tracks), "Car", Rules(memory=False))
+    assert figures(with_memory) == (10, 7, 0, 3, 1)
+    assert figures(without) == (10, 7, 0, 3, 0)
+    assert with_memory.fragments == without.fragments == 1
+    assert [miss.frame for miss in with_memory.misses] == [3, 4, 5]
+    assert with_memory.mostly_tracked == 0
+
+
+def test_continuity_keeps_a_match_that_is_no_longer_the_nearest() -> None:
+    """Another track comes nearer to the object for one frame; with continuity it stays with its own."""
+    truth = truth_of([(f, 1, 0.0) for f in range(3)])
+    tracks = tracks_of([(f, 1, 0.5) for f in range(3)] + [(1, 2, 0.1)])
+    kept = evaluate_clear(truth, tracks, "Car", Rules(continuity=True))
+    free = evaluate_clear(truth, tracks, "Car", Rules(continuity=False))
+    assert figures(kept) == (3, 3, 1, 0, 0)
+    assert figures(free) == (3, 3, 1, 0, 2)
+
+
+def test_as_many_pairs_as_possible_match() -> None:
+    """One track is near both objects, the other near one: both match, though one pair alone would be nearer."""
+    truth = truth_of([(0, 1, 0.0), (0, 2, 1.5)])
+    tracks = tracks_of([(0, 1, 1.4), (0, 2, 3.0)])
+    result = evaluate_clear(truth, tracks, "Car", Rules(measure="distance", limit=2.0))
+    assert figures(result) == (2, 2, 0, 0, 0)
+    assert result.motp == pytest.approx((1.4 + 1.5) / 2)
+
+
+def test_the_limit_decides_about_a_match() -> None:
+    """Boxes of 4 m shifted by 2 m overlap by a third; centres 2 m apart match within 2 m."""
+    truth, tracks = truth_of([(0, 1, 0.0)]), tracks_of([(0, 1, 2.0)])
+    hits = [
+        evaluate_clear(truth, tracks, "Car", rules).true
+        for rules in (
+            Rules(limit=0.33),
+            Rules(limit=0.34),
+            Rules(measure="distance", limit=2.0),
+            Rules(measure="distance", limit=1.99),
+        )
+    ]
+    assert hits == [1, 0, 1, 0]
+
+
+def test_ignored_truth_neither_helps_nor_harms() -> None:
+    """A hidden object counts neither when a track matches it nor when none does."""
+    truth = truth_of(TWO, ignored=[row for row in TWO if row[1] == 2])
+    assert figures(evaluate_clear(truth, tracks_of(TWO), "Car")) == (10, 10, 0, 0, 0)
+    alone = tracks_of(row for row in TWO if row[1] == 1)
+    result = evaluate_clear(truth, alone, "Car")
+    assert figures(result) == (10, 10, 0, 0, 0)
+    assert result.objects == 1
+
+
+def test_classes_alike_are_ignored_and_others_are_absent() -> None:
+    """A track on a van is no false car under the rule of neighbours, and a false one without it."""
+    truth = truth_of(TWO)
+    truth = replace(truth, label=np.where(truth.id == 2, 1, 0))
+    rules = Rules(neighbours={"Car": ("Van",)})
+    assert figures(evaluate_clear(truth, tracks_of(TWO), "Car", rules)) == (10, 10, 0, 0, 0)
+    assert figures(evaluate_clear(truth, tracks_of(TWO), "Car", Rules())) == (10, 10, 10, 0, 0)
+
+
+def test_low_image_boxes_and_unannotated_regions_excuse_unmatched_tracks() -> None:
+    """A track of 25 pixels is excused, one of 26 is not; half in a region is not enough, a little more is."""
+    tracks = tracks_of([(0, i, 100.0 * i) for i in range(4)])
+    tracks = replace(
+        tracks,
+        box2d=np.array([[0, 0, 50, 25], [0, 0, 50, 26], [0, 100, 50, 200], [1, 100, 51, 200]], dtype=np.float64),
+    )
+    truth = replace(truth_of([]), regions=Regions(np.array([0]), np.array([[25.5, 90.0, 99.0, 300.0]])))
+    assert evaluate_clear(truth, tracks, "Car", Rules()).false == 4
+    assert evaluate_clear(truth, tracks, "Car", Rules(min_height=25.0)).false == 3
+    assert evaluate_clear(truth, tracks, "Car", Rules(min_height=25.0, regions=True)).false == 2
+
+
+def test_sequences_add_up() -> None:
+    """Together two sequences have the sum of the counts and the figures of the sums."""
+    first = evaluate_clear(truth_of(TWO), tracks_of(TWO), "Car", sequence="a")
+    second = evaluate_clear(truth_of(TWO), tracks_of([]), "Car", sequence="b")
+    both = combine([first, second])
+    assert figures(both) == (40, 20, 0, 20, 0)
+    assert both.mota == 0.5
+    assert {miss.sequence for miss in both.misses} == {"b"}
+
+
+def test_the_best_threshold_leaves_the_false_tracks_out() -> None:
+    """A false track of low score and true ones of high score: the best threshold lies between them."""
+    rows = [*TWO, *((f, 7, 500.0) for f in range(10))]
+    case = prepare(truth_of(TWO), tracks_of(rows, {7: 0.2, 1: 0.8, 2: 0.9}), "Car", Rules())
+    found = sweep([case], Rules())
+    assert found.thresholds[0] == 0.2
+    assert found.results[0].mota == 0.5
+    assert found.results[found.best].mota == 1.0
+    assert 0.2 < found.thresholds[found.best] <= 0.8
+
+
+def test_real_truth_as_results_is_perfect(tmp_path: Path) -> None:
+    """The truth of a real sequence, written as result file, has MOTA 1 under the rules of the benchmark."""
+    dataset = open_dataset("kitti", kitti_root())
+    sequences = dataset.sequences(["0000", "0011"])
+    for sequence in sequences:
+        truth = sequence.truth()
+        assert truth is not None
+        with dataset.writer(tmp_path, sequence) as writer:
+            for index, pose in enumerate(sequence.poses):
+                writer.add(index, pose, _Now(truth.take(truth.frame == index)))
+    results = evaluate_files(sequences, tmp_path, ("Car", "Pedestrian", "Tram"), default_rules("kitti"))
+    assert [result.name for result in results] == ["Car", "Pedestrian"]
+    for result in results:
+        assert result.total.mota == 1.0
+        assert result.total.motp == pytest.approx(1.0, abs=1e-4)
+        assert set(result.sequences) == {"0000", "0011"}
+        assert result.sweep.results[result.sweep.best].mota == 1.0
+
+
+def test_results_of_a_missing_sequence_or_beyond_its_end_are_told(tmp_path: Path) -> None:
+    """A missing result file and a frame that the sequence has not are errors that name the file."""
+    sequences = open_dataset("scene", frames=2, vehicles=2, pedestrians=0, cyclists=0).sequences(["all"])
+    with pytest.raises(DatasetError, match=r"0000.txt: expected a KITTI result file"):
+        evaluate_files(sequences, tmp_path, ("Car",), default_rules("scene"))
+    (tmp_path / "0000.txt").write_text("2 1 Car -1 -1 0 0 0 1 1 1.5 1.6 4 0 1.7 20 0 0.9\n")
+    with pytest.raises(DatasetError, match="frames from 0 to 1"):
+        evaluate_files(sequences, tmp_path, ("Car",), default_rules("scene"))
+
+
+class _Now:
+    """The truth of one frame in the shape of tracks."""
+
+    def __init__(self, truth: Truth) -> None:
+        self.id, self.labels, self.label = truth.id, truth.labels, truth.label
+        self.center, self.size, self.yaw = truth.center, truth.size, truth.yaw
+        self.velocity = truth.velocity
+        self.score = self.existence = np.ones(len(truth))

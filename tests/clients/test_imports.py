@@ -1,0 +1,41 @@
+"""Which way dependencies run: the client knows the messages, and the tracker for offline tracking alone."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import optipmb_client
+
+SOURCES = sorted(Path(optipmb_client.__file__).parent.rglob("*.py"))
+
+
+def imported(source: Path) -> Iterator[str]:
+    """Give the top packages that a module imports, anywhere in it."""
+    for node in ast.walk(ast.parse(source.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (name.name.partition(".")[0] for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{source}: imports are written in full"
+            yield (node.module or "").partition(".")[0]
+
+
+def importers(package: str) -> set[str]:
+    """Give the modules of the client that import a package."""
+    root = Path(optipmb_client.__file__).parent
+    return {str(source.relative_to(root)) for source in SOURCES if package in set(imported(source))}
+
+
+def test_the_client_does_not_know_the_service() -> None:
+    """No module imports optipmb_service: the demo starts it as a program."""
+    assert len(SOURCES) > 20
+    assert importers("optipmb_service") == set()
+
+
+def test_the_tracker_is_imported_for_offline_tracking_alone() -> None:
+    """Only offline.py imports optipmb."""
+    assert importers("optipmb") == {"offline.py"}
+
+
+def test_zenoh_is_imported_in_one_module() -> None:
+    """Only transport.py imports zenoh."""
+    assert importers("zenoh") == {"transport.py"}

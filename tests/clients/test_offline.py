@@ -1,0 +1,120 @@
+"""Tracking in process: files that repeat, classes, profiles, and what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from optipmb_client.datasets import Dataset, open_dataset
+from optipmb_client.errors import UsageError
+from optipmb_client.offline import read_profile, track, track_sequence
+from optipmb_client.recording import Preloaded, latency, selected_frames
+
+
+@pytest.fixture(scope="module")
+def dataset() -> Dataset:
+    """A small generated scene with clouds."""
+    return open_dataset("scene", frames=20, vehicles=6, pedestrians=3, cyclists=2)
+
+
+def test_the_same_data_give_the_same_bytes(dataset: Dataset, tmp_path: Path) -> None:
+    """Two runs write the same file, and it is not empty."""
+    files = []
+    for run in ("one", "two"):
+        (result,) = track(dataset, dataset.sequences(["0000"]), tmp_path / run, profile="kitti")
+        files.append(result.file.read_bytes())
+    assert files[0] == files[1]
+    assert len(files[0].splitlines()) > 40
+
+
+def test_what_is_reported_is_what_was_written(dataset: Dataset, tmp_path: Path) -> None:
+    """Frames, clouds, track identities and durations of the report agree with the file and the sequence."""
+    seen: list[int] = []
+    (result,) = track(dataset, dataset.sequences(["0000"]), tmp_path, profile="kitti", on_frame=lambda: seen.append(1))
+    rows = [line.split() for line in result.file.read_text().splitlines()]
+    assert (result.name, result.frames, result.clouds, len(seen)) == ("0000", 20, 20, 20)
+    assert result.tracks == len({row[1] for row in rows})
+    assert result.step is not None
+    assert 0.0 < result.step.p50_ms <= result.step.p99_ms <= result.step.max_ms
+    assert result.seconds > 0.0
+
+
+def test_clouds_change_the_tracks(dataset: Dataset) -> None:
+    """The clouds of the frames reach the tracker: without them existence probabilities differ."""
+    parameters = read_profile("kitti")
+    (sequence,) = dataset.sequences(["0000"])
+    bare = Preloaded(sequence)
+    bare._frames = [replace(frame, cloud=None) for frame in bare._frames]
+    with_clouds, without = (
+        np.concatenate([tracks.existence for _, tracks, _ in track_sequence(parameters, one)])
+        for one in (sequence, bare)
+    )
+    assert with_clouds.shape != without.shape or not np.array_equal(with_clouds, without)
+
+
+def test_chosen_classes_are_the_only_ones() -> None:
+    """With classes given, frames keep their number and lose the other objects, in all columns alike."""
+    (sequence,) = open_dataset("scene", frames=20, vehicles=6, pedestrians=3, velocity=True).sequences(["0000"])
+    everything = list(sequence.frames())
+    chosen = list(selected_frames(sequence, ["Car", "Cyclist"]))
+    assert len(chosen) == len(everything)
+    for part, whole in zip(chosen, everything, strict=True):
+        rows = [row for row, label in enumerate(whole.label) if whole.labels[label] in {"Car", "Cyclist"}]
+        for column in ("label", "center", "size", "yaw", "score", "velocity"):
+            assert np.array_equal(getattr(part, column), getattr(whole, column)[rows])
+        assert (part.stamp_ns, part.cloud is None) == (whole.stamp_ns, whole.cloud is None)
+    assert sum(len(frame.label) for frame in chosen) < sum(len(frame.label) for frame in everything)
+
+
+def test_a_class_that_the_data_lack_is_refused(dataset: Dataset) -> None:
+    """The error names the class and those that there are."""
+    (sequence,) = dataset.sequences(["0000"])
+    with pytest.raises(UsageError, match=r"'Tram'.*Car"):
+        next(selected_frames(sequence, ["Tram"]))
+
+
+def test_a_profile_may_be_a_file(tmp_path: Path) -> None:
+    """A name, or the path of a TOML file; anything else is one clear line that names the option."""
+    assert "Car" in read_profile("kitti").classes
+    path = tmp_path / "own.toml"
+    path.write_text("not = [toml")
+    for wrong in ("nonsense", str(path), str(tmp_path)):
+        with pytest.raises(UsageError, match=r"^--profile ") as caught:
+            read_profile(wrong)
+        assert "\n" not in str(caught.value)
+
+
+def test_values_that_the_tracker_refuses_are_placed(dataset: Dataset) -> None:
+    """A score of 2 is refused with the sequence, the frame and the element."""
+    (sequence,) = dataset.sequences(["0000"])
+    loaded = Preloaded(sequence)
+    loaded._frames[3] = replace(loaded._frames[3], score=loaded._frames[3].score + 1.0)
+    with pytest.raises(UsageError, match=r"sequence 0000, frame 3: score"):
+        list(track_sequence(read_profile("kitti"), loaded))
+
+
+def test_a_preloaded_sequence_is_the_same(dataset: Dataset) -> None:
+    """Frames, clouds, poses and truth in memory equal those of the sequence."""
+    (sequence,) = dataset.sequences(["0000"])
+    loaded = Preloaded(sequence)
+    assert (loaded.name, len(loaded), loaded.has_clouds) == (sequence.name, len(sequence), sequence.has_clouds)
+    points = 0
+    for one, other in zip(loaded.frames(), sequence.frames(), strict=True):
+        assert np.array_equal(one.center, other.center)
+        assert one.cloud is not None
+        assert other.cloud is not None
+        assert np.array_equal(one.cloud.xyz, other.cloud.xyz)
+        points += len(one.cloud.xyz)
+    assert loaded.points == points > 0
+    truth, expected = loaded.truth(), sequence.truth()
+    assert truth is not None
+    assert expected is not None
+    assert np.array_equal(truth.center, expected.center)
+
+
+def test_latency_of_nothing_is_none() -> None:
+    """Quantiles of no durations are not defined; of one duration all are that one, in milliseconds."""
+    assert latency([]) is None
+    one = latency([2_500_000])
+    assert one is not None
+    assert (one.p50_ms, one.p99_ms, one.max_ms) == (2.5, 2.5, 2.5)

@@ -1,0 +1,238 @@
+"""Replaying through a stand-in for the service: pace, order, missing frames, errors, and what is left behind."""
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fake_service import Behaviour, FakeService
+from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, UsageError
+from optipmb_client.datasets import Dataset, open_dataset
+from optipmb_client.replay import Pace, ReplayedSequence, replay
+from optipmb_schemas import Detections, Tracks
+
+FRAMES = 24
+QUICK = Pace(patience_s=3.0, service_s=5.0)
+
+
+@pytest.fixture(scope="module")
+def dataset() -> Dataset:
+    """A small generated scene with clouds."""
+    return open_dataset("scene", frames=FRAMES, vehicles=6, pedestrians=2, cyclists=1)
+
+
+@pytest.fixture
+def link(endpoint: str) -> Iterator[Connection]:
+    """A connection to the router."""
+    with Connection(endpoint) as connection:
+        yield connection
+
+
+def run(link: Connection, dataset: Dataset, out: Path, *names: str, **options: object) -> list[ReplayedSequence]:
+    """Replay sequences of the scene."""
+    arguments = {"profile": "kitti", "pace": QUICK, "streams": 1} | options
+    return replay(link, dataset, dataset.sequences(names or ["0000"]), out, **arguments)  # type: ignore[arg-type]  # given by the tests
+
+
+def test_every_frame_comes_back(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
+    """All frames are sent and returned, latencies are measured for each, and the file holds one row per detection."""
+    with FakeService(endpoint) as service:
+        (result,) = run(link, dataset, tmp_path)
+    assert (result.frames, result.sent, result.returned, result.missing) == (FRAMES, FRAMES, FRAMES, 0)
+    assert result.latency is not None
+    assert 0.0 < result.latency.p50_ms <= result.latency.p99_ms <= result.latency.max_ms < 3000.0
+    assert len(result.latencies_ns) == FRAMES
+    assert result.file == tmp_path / "0000.txt"
+    rows = sum(len(message.label) for message in service.seen.detections)
+    assert len(result.file.read_text().splitlines()) == rows > FRAMES
+
+
+def test_parameters_come_first_and_the_session_is_closed(
+    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
+) -> None:
+    """The profile and a generous wait for clouds are set before the first frame; at the end the session is closed."""
+    with FakeService(endpoint) as service:
+        (result,) = run(link, dataset, tmp_path, profile="nuscenes")
+    ((stream, parameters),) = service.seen.parameters
+    assert stream == result.stream
+    assert parameters.profile == "nuscenes"
+    assert parameters.cloud_wait_s is not None
+    assert parameters.cloud_wait_s >= 5.0
+    assert service.seen.closed == [result.stream]
+
+
+def test_streams_are_new_in_every_run(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
+    """Two runs of the same sequence use different streams, `replay/<dataset>-<6 hex>/<sequence>`."""
+    with FakeService(endpoint):
+        names = [run(link, dataset, tmp_path)[0].stream for _ in range(2)]
+    for name in names:
+        site, node, sensor = name.split("/")
+        assert (site, node[:6], sensor) == ("replay", "scene-", "0000")
+        assert int(node[6:], 16) < 16**6
+    assert names[0] != names[1]
+
+
+def test_clouds_go_before_their_detections(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
+    """Every frame says whether it has a cloud, and all clouds arrive."""
+    with FakeService(endpoint) as service:
+        (result,) = run(link, dataset, tmp_path)
+    assert result.clouds == FRAMES
+    assert {message.has_points for message in service.seen.detections} == {True}
+    assert [message.stamp_ns for message in service.seen.points] == [m.stamp_ns for m in service.seen.detections]
+
+
+def test_frames_without_clouds_say_that_none_comes(endpoint: str, link: Connection, tmp_path: Path) -> None:
+    """Without clouds no frame leaves the question open, so that the service never waits."""
+    bare = open_dataset("scene", frames=FRAMES, vehicles=3, clouds=False)
+    with FakeService(endpoint) as service:
+        (result,) = run(link, bare, tmp_path)
+    assert (result.clouds, result.missing) == (0, 0)
+    assert {message.has_points for message in service.seen.detections} == {False}
+
+
+def test_the_window_bounds_the_frames_under_way(
+    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
+) -> None:
+    """At full speed no more than a window of frames is sent ahead of those that came back."""
+    gate = threading.Event()
+    ahead: list[int] = []
+
+    def answer(message: Detections, tracks: Tracks) -> list[Tracks]:
+        if message.seq == 0:
+            gate.wait(
+                1.0
+            )  # the frames of the window gather behind the first; a wait that is never answered, on purpose
+            ahead.append(len(service.seen.points))
+        return [tracks]
+
+    with FakeService(endpoint, Behaviour(answer)) as service:
+        (result,) = run(link, dataset, tmp_path, pace=Pace(window=4, patience_s=5.0))
+    assert ahead == [4]
+    assert result.missing == 0
+
+
+def test_recorded_pace_is_kept(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
+    """At twice the recorded rate, n frames of 0.1 s take (n - 1) / 20 s, whether or not tracks are slow."""
+    with FakeService(endpoint) as service:
+        begun = time.monotonic()
+        (result,) = run(link, dataset, tmp_path, pace=Pace(speed=2.0, patience_s=5.0))
+        took = time.monotonic() - begun
+    assert result.missing == 0
+    assert 0.05 * (FRAMES - 1) <= took < 0.05 * FRAMES + 3.0
+    assert len(service.seen.detections) == FRAMES
+
+
+def test_lost_tracks_are_reported_as_missing(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
+    """Frames whose tracks never come are counted, the others are written; the replay does not wait for patience."""
+    lost = {3, 4, FRAMES - 2}
+
+    def answer(message: Detections, tracks: Tracks) -> list[Tracks]:
+        return [] if message.seq in lost else [tracks]
+
+    with FakeService(endpoint, Behaviour(answer)):
+        begun = time.monotonic()
+        (result,) = run(link, dataset, tmp_path, pace=Pace(patience_s=60.0))
+    assert time.monotonic() - begun < 30.0
+    assert (result.sent, result.returned, result.missing) == (FRAMES, FRAMES - 3, 3)
+    frames = {int(line.split()[0]) for line in result.file.read_text().splitlines()}
+    assert frames.isdisjoint(lost)
+    assert {0, 5, FRAMES - 1} <= frames
+
+
+def test_a_service_that_falls_silent_ends_the_replay(
+    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
+) -> None:
+    """When nothing comes back for `patience_s`, the replay ends and reports all that is missing."""
+
+    def answer(message: Detections, tracks: Tracks) -> list[Tracks]:
+        return [tracks] if message.seq < 5 else []
+
+    with FakeService(endpoint, Behaviour(answer)):
+        (result,) = run(link, dataset, tmp_path, pace=Pace(patience_s=1.0))
+    assert (result.returned, result.missing) == (5, FRAMES - 5)
+    assert result.sent == 5 + 8
+
+
+def test_the_newest_revision_is_written(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
+    """Of several revisions of a frame, in whatever order they come, the highest is in the file."""
+
+    def answer(message: Detections, tracks: Tracks) -> list[Tracks]:
+        changed = tracks.model_copy(update={"revision": 1, "id": tracks.id + 1000})
+        again = tracks.model_copy(update={"revision": 2, "id": tracks.id + 2000})
+        return [tracks, again, changed] if message.seq == 7 else [tracks]
+
+    with FakeService(endpoint, Behaviour(answer)):
+        (result,) = run(link, dataset, tmp_path)
+    rows = [line.split() for line in result.file.read_text().splitlines()]
+    assert {int(row[1]) >= 2000 for row in rows if row[0] == "7"} == {True}
+    assert {int(row[1]) < 1000 for row in rows if row[0] != "7"} == {True}
+
+
+def test_sequences_at_once_do_not_mix(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
+    """Three sequences at once give the same files as one after the other."""
+    names = ("0000", "0001", "0002")
+    with FakeService(endpoint) as service:
+        run(link, dataset, tmp_path / "one", *names)
+        together = run(link, dataset, tmp_path / "three", *names, streams=3)
+    assert [result.name for result in together] == list(names)
+    assert len(service.seen.closed) == 6
+    for name in names:
+        one, three = (tmp_path / folder / f"{name}.txt" for folder in ("one", "three"))
+        assert one.read_bytes() == three.read_bytes() != b""
+
+
+def test_classes_are_chosen(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
+    """With classes given, only their objects are sent; a class that the data lack is refused by name."""
+    with FakeService(endpoint) as service:
+        run(link, dataset, tmp_path, classes=["Pedestrian"])
+        sent = {message.labels[index] for message in service.seen.detections for index in message.label}
+        assert sent == {"Pedestrian"}
+        with pytest.raises(UsageError, match="'Tram'"):
+            run(link, dataset, tmp_path, classes=["Tram"])
+
+
+def test_no_service_is_one_clear_error(link: Connection, dataset: Dataset, tmp_path: Path) -> None:
+    """A network without a service gives ServiceUnavailable within the time given, and no file."""
+    begun = time.monotonic()
+    with pytest.raises(ServiceUnavailable, match="optipmb-service"):
+        run(link, dataset, tmp_path, pace=Pace(service_s=0.5))
+    assert time.monotonic() - begun < 5.0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_service_that_comes_late_is_waited_for(
+    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
+) -> None:
+    """A replay started just before its service goes through."""
+    results: list[ReplayedSequence] = []
+    thread = threading.Thread(target=lambda: results.extend(run(link, dataset, tmp_path, pace=Pace(service_s=20.0))))
+    thread.start()
+    with FakeService(endpoint):
+        thread.join(30.0)
+    assert [result.missing for result in results] == [0]
+
+
+def test_a_refused_profile_is_told_in_the_words_of_the_service(
+    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
+) -> None:
+    """The service's error reply becomes ServiceRefused with its sentence."""
+    with FakeService(endpoint), pytest.raises(ServiceRefused, match="received 'waymo'"):
+        run(link, dataset, tmp_path, profile="waymo")
+
+
+def test_one_failing_sequence_ends_the_others_and_closes_their_sessions(
+    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
+) -> None:
+    """An error anywhere, here in the display of progress, ends all sequences and closes their sessions."""
+    count = [0]
+
+    def broken() -> None:
+        count[0] += 1
+        if count[0] > 6:
+            raise RuntimeError("display")
+
+    with FakeService(endpoint) as service, pytest.raises(RuntimeError, match="display"):
+        run(link, dataset, tmp_path, "0000", "0001", streams=2, on_frame=broken)
+    assert len(service.seen.closed) == len({stream for stream, _ in service.seen.parameters})
+    assert list(tmp_path.iterdir()) == []

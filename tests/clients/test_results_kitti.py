@@ -1,0 +1,191 @@
+"""Result files in the format of the KITTI tracking benchmark."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from optipmb_client.camera import synthetic_camera
+from optipmb_client.datasets import DatasetError, open_dataset
+from optipmb_client.geometry import Floats, Ints, Pose, planar_pose, wrap_angle
+from optipmb_client.results import KittiResultWriter, collect, empty_table, read_kitti_results
+from real_data import kitti_root
+
+LABELS = ("Car", "Pedestrian", "Cyclist")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The tracks of one frame."""
+
+    id: Ints
+    label: Ints
+    center: Floats
+    size: Floats
+    yaw: Floats
+    score: Floats
+    labels: tuple[str, ...] = LABELS
+
+    @property
+    def velocity(self) -> Floats:
+        """Unknown."""
+        return np.full((len(self.id), 2), np.nan)
+
+    @property
+    def existence(self) -> Floats:
+        """Certain."""
+        return np.ones(len(self.id))
+
+
+def some_rows(rng: np.random.Generator, count: int) -> Rows:
+    """Give tracks anywhere around the origin, also behind the sensor."""
+    return Rows(
+        id=rng.permutation(1000)[:count],
+        label=rng.integers(0, 3, count),
+        center=rng.uniform(-40.0, 40.0, (count, 3)) * [1.0, 1.0, 0.05],
+        size=rng.uniform(0.5, 5.0, (count, 3)),
+        yaw=rng.uniform(-np.pi, np.pi, count),
+        score=rng.uniform(0.0, 1.0, count),
+    )
+
+
+def write(path: Path, frames: list[tuple[int, Pose, Rows]]) -> Path:
+    """Write tracks and give the path of the file."""
+    with KittiResultWriter(path, synthetic_camera()) as writer:
+        for index, pose, rows in frames:
+            writer.add(index, pose, rows)
+    return writer.path
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
+@given(st.integers(0, 2**32), st.integers(0, 12))
+def test_every_track_comes_back(tmp_path: Path, seed: int, count: int) -> None:
+    """World to file to world gives the same ids, classes, boxes and scores to the digits of the file."""
+    rng = np.random.default_rng(seed)
+    poses = [planar_pose(*rng.uniform(-50, 50, 2), 1.7, float(rng.uniform(-3, 3))) for _ in range(3)]
+    frames = [(i, pose, some_rows(rng, count)) for i, pose in enumerate(poses)]
+    table = read_kitti_results(write(tmp_path / "0000.txt", frames), LABELS).to_world(poses)
+    wanted = collect([(i, rows) for i, _, rows in frames])
+    assert table.labels == wanted.labels
+    for name in ("frame", "id", "label"):
+        np.testing.assert_array_equal(getattr(table, name), getattr(wanted, name))
+    for name in ("center", "size", "score"):
+        np.testing.assert_allclose(getattr(table, name), getattr(wanted, name), atol=2e-6)
+    assert abs(wrap_angle(table.yaw - wanted.yaw)).max(initial=0.0) < 2e-6
+
+
+def test_a_line_has_the_eighteen_fields_of_the_benchmark(tmp_path: Path) -> None:
+    """A car 20 m ahead, driving away: each field where the benchmark wants it."""
+    rows = Rows(
+        np.array([7]),
+        np.array([0]),
+        np.array([[20.0, 0.0, -1.0]]),
+        np.array([[4.0, 1.6, 1.5]]),
+        np.zeros(1),
+        np.array([0.9]),
+    )
+    path = write(tmp_path / "0000.txt", [(3, planar_pose(0.0, 0.0, 0.0, 0.0), rows)])
+    assert path.read_text() == (
+        "3 7 Car -1 -1 -1.570796 589.000000 197.500000 653.000000 257.500000 "
+        "1.500000 1.600000 4.000000 0.000000 1.750000 20.000000 -1.570796 0.900000\n"
+    )
+
+
+def test_tracks_that_no_image_shows_are_written_too(tmp_path: Path) -> None:
+    """A track behind the camera has the image box 0 0 0 0 and its own 3D box."""
+    rows = Rows(
+        np.array([1]), np.array([1]), np.array([[-9.0, 2.0, 0.0]]), np.ones((1, 3)), np.zeros(1), np.array([0.1])
+    )
+    table = read_kitti_results(write(tmp_path / "0000.txt", [(0, planar_pose(0, 0, 0, 0), rows)]))
+    np.testing.assert_array_equal(table.box2d, np.zeros((1, 4)))
+    np.testing.assert_allclose(table.center, [[-9.0, 2.0, 0.0]])
+
+
+def test_a_sequence_without_tracks_is_an_empty_file(tmp_path: Path) -> None:
+    """The file is there, and reading it gives a table without rows."""
+    path = write(tmp_path / "out" / "0000.txt", [])
+    assert path.read_bytes() == b""
+    assert len(read_kitti_results(path)) == len(empty_table()) == len(collect([])) == 0
+
+
+def test_an_error_on_the_way_leaves_no_file(tmp_path: Path) -> None:
+    """When writing fails, neither the file nor a part of it is left."""
+    rows = some_rows(np.random.default_rng(0), 2)
+    broken = replace(rows, score=np.ones(1))
+    with pytest.raises(ValueError, match="dimension"):
+        write(tmp_path / "0000.txt", [(0, planar_pose(0, 0, 0, 0), rows), (1, planar_pose(0, 0, 0, 0), broken)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_same_tracks_give_the_same_bytes(tmp_path: Path) -> None:
+    """Written twice, and with -0 in the place of 0, the file is the same."""
+    rows = some_rows(np.random.default_rng(3), 5)
+    zero = replace(rows, center=rows.center * [1.0, 0.0, 1.0])
+    minus = replace(rows, center=rows.center * [1.0, -0.0, 1.0])
+    pose = planar_pose(0, 0, 0, 0)
+    assert (
+        write(tmp_path / "a", [(0, pose, zero)]).read_bytes() == write(tmp_path / "b", [(0, pose, minus)]).read_bytes()
+    )
+
+
+LINE = "0 1 Car -1 -1 0 0 0 1 1 1.5 1.6 4 0 1.7 20 0 0.9"
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "received"),
+    [
+        ("0 1 Car -1 -1 0 0 0 1 1 1.5 1.6 4 0 1.7 20", 1, "16 fields"),
+        (f"{LINE}\n{LINE}", 2, "id 1 again in frame 0"),
+        (f"{LINE}\n{LINE.replace('0 1 Car', '-1 1 Car')}", 2, "-1"),
+        (LINE.replace("1.7", "high"), 1, "'high'"),
+    ],
+)
+def test_a_wrong_result_file_is_told_with_its_line(tmp_path: Path, text: str, line: int, received: str) -> None:
+    """Fields, frames, ids and numbers are checked."""
+    path = tmp_path / "0000.txt"
+    path.write_text(text + "\n")
+    with pytest.raises(DatasetError) as caught:
+        read_kitti_results(path)
+    assert (caught.value.line, caught.value.received) == (line, received)
+
+
+def test_a_file_without_scores_is_read_too(tmp_path: Path) -> None:
+    """Seventeen fields mean score 1, and rows are put in the order of frames."""
+    path = tmp_path / "0000.txt"
+    path.write_text(LINE.replace("0 1 Car", "5 1 Car") + "\n" + LINE.rsplit(" ", 1)[0].replace("Car", "Van") + "\n")
+    table = read_kitti_results(path, ("Car",))
+    assert table.frame.tolist() == [0, 5]
+    assert table.score.tolist() == [1.0, 0.9]
+    assert [table.labels[i] for i in table.label] == ["Van", "Car"]
+    assert table.of_class("Van").frame.tolist() == [0]
+
+
+def test_tables_of_different_labels_are_not_mixed() -> None:
+    """One table has one tuple of labels."""
+    rows = some_rows(np.random.default_rng(0), 2)
+    with pytest.raises(ValueError, match="one tuple of labels"):
+        collect([(0, rows), (1, replace(rows, labels=("Car",)))])
+
+
+def test_real_truth_written_as_results_is_the_label_file_again(tmp_path: Path) -> None:
+    """Truth of a real sequence through world and writer has the 3D boxes, ry and alpha of its label file."""
+    dataset = open_dataset("kitti", kitti_root())
+    (sequence,) = dataset.sequences(["0011"])
+    truth = sequence.truth()
+    assert truth is not None
+    with dataset.writer(tmp_path, sequence) as writer:
+        for index, pose in enumerate(sequence.poses):
+            now = truth.take(truth.frame == index)
+            rows = Rows(now.id, now.label, now.center, now.size, now.yaw, np.ones(len(now)), truth.labels)
+            writer.add(index, pose, rows)
+    assert writer.path == tmp_path / "0011.txt"
+    lines = (kitti_root() / "training/label_02/0011.txt").read_text().splitlines()
+    wanted = {tuple(f[:3]): f for f in (line.split() for line in lines) if f[2] != "DontCare"}
+    found = {tuple(f[:3]): f for f in (line.split() for line in writer.path.read_text().splitlines())}
+    assert found.keys() == wanted.keys()
+    ours = np.array([found[key][10:17] for key in wanted], dtype=np.float64)
+    theirs = np.array([fields[10:17] for fields in wanted.values()], dtype=np.float64)
+    np.testing.assert_allclose(ours[:, :6], theirs[:, :6], atol=2e-6)
+    assert abs(wrap_angle(ours[:, 6] - theirs[:, 6])).max() < 2e-6

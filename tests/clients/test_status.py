@@ -1,0 +1,69 @@
+"""What runs: services found by their liveliness, shown as a table or as JSON."""
+
+import json
+import time
+
+import pytest
+from fake_service import FakeService
+from optipmb_client import Connection
+from optipmb_client.cli import run
+from optipmb_client.sessions import find_services
+from optipmb_client.status import render
+from optipmb_schemas import Problem, ServiceStatus
+from rich.console import Console
+
+
+def test_a_service_is_shown_with_its_streams_and_problems(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The table holds instance, uptime, each stream with its figures, and the newest problem."""
+    with FakeService(endpoint):
+        assert run(["status", "--connect", endpoint, "--timeout", "10"]) == 0
+    text = capsys.readouterr().out
+    head, columns, stream, problem = text.splitlines()
+    assert head.split()[:2] == ["fake", "ready,"]
+    assert "1.2.3" in head
+    assert "2 h" in head
+    assert columns.split()[0] == "stream"
+    assert stream.split()[:4] == ["a/b/c", "kitti", "running", "10.0"]
+    assert "1234" in stream
+    assert "score[3]: too high" in problem
+
+
+def test_json_holds_the_messages(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """--json prints the status messages as they are."""
+    with FakeService(endpoint):
+        assert run(["status", "--connect", endpoint, "--timeout", "10", "--json"]) == 0
+    (service,) = json.loads(capsys.readouterr().out)["services"]
+    assert service["instance"] == "fake"
+    assert service["sessions"][0]["frames"] == 1234
+
+
+def test_every_service_is_found(endpoint: str) -> None:
+    """Two services on one network are both listed, by instance; one that ended is not."""
+    with Connection(endpoint) as connection, FakeService(endpoint, instance="one"):
+        with FakeService(endpoint, instance="two"):
+            deadline = time.monotonic() + 10.0
+            while len(found := find_services(connection)) < 2 and time.monotonic() < deadline:
+                pass
+            assert [status.instance for status in found] == ["one", "two"]
+        while len(found := find_services(connection)) > 1 and time.monotonic() < deadline:
+            pass
+        assert [status.instance for status in found] == ["one"]
+
+
+def test_nobody_is_an_empty_list_after_the_patience(endpoint: str) -> None:
+    """Without a service the search ends when its time is up."""
+    with Connection(endpoint) as connection:
+        begun = time.monotonic()
+        assert find_services(connection, patience_s=0.3) == []
+        assert 0.3 <= time.monotonic() - begun < 2.0
+
+
+def test_text_from_the_network_is_never_markup() -> None:
+    """A problem's text with brackets is shown as it is."""
+    text = "[red]x[/red] [/] received '[bold]'"
+    problem = Problem(stream="a/b/c", instance="x", code="malformed", message=text, count=3)
+    status = ServiceStatus(instance="x", version="1", started_ns=0, uptime_s=1.0, state="ready", problems=(problem,))
+    console = Console(width=200)
+    with console.capture() as capture:
+        console.print(render([status]))
+    assert f"{text} (3 times)" in capture.get()

@@ -1,0 +1,16 @@
+"""A real service for the tests of a module, as a process of its own."""
+
+from collections.abc import Iterator
+
+import pytest
+from optipmb_client.child import ServiceProcess
+
+START_S = 180.0  # the first start on a machine compiles
+
+
+@pytest.fixture(scope="module")
+def service() -> Iterator[ServiceProcess]:
+    """A running service with its own router."""
+    with ServiceProcess() as process:
+        process.wait_until_ready(START_S)
+        yield process

@@ -1,0 +1,190 @@
+"""What other people's programs do to the network must not reach the tracks of a stream."""
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pytest
+from commands import kill, optipmb, result_of, start
+from optipmb_client import Connection, Publisher, Subscriber
+from optipmb_client.child import ServiceProcess
+from optipmb_client.sessions import find_services
+from optipmb_schemas import Detections, Keys, Points, Problem, SessionParameters, Tracks, encoding_of
+from routers import open_client
+
+SCENE = ("--dataset", "scene", "--option", "frames=60", "--option", "clouds=0")
+POSE = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The result file of the scene, tracked offline."""
+    out = tmp_path_factory.mktemp("expected")
+    result_of(optipmb("track", *SCENE, "--out", out, "--json"))
+    return (out / "0000.txt").read_bytes()
+
+
+def replay(service: ServiceProcess, out: Path) -> Any:
+    """Replay the scene at twice the recorded rate, that is for three seconds."""
+    return result_of(
+        optipmb("replay", *SCENE, "--speed", 2, "--connect", service.endpoint, "--out", out, "--json", timeout=120)
+    )
+
+
+class Disturbance:
+    """Calls a function again and again in a thread, with a running number, until the end of the context."""
+
+    def __init__(self, act: Callable[[int], None]) -> None:
+        self.count = 0
+        self._act = act
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.002):
+            self._act(self.count)
+            self.count += 1
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(30.0)
+        assert not self._thread.is_alive()
+
+
+@pytest.fixture
+def link(service: ServiceProcess) -> Iterator[Connection]:
+    """A connection to the service's router."""
+    with Connection(service.endpoint) as connection:
+        yield connection
+
+
+def test_a_client_killed_in_the_middle(
+    service: ServiceProcess, link: Connection, expected: bytes, tmp_path: Path
+) -> None:
+    """SIGKILL of one client while another replays: the other's file is that of an undisturbed run."""
+    with Subscriber("replay/*/0007", connection=link) as tracks:
+        victim = start(
+            *("replay", *SCENE, "--option", "frames=600", "--sequences", "0007", "--speed", "1"),
+            *("--connect", service.endpoint, "--out", tmp_path / "victim"),
+        )
+        assert tracks.receive(60.0) is not None, "the victim did not start"
+        killer = threading.Timer(1.0, kill, (victim,))  # in the middle of the other's three seconds
+        killer.start()
+        result = replay(service, tmp_path)
+        killer.join(60.0)
+    assert victim.returncode == -9
+    assert result["missing"] == 0
+    assert (tmp_path / "0000.txt").read_bytes() == expected
+    assert not (tmp_path / "victim" / "0007.txt").exists()
+
+
+def test_garbage_on_every_key(service: ServiceProcess, link: Connection, expected: bytes, tmp_path: Path) -> None:
+    """Bytes without meaning on all topics and queries, of this stream and of others, leave the file as it is."""
+    keys = Keys()
+    kinds = {"detections": Detections, "points": Points, "tracks": Tracks, "problems": Problem}
+    rng = np.random.default_rng(5)
+    heads = [b"", b"\xc1", b"{", b"[" * 5000, b"\x81\xa6center\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xde"]
+    with open_client(service.endpoint) as session, Subscriber("replay/*/0000", connection=link) as tracks:
+        streams = ["a/b/c"]
+
+        def disturb(number: int) -> None:
+            received = tracks.receive(0.0)
+            if received is not None and received.tracks.stream not in streams:
+                streams.append(received.tracks.stream)
+            payload = heads[number % len(heads)] + rng.bytes(number % 300)
+            for stream in streams:
+                for topic, kind in kinds.items():
+                    encoding = encoding_of(kind) if number % 3 else "zenoh/bytes"
+                    session.put(keys.all(topic).replace("*/*/*", stream), payload, encoding=encoding)
+                if number % 10 == 0:
+                    for what in ("state", "parameters", "reset"):
+                        if what != "reset" or stream == "a/b/c":  # a reset is valid without a payload
+                            link.query(keys.query(stream, what), payload, encoding_of(SessionParameters), timeout=5.0)
+
+        with Disturbance(disturb) as disturbance:
+            result = replay(service, tmp_path)
+    assert len(streams) == 2, "the stream itself was not disturbed"
+    assert disturbance.count > 50
+    assert result["missing"] == 0
+    assert (tmp_path / "0000.txt").read_bytes() == expected
+    (status,) = find_services(link, patience_s=10.0)
+    assert status.refused > 100
+    assert status.problems
+
+
+def test_classes_that_no_profile_has(
+    service: ServiceProcess, link: Connection, expected: bytes, tmp_path: Path
+) -> None:
+    """A stream full of unknown classes gets tracks of none of them, and disturbs nobody."""
+    seen: list[Problem] = []
+    with (
+        Publisher("a/b/unknown", connection=link) as publisher,
+        Subscriber("a/b/unknown", connection=link, on_problem=seen.append, queue=100_000) as tracks,
+    ):
+
+        def disturb(number: int) -> None:
+            count = 200
+            publisher.publish(
+                stamp_ns=number * 1_000_000,
+                label=[f"thing-{number % 7}"] * count,
+                center=np.zeros((count, 3)),
+                size=np.ones((count, 3)),
+                yaw=np.zeros(count),
+                score=np.ones(count),
+                pose=POSE,
+            )
+
+        with Disturbance(disturb):
+            result = replay(service, tmp_path)
+        messages = []
+        while (received := tracks.receive(0.5)) is not None:
+            messages.append(received.tracks)
+    assert result["missing"] == 0
+    assert (tmp_path / "0000.txt").read_bytes() == expected
+    assert messages
+    assert all(len(message.id) == 0 and message.ignored == 200 for message in messages)
+    assert any(problem.code == "unknown_class" for problem in seen)
+
+
+def test_two_publishers_of_one_stream(
+    service: ServiceProcess, link: Connection, expected: bytes, tmp_path: Path
+) -> None:
+    """Two programs that fight for the name of a stream leave other streams alone."""
+    rng = np.random.default_rng(1)
+    with Publisher("a/b/twice", connection=link) as one, Publisher("a/b/twice", connection=link) as two:
+
+        def disturb(number: int) -> None:
+            (one, two)[number % 2].publish(
+                stamp_ns=int(rng.integers(0, 10**12)),
+                label=["car"],
+                center=rng.normal(size=(1, 3)),
+                size=np.ones((1, 3)),
+                yaw=[0.0],
+                score=[0.5],
+                pose=POSE,
+            )
+
+        with Disturbance(disturb):
+            result = replay(service, tmp_path)
+    assert result["missing"] == 0
+    assert (tmp_path / "0000.txt").read_bytes() == expected
+
+
+def test_the_service_has_survived(service: ServiceProcess, link: Connection) -> None:
+    """After all that the service runs, answers, and ends with status 0 when asked to."""
+    deadline = time.monotonic() + 10.0
+    (status,) = find_services(link, patience_s=10.0)
+    assert status.instance == service.instance
+    assert status.state in {"ready", "running"}
+    link.close()
+    assert service.stop() == 0
+    assert time.monotonic() < deadline + 10.0
+    assert not os.path.exists(f"/proc/{service.process.pid}")  # noqa: PTH110  a path of the kernel's, not of ours

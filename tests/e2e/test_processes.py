@@ -1,0 +1,103 @@
+"""The service as a child process: it comes up, it ends, and it never stays behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from commands import start
+from optipmb_client import Connection, ServiceUnavailable
+from optipmb_client.child import ServiceProcess
+from processes import descendants, running, wait_until_ended
+
+START_S = 180.0
+
+
+def test_a_service_comes_up_and_ends(tmp_path: Path) -> None:
+    """It answers at its endpoint while the context lasts, ends with status 0 after it, and its log is kept."""
+    log = tmp_path / "folder" / "service.log"
+    with ServiceProcess(log=log) as service:
+        service.wait_until_ready(START_S)
+        with Connection(service.endpoint) as connection:
+            assert len(connection.alive("optipmb/v1/service/*/alive")) == 1
+        pids = {service.process.pid} | descendants(service.process.pid)
+    assert service.process.returncode == 0
+    assert wait_until_ended(pids, 0.0) == set()
+    assert "ready" in log.read_text()
+
+
+def test_a_service_that_cannot_start_is_told_with_its_words() -> None:
+    """A wrong setting ends the service at its start: the error carries what it printed, at once."""
+    begun = time.monotonic()
+    with (
+        ServiceProcess(environment={"OPTIPMB_MAX_SESSIONS": "none"}) as service,
+        pytest.raises(ServiceUnavailable, match="max_sessions"),
+    ):
+        service.wait_until_ready(START_S)
+    assert time.monotonic() - begun < 60.0
+    assert not running(service.process.pid)
+
+
+def test_settings_of_this_process_do_not_reach_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Settings in the environment are meant for other services than the one started here."""
+    monkeypatch.setenv("OPTIPMB_MAX_SESSIONS", "none")
+    with ServiceProcess() as service:
+        service.wait_until_ready(START_S)
+
+
+def test_a_frozen_service_is_killed() -> None:
+    """A service that does not follow SIGTERM is killed after its grace."""
+    with ServiceProcess(grace_s=0.5) as service:
+        service.wait_until_ready(START_S)
+        service.process.send_signal(signal.SIGSTOP)
+        begun = time.monotonic()
+    assert 0.5 <= time.monotonic() - begun < 5.0
+    assert service.process.returncode == -signal.SIGKILL
+
+
+def test_the_service_ends_when_its_parent_is_killed() -> None:
+    """SIGKILL of the parent, which can clean up nothing, takes the service along."""
+    code = (
+        "from optipmb_client.child import ServiceProcess\n"
+        "with ServiceProcess() as service:\n"
+        f"    service.wait_until_ready({START_S})\n"
+        "    print(service.process.pid, flush=True)\n"
+        "    service.process.wait()\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        assert running(child)
+        parent.kill()
+    assert wait_until_ended({child}, 10.0) == set()
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+@pytest.mark.parametrize("stage", ["starting", "replaying"])
+def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, stage: str, number: int, status: int) -> None:
+    """Whatever ends the demo, at whichever stage: the service ends too, and there is no traceback."""
+    process = start("demo", "--out", tmp_path, "--frames", 100, "--speed", 1)
+    assert process.stderr is not None
+    try:
+        for line in process.stderr:
+            if line.startswith(stage):
+                break
+        else:
+            pytest.fail(f"the demo ended before {stage}")
+        children = descendants(process.pid)
+        deadline = time.monotonic() + 10.0
+        while not children and time.monotonic() < deadline:
+            children = descendants(process.pid)  # told of the stage, the service is being started
+        assert children
+        os.kill(process.pid, number)
+        out, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == status, err
+    assert out == ""
+    assert "Traceback" not in err
+    assert wait_until_ended(children, 10.0) == set()

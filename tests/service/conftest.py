@@ -1,0 +1,61 @@
+"""A service in the test's own process, with its own router on a free port, and a node that talks to it."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from optipmb_service.profiles import Profiles
+from optipmb_service.service import Service
+from optipmb_service.settings import load
+from router import Node
+from routers import free_endpoint
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from optipmb_service.lane import Lane
+
+    Start = Callable[..., tuple[Service, str]]
+
+
+@pytest.fixture(scope="session")
+def _compiled() -> None:
+    optipmb.warm_up()
+
+
+@pytest.fixture
+def start(_compiled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
+    """Start services; each is stopped at the end. Options are settings; `tracker` makes the trackers."""
+    with contextlib.ExitStack() as stack:
+
+        def begin(*, tracker: Any = optipmb.Tracker, **options: Any) -> tuple[Service, str]:
+            endpoint = free_endpoint()
+            given = {"listen": [endpoint], "instance": "test", "workers": 2, "grace_s": 0.2} | options
+            settings = load(None, given).settings
+            service = Service(settings, Profiles.read(settings.profile, settings.profiles), arm, tracker)
+            stack.callback(service.stop)
+            service.start()
+            return service, (settings.endpoints or settings.connect)[0]
+
+        yield begin
+
+
+@pytest.fixture
+def node(start: Start) -> Iterator[Node]:
+    """A node beside a service with default settings."""
+    _, endpoint = start()
+    with Node(endpoint) as one:
+        yield one
+
+
+def arm(lane: Lane, at_ns: int) -> None:
+    """Wake a lane in time, as the control loop does."""
+    timer = threading.Timer(max(0.0, at_ns - time.monotonic_ns()) / 1e9, lane.wake)
+    timer.daemon = True
+    timer.start()

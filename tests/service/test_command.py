@@ -1,0 +1,222 @@
+"""The command: starting, stopping, wrong use, settings."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import time
+from pathlib import Path
+
+import pytest
+from optipmb_schemas import Keys, ServiceStatus, SessionParameters
+from router import Node, Sensor
+from routers import free_endpoint, open_router
+from service_process import ServiceProcess
+
+KEYS = Keys()
+SENSOR = Sensor()
+END_S = 2.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_in_order(number: signal.Signals) -> None:
+    """After SIGINT or SIGTERM it ends within two seconds with status 0, its tokens withdrawn, in the midst of a stream."""
+    with ServiceProcess("--instance", "one") as service:
+        assert service.wait_ready() == f"ready instance=one endpoints={service.endpoint}"
+        with Node(service.endpoint) as node:
+            node.send(*(SENSOR.detections(seq) for seq in range(5)))
+            assert len(node.tracks(SENSOR.stream, 5)) == 5
+            node.send(SENSOR.detections(5, has_points=True))
+            status, seconds = service.end(number)
+        assert (status, service.output) == (0, [])
+        assert seconds < END_S
+        assert "Traceback" not in service.errors
+
+
+def test_a_second_signal_does_no_harm() -> None:
+    """Signals sent again while it ends change nothing."""
+    with ServiceProcess() as service:
+        service.wait_ready()
+        status, seconds = service.end(signal.SIGTERM, signal.SIGINT, signal.SIGTERM)
+        assert status == 0
+        assert seconds < END_S
+
+
+def test_a_signal_during_the_start_ends_it() -> None:
+    """Before it is ready, too, a signal ends it within two seconds with status 0."""
+    with ServiceProcess() as service:
+        service.wait_log("starting")
+        status, seconds = service.end(signal.SIGTERM)
+        assert status == 0
+        assert seconds < END_S
+
+
+def test_the_last_frames_are_tracked() -> None:
+    """Frames that were received before the signal still become tracks."""
+    with ServiceProcess() as service:
+        service.wait_ready()
+        with Node(service.endpoint) as node:
+            node.send(SENSOR.detections(0))
+            node.tracks(SENSOR.stream, 1)
+            gone = node.watch_alive(KEYS.all_alive())
+            node.send(SENSOR.detections(1, has_points=True))
+            node.ask(KEYS.query(SENSOR.stream, "parameters"), SessionParameters)
+            service.process.send_signal(signal.SIGTERM)
+            node.tracks(SENSOR.stream, 2)
+            gone.wait(lambda items: items[-1:] and items[-1][1] == b"-", "the end of the alive token")  # type: ignore[arg-type,return-value]  # a list is as good as its truth
+        assert service.wait_end() == 0
+
+
+def test_a_killed_service_is_seen_at_once_and_may_come_back() -> None:
+    """After SIGKILL its token vanishes, and another start on the same port works and tracks the same publisher."""
+    endpoint = free_endpoint()
+    with open_router(endpoint), Node(endpoint) as node:
+        tokens = node.watch_alive(KEYS.all_alive())
+        first = ("--connect", endpoint, "--instance", "first")
+        with ServiceProcess(*first, listen=False) as service:
+            service.wait_ready()
+            node.send(*(SENSOR.detections(seq) for seq in range(3)))
+            node.tracks(SENSOR.stream, 3)
+            service.process.kill()
+            tokens.wait(lambda items: (KEYS.alive("first"), b"-", "") in items, "the end of the token")
+        with ServiceProcess("--connect", endpoint, "--instance", "second", listen=False) as service:
+            service.wait_ready()
+            node.send(SENSOR.detections(3))
+            received = node.tracks(SENSOR.stream, 7)
+            assert [message.seq for message in received] == [0, 1, 2, 0, 1, 2, 3]
+            assert service.end()[0] == 0
+
+
+def test_a_client_waits_for_its_router() -> None:
+    """Started before the router it connects when the router comes; a signal ends the waiting too."""
+    endpoint = free_endpoint()
+    with ServiceProcess("--connect", endpoint, listen=False) as service:
+        service.wait_log("connecting")
+        with open_router(endpoint):
+            assert service.wait_ready().endswith(endpoint)
+            assert service.end()[0] == 0
+    with ServiceProcess("--connect", endpoint, listen=False) as service:
+        service.wait_log("connecting")
+        status, seconds = service.end()
+        assert status == 0
+        assert seconds < END_S
+
+
+def test_a_port_in_use_is_one_clear_line() -> None:
+    """Status 1 and one line that names the endpoint."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        with ServiceProcess("--listen", endpoint, "--log-level", "error", listen=False) as service:
+            assert service.wait_end(120) == 1
+            assert service.errors.count("\n") == 1
+            assert service.errors.startswith(f"optipmb-service: cannot listen on {endpoint}: the address is in use")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--nonsense",), "No such option"),
+        (("nonsense",), "No such command"),
+        (("--listen", "7447"), "an endpoint looks like"),
+        (("--profile", "unheard-of"), "expected one of kitti, nuscenes"),
+        (("--profile", "/no/such/file.toml"), "/no/such/file.toml"),
+        (("--settings", "/no/such/file.toml"), "No such file"),
+        (("--instance", "a/b"), "instance"),
+        (("--log-format", "xml"), "'console' or 'json'"),
+    ],
+)
+def test_wrong_use_is_one_clear_line(options: tuple[str, ...], says: str) -> None:
+    """Status 2 and one line on stderr that says what is wrong; nothing on stdout."""
+    with ServiceProcess(*options, listen=False) as service:
+        assert service.wait_end(60) == 2
+        assert service.errors.count("\n") == 1
+        assert service.errors.startswith("optipmb-service: ")
+        assert says in service.errors
+        assert service.output == []
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("cloud_wait_s = -1", "cloud_wait_s (from the file)"),
+        ("no_such_setting = 1", "no_such_setting"),
+        ("listen = 'tcp/[", "settings file"),
+        ("[profiles]\n'a/*' = 'unheard-of'", "unheard-of"),
+        ("[limits]\nmax_bytes = 'many'", "limits.max_bytes"),
+    ],
+)
+def test_a_bad_settings_file_is_one_clear_line(tmp_path: Path, text: str, says: str) -> None:
+    """Status 2 and one line that names the setting and where it came from."""
+    file = tmp_path / "settings.toml"
+    file.write_text(text)
+    with ServiceProcess("--settings", str(file), listen=False) as service:
+        assert service.wait_end(60) == 2
+        assert service.errors.count("\n") == 1
+        assert says in service.errors
+
+
+def test_json_logs_and_an_own_profile(tmp_path: Path) -> None:
+    """Log lines are JSON objects when asked for; a profile from a file is tracked with."""
+    from importlib import resources  # noqa: PLC0415 - this test alone reads a shipped profile
+
+    text = resources.files("optipmb").joinpath("profiles", "nuscenes.toml").read_text()
+    profile = tmp_path / "own.toml"
+    profile.write_text(text.replace('name = "nuscenes"', 'name = "own"'))
+    with ServiceProcess("--log-format", "json", "--profile", str(profile), "--instance", "x") as service:
+        service.wait_ready()
+        with Node(service.endpoint) as node:
+            node.send(SENSOR.detections(0))
+            assert node.tracks(SENSOR.stream, 1)[0].profile == "own"
+            assert node.ask(KEYS.status("x"), ServiceStatus).sessions[0].profile == "own"
+        service.end()
+        events = [json.loads(line)["event"] for line in service.errors.splitlines()]
+    assert events[:2] == ["starting", "ready"]
+    assert {"session_opened", "session_begun", "stop_asked", "stopped"} <= set(events)
+
+
+def test_settings_have_an_order(tmp_path: Path) -> None:
+    """An option is above the environment, the environment above the file, and `config` says which it was."""
+    file = tmp_path / "settings.toml"
+    file.write_text("instance = 'file'\nprefix = 'file/v1'\nworkers = 3\n[limits]\nmax_points = 10\nmax_bytes = 5000\n")
+    environment = {"OPTIPMB_INSTANCE": "environment", "OPTIPMB_PREFIX": "env/v1", "OPTIPMB_LIMITS__MAX_POINTS": "20"}
+    options = ("config", "--json", "--settings", str(file), "--instance", "option")
+    with ServiceProcess(*options, environment=environment, listen=False) as service:
+        assert service.wait_end(60) == 0
+        printed = json.loads("\n".join(service.output))
+    values, sources = printed["settings"], printed["sources"]
+    assert (values["instance"], values["prefix"], values["workers"]) == ("option", "env/v1", 3)
+    assert (values["limits"]["max_points"], values["limits"]["max_bytes"]) == (20, 5000)
+    assert [sources[name] for name in ("instance", "prefix", "workers", "listen")] == [
+        "option",
+        "environment",
+        "file",
+        "default",
+    ]
+
+
+def test_what_config_prints_is_a_settings_file(tmp_path: Path) -> None:
+    """The output of `config` can be given to `--settings`."""
+    with ServiceProcess("config", "--instance", "one", "--connect", "tcp/127.0.0.1:1", listen=False) as service:
+        assert service.wait_end(60) == 0
+        printed = "\n".join(service.output)
+    file = tmp_path / "settings.toml"
+    file.write_text(printed)
+    with ServiceProcess("config", "--json", "--settings", str(file), listen=False) as service:
+        assert service.wait_end(60) == 0
+        values = json.loads("\n".join(service.output))["settings"]
+    assert (values["instance"], values["connect"], values["router"]) == ("one", ["tcp/127.0.0.1:1"], False)
+
+
+def test_starting_takes_no_long_time() -> None:
+    """With compiled kernels in the cache the service is ready within ten seconds, even on a busy machine."""
+    with ServiceProcess() as service:
+        service.wait_ready()
+        service.end()
+    began = time.monotonic()
+    with ServiceProcess() as service:
+        service.wait_ready()
+        assert time.monotonic() - began < 10
+        service.end()

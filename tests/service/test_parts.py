@@ -1,0 +1,308 @@
+"""The small parts: inboxes, workers, problems, figures, profiles, settings, and what imports what."""
+
+from __future__ import annotations
+
+import ast
+import re
+import threading
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from router import SECOND, Sensor
+
+import optipmb
+import optipmb_service
+from optipmb_schemas import Problem
+from optipmb_service.clouds import Clouds
+from optipmb_service.inbox import Inbox, Pool
+from optipmb_service.meter import Meter
+from optipmb_service.ports import Packet
+from optipmb_service.problems import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, Desk, problem_of
+from optipmb_service.profiles import Profiles
+from optipmb_service.settings import LimitSettings, Settings, SettingsInvalidError, load
+
+SOURCES = sorted(Path(optipmb_service.__file__).parent.glob("*.py"))
+SENSOR = Sensor()
+
+
+def packet(number: int) -> Packet:
+    """A packet known by its size."""
+    return Packet("key", b"", number, "", 0, 0)
+
+
+# Inbox and workers
+
+
+@given(st.lists(st.integers(0, 2), max_size=60), st.integers(1, 5), st.integers(1, 5))
+def test_an_inbox_is_bounded_ordered_and_counts(kinds: list[int], frames: int, clouds: int) -> None:
+    """The newest frames and clouds stay, in order, clouds first; commands are never lost; what is missing is counted."""
+    inbox, ran = Inbox(frames, clouds), []
+    for number, kind in enumerate(kinds):
+        if kind == 0:
+            inbox.offer_frame(packet(number))
+        elif kind == 1:
+            inbox.offer_cloud(packet(number))
+        else:
+            inbox.offer_command(lambda number=number: ran.append(number), urgent=False)  # type: ignore[misc]  # bound now
+    taken: dict[str, list[int]] = {"frame": [], "cloud": []}
+    order = []
+    while (item := inbox.take()) is not None:
+        order.append(item[0])
+        if isinstance(item[1], Packet):
+            taken[item[0]].append(item[1].size)
+        else:
+            item[1]()
+    sent = [[number for number, kind in enumerate(kinds) if kind == wanted] for wanted in range(3)]
+    assert taken["frame"] == sent[0][-frames:]
+    assert taken["cloud"] == sent[1][-clouds:]
+    assert ran == sent[2]
+    assert (inbox.shed_frames, inbox.shed_clouds) == (max(0, len(sent[0]) - frames), max(0, len(sent[1]) - clouds))
+    assert order == sorted(order, key=lambda kind: kind != "cloud")
+
+
+def test_an_inbox_sends_one_worker() -> None:
+    """Only the first offer calls for a worker, until that one leaves; a closed inbox takes nothing."""
+    inbox = Inbox(4, 4)
+    assert [inbox.offer_frame(packet(0)), inbox.offer_cloud(packet(1)), inbox.ring()] == [True, False, False]
+    inbox.take()
+    assert inbox.leave(close=True) is True
+    inbox.take()
+    assert inbox.leave(close=False) is False
+    assert inbox.offer_frame(packet(2)) is True
+    inbox.take()
+    assert inbox.leave(close=True) is None
+    assert inbox.offer_frame(packet(3)) is None
+    assert inbox.offer_command(print, urgent=True) is None
+
+
+def test_urgent_commands_go_first() -> None:
+    """A question overtakes the frames that wait, an ordinary command does not."""
+    inbox, ran = Inbox(4, 4), []
+    inbox.offer_frame(packet(0))
+    inbox.offer_command(lambda: ran.append("later"), urgent=False)
+    inbox.offer_command(lambda: ran.append("now"), urgent=True)
+    assert [item[0] for item in iter(inbox.take, None)] == ["command", "frame", "command"]
+
+
+def test_workers_take_turns() -> None:
+    """With one thread, what has more to do waits until the others had their turn."""
+    turns: list[str] = []
+    done = threading.Event()
+
+    class Work:
+        def __init__(self, name: str, times: int) -> None:
+            self.name, self.left = name, times
+
+        def work(self) -> bool:
+            turns.append(self.name)
+            self.left -= 1
+            if len(turns) == 5:
+                done.set()
+            return self.left > 0
+
+    pool = Pool(1)
+    gate = threading.Event()
+
+    class Gate:
+        def work(self) -> bool:
+            return gate.wait(20) and False
+
+    pool.submit(Gate())
+    pool.submit(Work("long", 3))
+    pool.submit(Work("short", 2))
+    gate.set()
+    assert done.wait(20)
+    assert turns == ["long", "short", "long", "short", "long"]
+    assert pool.close(5)
+
+
+def test_a_stuck_worker_does_not_keep_the_pool() -> None:
+    """Closing gives up on a step that does not end, and says so."""
+    entered, gate = threading.Event(), threading.Event()
+
+    class Stuck:
+        def work(self) -> bool:
+            entered.set()
+            return gate.wait(20) and False
+
+    pool = Pool(1)
+    pool.submit(Stuck())
+    assert entered.wait(20)
+    assert not pool.close(0.05)
+    gate.set()
+
+
+# Problems
+
+
+def desk() -> tuple[Desk, list[Problem], list[tuple[str, int]]]:
+    """A desk, what it publishes, what it logs."""
+    published: list[Problem] = []
+    logged: list[tuple[str, int]] = []
+    return Desk(published.append, lambda problem, count: logged.append((problem.code, count))), published, logged
+
+
+def problem(stream: str = "a/b/c", code: str = "late", count: int = 1) -> Problem:
+    """Some problem."""
+    return problem_of(code, stream=stream, instance="x", message="m", count=count)
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, SECOND)), max_size=80))
+def test_no_problem_is_lost_and_few_are_told(steps: list[tuple[int, int]]) -> None:
+    """Counts on the key and in the log add up to what was reported, each kind at most once a second, once in ten."""
+    one, published, logged = desk()
+    now, last = 0, dict[str, int]()
+    for kind, step in steps:
+        now += step
+        before = len(published)
+        one.report(problem(stream=f"a/b/{kind}"), now)
+        for told in published[before:]:
+            assert now - last.get(told.stream, -SECOND) >= SECOND
+            last[told.stream] = now
+    one.flush(now + 10 * SECOND)
+    assert sum(told.count for told in published) == sum(count for _, count in logged) == len(steps) == one.total
+
+
+def test_a_flood_on_ever_new_keys_is_bounded() -> None:
+    """Ten thousand kinds in one second make a few lines and messages, and a bounded memory."""
+    one, published, logged = desk()
+    for number in range(10_000):
+        one.report(problem(stream=f"a/b/{number}"), 5)
+    assert (len(published), len(logged)) == (PUBLISHED_PER_SECOND, LOGGED_PER_SECOND)
+    assert len(one.newest()) == 20
+
+
+def test_elements_of_an_array_are_one_kind() -> None:
+    """Which element was wrong does not make a new kind of problem; a new class name does."""
+    one, published, _ = desk()
+    for number in range(5):
+        one.report(problem_of("invalid_value", stream="a/b/c", instance="x", message="m", path=f"score[{number}]"), 0)
+        one.report(problem_of("unknown_class", stream="a/b/c", instance="x", message="m", received=f"'{number}'"), 0)
+    assert [told.code for told in published].count("invalid_value") == 1
+    assert [told.code for told in published].count("unknown_class") == 5
+
+
+@given(st.text(max_size=2000))
+def test_a_problem_takes_any_text(text: str) -> None:
+    """Whatever was received, the problem can be made and its texts are printable."""
+    made = problem_of("x", stream="", instance="x", message=text, received=text, expected=text, path=text)
+    assert made.message.isprintable()
+
+
+# Figures
+
+
+def test_figures_of_a_stream() -> None:
+    """Rate and latencies of the last frames; the rate falls in silence; without frames all are zero."""
+    meter = Meter(0)
+    assert (meter.rate_hz(SECOND), meter.latency_ms(), meter.age_s(SECOND)) == (0.0, (0.0, 0.0), None)
+    for frame in range(21):
+        meter.arrived(frame * SECOND // 10, frame=True)
+        meter.published((frame + 1) * 1_000_000)
+    assert meter.rate_hz(2 * SECOND) == pytest.approx(10)
+    assert meter.rate_hz(20 * SECOND) == pytest.approx(1)
+    assert meter.latency_ms() == (11.0, 21.0)
+    assert meter.age_s(3 * SECOND) == 1.0
+
+
+def test_clouds_are_found_by_stamp_and_bounded() -> None:
+    """The newest clouds stay; those up to a processed frame go, those of a jump away stay."""
+    clouds = Clouds(3)
+    for seq in range(5):
+        clouds.add(SENSOR.points(seq))
+    assert [clouds.get(SENSOR.stamp_ns(seq)) is not None for seq in range(5)] == [False, False, True, True, True]
+    clouds.forget_until(SENSOR.stamp_ns(3), SECOND)
+    assert len(clouds) == 1
+    clouds.forget_until(SENSOR.stamp_ns(4) + 2 * SECOND, SECOND)
+    assert len(clouds) == 1
+    clouds.forget_publisher(SENSOR.epoch)
+    assert len(clouds) == 0
+
+
+# Settings and profiles
+
+
+def test_profiles_that_cannot_be_named_in_messages_are_refused(tmp_path: Path) -> None:
+    """A profile whose name no message could carry ends the start, not the first frame."""
+    values = optipmb.load_profile("kitti").model_dump(mode="json")
+    own = tmp_path / "own.toml"
+    text = Path(optipmb.__file__).parent.joinpath("profiles", "kitti.toml").read_text()
+    own.write_text(text.replace('name = "kitti"', 'name = "not a name"'))
+    assert values["name"] == "kitti"
+    with pytest.raises(optipmb.ParameterError, match="name"):
+        Profiles.read(str(own), {})
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "says"),
+    [
+        ("OPTIPMB_CLOUD_WAIT_S", "soon", "cloud_wait_s (from the environment)"),
+        ("OPTIPMB_LISTEN", "tcp/1.2.3.4:1,7447", "listen.1 (from the environment)"),
+        ("OPTIPMB_CONNECT", "[tcp", "connect (from the environment): names separated by commas"),
+        ("OPTIPMB_PROFILES", "a:b", "OPTIPMB_PROFILES: tables are written as JSON"),
+        ("OPTIPMB_PREFIX", "a//b", "prefix"),
+        ("OPTIPMB_LIMITS__MAX_BYTES", "0", "limits.max_bytes"),
+    ],
+)
+def test_a_wrong_variable_is_named(monkeypatch: pytest.MonkeyPatch, variable: str, value: str, says: str) -> None:
+    """An environment variable that cannot be used is one clear error."""
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(SettingsInvalidError, match=re.escape(says)) as raised:
+        load()
+    assert "\n" not in str(raised.value)
+
+
+def test_a_misspelt_variable_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A variable that looks like a setting and is none is reported."""
+    monkeypatch.setenv("OPTIPMB_CLOUD_WAIT", "1")
+    assert load().unknown == ("OPTIPMB_CLOUD_WAIT",)
+
+
+@pytest.mark.parametrize("value", ["tcp/1.2.3.4:1,tcp/[::]:2", '["tcp/1.2.3.4:1", "tcp/[::]:2"]'])
+def test_lists_in_the_environment(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    """Several endpoints in one variable, with commas or as JSON."""
+    monkeypatch.setenv("OPTIPMB_LISTEN", value)
+    monkeypatch.setenv("OPTIPMB_CONNECT", value)
+    settings = load().settings
+    assert settings.listen == settings.connect == ("tcp/1.2.3.4:1", "tcp/[::]:2")
+
+
+def test_router_or_client() -> None:
+    """A router listens by default; with routers to connect to it is a client, unless both are wanted."""
+    router, client = load().settings, load(None, {"connect": ["tcp/1.2.3.4:7447"]}).settings
+    both = load(None, {"connect": ["tcp/1.2.3.4:7447"], "router": True}).settings
+    assert (router.is_router, router.endpoints) == (True, ("tcp/127.0.0.1:7447",))
+    assert (client.is_router, client.endpoints) == (False, ())
+    assert (both.is_router, both.endpoints) == (True, ("tcp/127.0.0.1:7447",))
+
+
+# The house
+
+
+def imported(source: Path) -> set[str]:
+    """First names of everything that a module imports."""
+    names = set()
+    for part in ast.walk(ast.parse(source.read_text())):
+        if isinstance(part, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in part.names}
+        elif isinstance(part, ast.ImportFrom) and part.level == 0:
+            names.add(str(part.module).partition(".")[0])
+    return names
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
+def test_what_imports_what(source: Path) -> None:
+    """The service imports no client; only the transport imports Zenoh; the pure modules import nothing that waits."""
+    names = imported(source)
+    assert "optipmb_client" not in names
+    assert ("zenoh" in names) == (source.stem == "transport")
+    if source.stem in {"timing", "session", "convert", "clouds", "records", "profiles"}:
+        assert not names & {"threading", "asyncio", "socket", "queue", "structlog"}
+
+
+def test_every_setting_is_described() -> None:
+    """No setting without a word on what it does."""
+    for model in (Settings, LimitSettings):
+        assert all(field.description for field in model.model_fields.values())

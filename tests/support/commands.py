@@ -1,0 +1,31 @@
+"""The client's command, run as users run it: in a process of its own."""
+
+import json
+import signal
+import subprocess
+import sys
+from typing import Any
+
+
+def optipmb(*arguments: object, timeout: float = 240.0) -> "subprocess.CompletedProcess[str]":
+    """Run the client's command in a process of its own."""
+    command = [sys.executable, "-m", "optipmb_client", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+
+
+def start(*arguments: object) -> "subprocess.Popen[str]":
+    """Start the client's command and return the running process."""
+    command = [sys.executable, "-m", "optipmb_client", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def result_of(done: "subprocess.CompletedProcess[str]") -> Any:
+    """Give the JSON that a command printed; it must have ended well."""
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def kill(process: "subprocess.Popen[str]") -> None:
+    """End a process as a crash would, and clear away its pipes."""
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=30)

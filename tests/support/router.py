@@ -1,0 +1,281 @@
+"""A sensor's messages, and a node on a real Zenoh network that sends them and waits for what comes back.
+
+Nothing here sleeps: whoever waits is woken by a message, or fails at a deadline.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+import numpy as np
+import zenoh
+import zenoh.ext
+from optipmb_schemas import (
+    Detections,
+    Keys,
+    Message,
+    Points,
+    Pose,
+    Problem,
+    Tracks,
+    decode,
+    encode,
+    encoding_of,
+)
+from routers import open_client
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from types import TracebackType
+
+SECOND = 1_000_000_000
+DEADLINE_S = 20.0
+PERIOD_S = 0.1
+
+_T = TypeVar("_T", bound=Message)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Makes the messages of one stream: objects that drive along x, seen at 10 Hz in the world frame."""
+
+    stream: str = "site/node/lidar"
+    epoch: bytes = b"0123456789abcdef"
+    objects: int = 3
+    start_s: float = 10_000.0
+
+    def stamp_ns(self, seq: int) -> int:
+        """Sensor time of a frame."""
+        return round((self.start_s + seq * PERIOD_S) * SECOND)
+
+    def detections(self, seq: int, **changes: Any) -> Detections:
+        """The frame `seq`; the same call gives the same message."""
+        count = int(changes.pop("objects", self.objects))
+        index = np.arange(count, dtype=np.float64)
+        noise = np.random.default_rng(seq).normal(0, 0.05, (count, 3))
+        fields: dict[str, Any] = {
+            "stream": self.stream,
+            "epoch": self.epoch,
+            "seq": seq,
+            "stamp_ns": self.stamp_ns(seq),
+            "frame": "world",
+            "labels": ("car", "pedestrian"),
+            "label": np.zeros(count, np.int64),
+            "center": np.stack([5 * seq * PERIOD_S + 0 * index, 12 * index, 1 + 0 * index], axis=1) + noise,
+            "size": np.tile([4.5, 1.9, 1.6], (count, 1)),
+            "yaw": np.zeros(count),
+            "velocity": np.tile([5.0, 0.0], (count, 1)),
+            "score": np.full(count, 0.8),
+        }
+        return Detections(**(fields | changes))
+
+    def points(self, seq: int, count: int = 500, **changes: Any) -> Points:
+        """The cloud of the frame `seq`, in the sensor frame."""
+        xyz = np.random.default_rng(seq).uniform(-30, 30, (count, 3)).astype(np.float32)
+        fields: dict[str, Any] = {
+            "stream": self.stream,
+            "epoch": self.epoch,
+            "seq": seq,
+            "stamp_ns": self.stamp_ns(seq),
+            "frame": "sensor",
+            "pose": Pose(translation=np.array([5 * seq * PERIOD_S, 0, 0]), quaternion=np.array([1.0, 0, 0, 0])),
+            "xyz": xyz,
+        }
+        return Points(**(fields | changes))
+
+
+def plain(tracks: Tracks) -> bytes:
+    """The bytes of tracks that must be the same in every run: all but how they were delivered."""
+    return encode(tracks.model_copy(update={"delivery": None}))
+
+
+@dataclass
+class Collected:
+    """What came in so far, and a way to wait for more."""
+
+    items: list[tuple[str, bytes, str]] = field(default_factory=list)
+    changed: threading.Condition = field(default_factory=threading.Condition)
+
+    def add(self, key: str, payload: bytes, encoding: str) -> None:
+        """Append one message and wake who waits."""
+        with self.changed:
+            self.items.append((key, payload, encoding))
+            self.changed.notify_all()
+
+    def wait(self, enough: Callable[[list[tuple[str, bytes, str]]], bool], what: str) -> None:
+        """Wait until `enough` of what came in; fails at the deadline."""
+        with self.changed:
+            if not self.changed.wait_for(lambda: enough(self.items), DEADLINE_S):
+                raise AssertionError(f"{what} did not come within {DEADLINE_S:g} s; {len(self.items)} messages came")
+
+
+class Node:
+    """A publisher and subscriber as users write them; a client of the router at `endpoint`."""
+
+    def __init__(self, endpoint: str, keys: Keys | None = None) -> None:
+        self.keys = keys or Keys()
+        self.session = open_client(endpoint)
+        self._publishers: dict[str, Any] = {}
+        self._subscriptions: list[Any] = []
+        self.tracks_seen = self._collect(self.keys.all("tracks"))
+        self.problems_seen = self._collect(self.keys.all("problems"))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the network in order."""
+        for subscription in self._subscriptions:
+            subscription.undeclare()
+        for publisher in self._publishers.values():
+            publisher.undeclare()
+        self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
+
+    def send(self, *messages: Detections | Points) -> None:
+        """Publish messages as a sensor would."""
+        for message in messages:
+            topic = "detections" if isinstance(message, Detections) else "points"
+            key = getattr(self.keys, topic)(message.stream)
+            self._publisher(key, type(message), cached=topic == "detections").put(encode(message))
+
+    def send_raw(self, key: str, payload: bytes, encoding: str = "") -> None:
+        """Publish any bytes on any key."""
+        self.session.put(key, payload, encoding=encoding or None)
+
+    def query(
+        self, key: str, message: Message | bytes | None = None, timeout: float = 5.0
+    ) -> list[tuple[bool, str, bytes]]:
+        """Ask everybody; returns for each reply whether it is no error, its key and its payload."""
+        payload = encode(message) if isinstance(message, Message) else message
+        encoding = encoding_of(message) if isinstance(message, Message) else None
+        answers = []
+        for reply in self.session.get(
+            key,
+            payload=payload,
+            encoding=encoding,
+            timeout=timeout,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        ):
+            if (sample := reply.ok) is not None:
+                answers.append((True, str(sample.key_expr), sample.payload.to_bytes()))
+            elif (error := reply.err) is not None:
+                answers.append((False, key, error.payload.to_bytes()))
+        return answers
+
+    def ask(self, key: str, expected: type[_T], message: Message | bytes | None = None) -> _T:
+        """Ask and return the one good reply."""
+        answers = self.query(key, message)
+        assert [ok for ok, _, _ in answers] == [True], answers
+        return decode(answers[0][2], expected)
+
+    def refused(self, key: str, message: Message | bytes | None = None) -> Problem:
+        """Ask and return the one error reply."""
+        answers = self.query(key, message)
+        assert [ok for ok, _, _ in answers] == [False], answers
+        return decode(answers[0][2], Problem)
+
+    def alive(self, pattern: str) -> list[str]:
+        """Keys of the liveliness tokens under a pattern."""
+        replies = self.session.liveliness().get(pattern, timeout=5.0)
+        return sorted(str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None)
+
+    def watch_alive(self, pattern: str) -> Collected:
+        """Collect the tokens that come (payload `b"+"`) and go (`b"-"`) under a pattern."""
+        collected = Collected()
+        subscriber = self.session.liveliness().declare_subscriber(
+            pattern, zenoh.handlers.FifoChannel(1000), history=True
+        )
+        put = zenoh.SampleKind.PUT
+        self._drain(
+            subscriber, lambda sample: collected.add(str(sample.key_expr), b"+" if sample.kind == put else b"-", "")
+        )
+        return collected
+
+    def tracks(self, stream: str, count: int) -> list[Tracks]:
+        """Wait for `count` messages of tracks of a stream."""
+        return self._wait(self.tracks_seen, self.keys.tracks(stream), count, Tracks)
+
+    def problems(self, stream: str, count: int = 1) -> list[Problem]:
+        """Wait for `count` problems of a stream."""
+        return self._wait(self.problems_seen, self.keys.problems(stream), count, Problem)
+
+    def problem(self, stream: str, code: str) -> Problem:
+        """Wait for a problem of a kind."""
+        key = self.keys.problems(stream)
+
+        def found(items: Iterable[tuple[str, bytes, str]]) -> list[Problem]:
+            problems = [decode(payload, Problem) for at, payload, _ in items if at == key]
+            return [problem for problem in problems if problem.code == code]
+
+        self.problems_seen.wait(lambda items: bool(found(items)), f"a problem {code} on {key}")
+        return found(self.problems_seen.items)[-1]
+
+    def _wait(self, collected: Collected, key: str, count: int, kind: type[_T]) -> list[_T]:
+        collected.wait(lambda items: sum(at == key for at, _, _ in items) >= count, f"{count} messages on {key}")
+        with collected.changed:
+            return [decode(payload, kind) for at, payload, _ in collected.items if at == key]
+
+    def _publisher(self, key: str, kind: type[Message], *, cached: bool) -> Any:
+        if key not in self._publishers:
+            if cached:
+                self._publishers[key] = zenoh.ext.declare_advanced_publisher(
+                    self.session,
+                    key,
+                    encoding=encoding_of(kind),
+                    priority=zenoh.Priority.DATA_HIGH,
+                    express=True,
+                    cache=zenoh.ext.CacheConfig(1000),
+                    sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.1, sporadic_heartbeat=None),
+                    publisher_detection=True,
+                )
+            else:
+                self._publishers[key] = self.session.declare_publisher(
+                    key, encoding=encoding_of(kind), priority=zenoh.Priority.DATA_LOW
+                )
+        return self._publishers[key]
+
+    def _collect(self, pattern: str) -> Collected:
+        collected = Collected()
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            self.session,
+            pattern,
+            zenoh.handlers.FifoChannel(10_000),
+            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+        )
+        self._drain(
+            subscriber,
+            lambda sample: collected.add(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)),
+        )
+        return collected
+
+    def _drain(self, subscriber: Any, take: Callable[[Any], None]) -> None:
+        self._subscriptions.append(subscriber)
+        handler = subscriber.handler
+
+        def loop() -> None:
+            try:
+                for sample in handler:
+                    take(sample)
+            except zenoh.ZError:  # closed and empty
+                return
+
+        threading.Thread(target=loop, daemon=True).start()
+
+
+def until(true: Callable[[], bool], what: str, deadline_s: float = DEADLINE_S) -> None:
+    """Ask again and again, for what sends no message; fails at the deadline."""
+    ends = time.monotonic() + deadline_s
+    pause = threading.Event()
+    while not true():
+        if time.monotonic() > ends:
+            raise AssertionError(f"{what} within {deadline_s:g} s")
+        pause.wait(0.01)

@@ -1,0 +1,115 @@
+"""The real command in a process of its own: started, awaited by its ready line, always ended."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Self
+
+from routers import free_endpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from types import TracebackType
+
+READY_S = 120.0
+"""The first start after an installation compiles the kernels."""
+
+
+class ServiceProcess:
+    """`optipmb-service` with options, on a free endpoint unless they name one.
+
+    Args:
+        options: what follows the command's name.
+        environment: variables on top of this process's, which loses its own settings.
+        listen: whether a free endpoint is given to it.
+    """
+
+    def __init__(self, *options: str, environment: Mapping[str, str] | None = None, listen: bool = True) -> None:
+        self.endpoint = free_endpoint()
+        where = ("--listen", self.endpoint) if listen else ()
+        clean = {name: value for name, value in os.environ.items() if not name.startswith("OPTIPMB_")}
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._errors: list[str] = []
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "optipmb_service", *options, *where],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=clean | dict(environment or {}),
+        )
+        self._threads = [threading.Thread(target=read, daemon=True) for read in (self._read_out, self._read_errors)]
+        for thread in self._threads:
+            thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        for thread in self._threads:
+            thread.join()
+        for stream in (self.process.stdout, self.process.stderr):
+            if stream is not None:
+                stream.close()
+
+    def wait_ready(self) -> str:
+        """Return the ready line."""
+        line = self._lines.get(timeout=READY_S)
+        assert line is not None, f"ended without a ready line: {self.errors}"
+        return line
+
+    def wait_log(self, event: str, deadline_s: float = 30.0) -> None:
+        """Wait for a log event."""
+        ends = time.monotonic() + deadline_s
+        pause = threading.Event()
+        while event not in self.errors:
+            assert time.monotonic() < ends, f"no {event} in {self.errors}"
+            pause.wait(0.01)
+
+    def end(self, *numbers: signal.Signals, deadline_s: float = 10.0) -> tuple[int, float]:
+        """Send signals (SIGTERM unless named); return the exit status and the seconds until the end."""
+        began = time.monotonic()
+        for number in numbers or (signal.SIGTERM,):
+            self.process.send_signal(number)
+        return self.wait_end(deadline_s), time.monotonic() - began
+
+    def wait_end(self, deadline_s: float = 30.0) -> int:
+        """Return the exit status of a process that ends by itself; everything it has written is then there."""
+        status = self.process.wait(deadline_s)
+        for thread in self._threads:
+            thread.join(deadline_s)
+        return status
+
+    @property
+    def errors(self) -> str:
+        """What it has written to stderr."""
+        return "".join(self._errors)
+
+    @property
+    def output(self) -> list[str]:
+        """The lines on stdout that nobody has taken."""
+        lines = []
+        while not self._lines.empty():
+            if (line := self._lines.get()) is not None:
+                lines.append(line)
+        return lines
+
+    def _read_out(self) -> None:
+        for line in self.process.stdout or ():
+            self._lines.put(line.rstrip("\n"))
+        self._lines.put(None)
+
+    def _read_errors(self) -> None:
+        for line in self.process.stderr or ():
+            self._errors.append(line)

@@ -1,0 +1,41 @@
+#!/bin/sh
+# Builds the wheel, installs it alone into a fresh environment, and uses it from there: what the source tree adds is not
+# there, so that a file missing from the wheel shows. Called as: sh tests/wheel.sh PYTHON BIN
+#   PYTHON  interpreter that makes the fresh environment
+#   BIN     folder of an environment with `build`
+set -eu
+python=$1
+case $2 in /*) bin=$2 ;; *) bin=$PWD/$2 ;; esac
+root=$(cd "$(dirname "$0")/.." && pwd)
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT INT TERM
+
+"$bin/python" -m build --wheel --outdir "$work/dist" "$root" >"$work/build.log" 2>&1 || { cat "$work/build.log"; exit 1; }
+"$python" -m venv "$work/venv"
+"$work/venv/bin/python" -m pip install --quiet --disable-pip-version-check \
+  --constraint "$root/requirements.lock" "$work"/dist/optipmb-*.whl
+
+cd "$work" # nothing of the source tree is importable from here
+unset PYTHONPATH
+"$work/venv/bin/python" - <<'PYTHON'
+from pathlib import Path
+
+import optipmb
+import optipmb_client
+import optipmb_schemas
+import optipmb_service
+
+for package in (optipmb, optipmb_client, optipmb_schemas, optipmb_service):
+    folder = Path(package.__file__).parent
+    assert "site-packages" in folder.parts, folder
+    assert (folder / "py.typed").is_file(), f"{folder.name} lacks py.typed: its users' type checkers see nothing"
+for profile in ("kitti", "nuscenes"):
+    assert optipmb.load_profile(profile).classes, profile
+PYTHON
+"$work/venv/bin/optipmb" --help >/dev/null
+"$work/venv/bin/optipmb" --version
+"$work/venv/bin/optipmb-service" --help >/dev/null
+"$work/venv/bin/optipmb" track --dataset scene --option frames=5 --out "$work/out" >/dev/null
+test -s "$work/out/0000.txt"
+"$work/venv/bin/python" -m pip check --disable-pip-version-check
+echo "the wheel $(basename "$work"/dist/optipmb-*.whl) works by itself"
