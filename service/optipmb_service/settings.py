@@ -252,6 +252,5 @@ def _environment() -> dict[str, Any]:
     except SettingsError as error:
         match = re.search(r'field "(\w+)"', str(error))
         name = f"{PREFIX}{match[1].upper()}" if match else "environment"
-        raise SettingsInvalidError(
-            f"{name}: lists and tables are written as JSON, as '[\"tcp/0.0.0.0:7447\"]'"
-        ) from error
+        example = '{"site/*/*": "kitti"}'
+        raise SettingsInvalidError(f"{name}: tables are written as JSON, as '{example}'") from error

@@ -77,7 +77,7 @@ def test_every_track_comes_back(tmp_path: Path, seed: int, count: int) -> None:
 
 
 def test_a_line_has_the_eighteen_fields_of_the_benchmark(tmp_path: Path) -> None:
-    """A car 20 m ahead, driving away: each field where the benchmark wants it."""
+    """A car 20 m ahead and below the camera, driving away: each field where the benchmark wants it."""
     rows = Rows(
         np.array([7]),
         np.array([0]),
@@ -88,7 +88,7 @@ def test_a_line_has_the_eighteen_fields_of_the_benchmark(tmp_path: Path) -> None
     )
     path = write(tmp_path / "0000.txt", [(3, planar_pose(0.0, 0.0, 0.0, 0.0), rows)])
     assert path.read_text() == (
-        "3 7 Car -1 -1 -1.570796 589.000000 197.500000 653.000000 257.500000 "
+        "3 7 Car -1 -1 -1.570796 589.000000 195.681818 653.000000 257.500000 "
         "1.500000 1.600000 4.000000 0.000000 1.750000 20.000000 -1.570796 0.900000\n"
     )
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import threading
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +27,7 @@ from optipmb_schemas import (
 from optipmb_service.records import Tracked
 from optipmb_service.session import Session
 from router import Node, Sensor, plain, until
+from routers import free_endpoint, open_router
 
 import optipmb
 
@@ -63,10 +66,13 @@ def test_json_is_understood(node: Node) -> None:
 
 def test_a_cloud_is_waited_for(node: Node) -> None:
     """A frame that has a cloud is tracked with it, whichever comes first; without, after the wait."""
+    key = KEYS.query(SENSOR.stream, "parameters")
+    node.ask(key, SessionParameters, SessionParameters(cloud_wait_s=10.0))
     node.send(SENSOR.points(0), SENSOR.detections(0, has_points=True))
     node.tracks(SENSOR.stream, 1)
     node.send(SENSOR.detections(1, has_points=True), SENSOR.points(1))
     node.tracks(SENSOR.stream, 2)
+    node.ask(key, SessionParameters, SessionParameters(cloud_wait_s=0.1))
     node.send(SENSOR.detections(2, has_points=True))
     received = node.tracks(SENSOR.stream, 3)
     assert [message.cloud_used for message in received] == [True, True, False]
@@ -76,6 +82,8 @@ def test_a_cloud_is_waited_for(node: Node) -> None:
 
 def test_a_fast_replay_keeps_all_its_clouds(node: Node) -> None:
     """Eight frames and clouds in flight at once, no cloud lost, in order."""
+    wait = SessionParameters(cloud_wait_s=10.0)
+    node.ask(KEYS.query(SENSOR.stream, "parameters"), SessionParameters, wait)
     for first in range(0, 64, 8):
         node.send(*(SENSOR.detections(seq, has_points=True) for seq in range(first, first + 8)))
         node.send(*(SENSOR.points(seq, count=30_000) for seq in range(first, first + 8)))
@@ -223,8 +231,6 @@ def test_a_publisher_that_starts_anew_goes_on(start: Callable[..., Any]) -> None
 
 def test_the_service_fetches_what_it_missed(start: Callable[..., Any]) -> None:
     """Frames published just before the service came are tracked: they come from the publisher's cache."""
-    from routers import free_endpoint, open_router  # noqa: PLC0415 - this test alone has a router of its own
-
     endpoint = free_endpoint()
     with open_router(endpoint), Node(endpoint) as node:
         node.send(*(SENSOR.detections(seq) for seq in range(5)))
@@ -345,8 +351,6 @@ def test_sessions_are_limited_and_idle_ones_freed(start: Callable[..., Any]) -> 
 
 def test_an_overloaded_stream_sheds_its_oldest(start: Callable[..., Any]) -> None:
     """More frames than the queue holds while a step takes its time: the oldest go, counted and reported."""
-    import threading  # noqa: PLC0415 - this test alone holds a tracker back
-
     entered, gate = threading.Event(), threading.Event()
 
     class Slow(optipmb.Tracker):
@@ -374,3 +378,62 @@ def test_a_problem_says_it_in_one_sentence(node: Node) -> None:
     assert isinstance(problem, Problem)
     assert problem.message.isprintable()
     assert len(problem.message) <= 500
+
+
+def test_a_silent_stream_is_stale(start: Callable[..., Any]) -> None:
+    """A stream without frames for long is shown as stale, and no longer when it is back."""
+    service, endpoint = start(stale_s=0.02)
+    with Node(endpoint) as node:
+        node.send(SENSOR.detections(0))
+        node.tracks(SENSOR.stream, 1)
+
+        def stale() -> bool:
+            service.housekeeping()
+            return service.status().sessions[0].state == "stale"
+
+        until(stale, "the stream is stale")
+        node.send(SENSOR.detections(1))
+        node.tracks(SENSOR.stream, 2)
+        assert service.status().sessions[0].state == "running"
+
+
+def test_a_step_that_does_not_end_does_not_keep_the_service(start: Callable[..., Any]) -> None:
+    """Stopping gives up on a stuck step after the grace and closes the network all the same."""
+    entered, gate = threading.Event(), threading.Event()
+
+    class Stuck(optipmb.Tracker):
+        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+            entered.set()
+            gate.wait(20)
+            return super().step(density, frame)
+
+    service, endpoint = start(tracker=Stuck, grace_s=0.2)
+    with Node(endpoint) as node:
+        node.send(SENSOR.detections(0))
+        assert entered.wait(20)
+        began = time.monotonic()
+        assert not service.stop()
+        assert time.monotonic() - began < 2
+    gate.set()
+
+
+def test_a_router_that_goes_and_comes_loses_nothing(start: Callable[..., Any]) -> None:
+    """While the router is away publisher and service wait; afterwards what was missed is recovered, nothing twice."""
+    endpoint = free_endpoint()
+    router = open_router(endpoint)
+    start(listen=None, connect=[endpoint])
+    with Node(endpoint) as node:
+        node.send(*(SENSOR.detections(seq) for seq in range(5)))
+        node.tracks(SENSOR.stream, 5)
+        router.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
+        node.send(*(SENSOR.detections(seq) for seq in range(5, 10)))
+        with open_router(endpoint):
+            state = KEYS.query(SENSOR.stream, "state")
+            until(lambda: bool(node.query(state, timeout=0.5)), "the service is back")
+            node.send(SENSOR.detections(10))
+
+            def caught_up() -> bool:
+                return node.ask(state, SessionState).frames == 11
+
+            until(caught_up, "all frames are tracked")
+            assert node.ask(state, SessionState).gaps == 0

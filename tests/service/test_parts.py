@@ -6,15 +6,12 @@ import ast
 import re
 import threading
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import optipmb_service
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from router import SECOND, Sensor
-
-import optipmb
-import optipmb_service
-from optipmb_schemas import Problem
 from optipmb_service.clouds import Clouds
 from optipmb_service.inbox import Inbox, Pool
 from optipmb_service.meter import Meter
@@ -22,6 +19,12 @@ from optipmb_service.ports import Packet
 from optipmb_service.problems import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, Desk, problem_of
 from optipmb_service.profiles import Profiles
 from optipmb_service.settings import LimitSettings, Settings, SettingsInvalidError, load
+from router import SECOND, Sensor
+
+import optipmb
+
+if TYPE_CHECKING:
+    from optipmb_schemas import Problem
 
 SOURCES = sorted(Path(optipmb_service.__file__).parent.glob("*.py"))
 SENSOR = Sensor()
@@ -37,7 +40,7 @@ def packet(number: int) -> Packet:
 
 @given(st.lists(st.integers(0, 2), max_size=60), st.integers(1, 5), st.integers(1, 5))
 def test_an_inbox_is_bounded_ordered_and_counts(kinds: list[int], frames: int, clouds: int) -> None:
-    """The newest frames and clouds stay, in order, clouds first; commands are never lost; what is missing is counted."""
+    """The newest frames and clouds stay, in order, clouds first; commands are never lost; the rest is counted."""
     inbox, ran = Inbox(frames, clouds), []
     for number, kind in enumerate(kinds):
         if kind == 0:

@@ -29,28 +29,34 @@ class Failing:
         self._count = count
 
     def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+        """Step, or raise."""
         if len(frame.score) == self._count:
             raise ZeroDivisionError("seven")
         return self._tracker.step(density, frame)
 
 
 def session(**changes: Any) -> Session:
+    """A session of the sensor's stream."""
     return Session(SENSOR.stream, NUSCENES, instance="test", **changes)
 
 
 def tracks(outputs: list[Output]) -> list[Tracks]:
+    """The tracks among outputs."""
     return [output.tracks for output in outputs if isinstance(output, Tracked)]
 
 
 def problems(outputs: list[Output]) -> list[Problem]:
+    """The problems among outputs."""
     return [output for output in outputs if isinstance(output, Problem)]
 
 
 def begun(outputs: list[Output]) -> list[str]:
+    """Why sessions began anew."""
     return [output.reason for output in outputs if isinstance(output, Begun)]
 
 
 def feed(one: Session, seqs: Any, sensor: Sensor = SENSOR, **changes: Any) -> list[Output]:
+    """Give frames to a session at time zero."""
     return [output for seq in seqs for output in one.on_detections(sensor.detections(seq, **changes), 0)]
 
 
@@ -253,6 +259,7 @@ def test_clouds_and_frames_may_come_in_any_order(order: list[int]) -> None:
 
 
 def in_order() -> bytes:
+    """The tracks of eight frames, each after its cloud."""
     one, outputs = session(), []
     for seq in range(8):
         outputs += one.on_points(SENSOR.points(seq), 0)

@@ -1,4 +1,4 @@
-"""What becomes of frames in time: order, duplicates, late ones, gaps, jumps, restarted publishers, waiting for clouds."""
+"""What becomes of frames in time: order, duplicates, late ones, gaps, jumps, restarted publishers, waiting."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ A, B, C = (bytes([letter]) * 16 for letter in b"abc")
 
 
 def mark(seq: int, seconds: float, epoch: bytes = A) -> Mark:
+    """A frame by number and seconds."""
     return Mark(epoch, seq, round(seconds * SECOND))
 
 
@@ -28,6 +29,7 @@ def judge_all(marks: list[Mark]) -> tuple[list[Decision], list[int], Timeline]:
 
 
 def verdicts(marks: list[Mark]) -> list[Verdict]:
+    """The verdicts on frames."""
     return [decision.verdict for decision in judge_all(marks)[0]]
 
 
@@ -167,7 +169,7 @@ def test_a_succeeded_publisher_does_not_come_back() -> None:
 
 
 def test_a_continuing_epoch_does_not_reach_back() -> None:
-    """After a publisher's restart, frames stamped before its predecessor's last are late even while nothing is released."""
+    """After a publisher's restart, frames stamped before its predecessor's last are late, released or not."""
     timeline = Timeline(LIMIT)
     for one in (mark(0, 0), mark(1, 1)):
         _, timeline = timeline.judge(one)

@@ -1,7 +1,7 @@
 """What tuning works on: the detections of one class, ready to be tracked any number of times, and the truth.
 
-Conventions: frames are in the world frame, made once by `optipmb.make_frame`; truth is in the sensor frame of each
-frame, where the benchmarks compare. One `Track` of a trial needs nothing but these and a set of parameters.
+Conventions: frames are in the world frame, made once by `optipmb.make_frame`; so are the tracks. The truth is in the
+sensor frame of each row's frame, where the benchmarks compare.
 """
 
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optipmb import Frame, Modules, OptipmbError, Parameters, PointCloud, Pose, Tracker, make_frame
+from optipmb import Frame, Modules, OptipmbError, Parameters, PointCloud, Pose, Tracker, Tracks, make_frame
 from optipmb_client.camera import Camera
 from optipmb_client.datasets import DataSequence, DatasetError, DetectionFrame, Truth
 from optipmb_client.errors import UsageError
@@ -18,7 +18,7 @@ from optipmb_client.geometry import Floats, Ints, stack_poses, to_sensor
 from optipmb_client.results import ResultTable
 from optipmb_client.results.rows import empty_table
 
-__all__ = ["Clip", "load", "prepare_frames", "track_clip"]
+__all__ = ["Clip", "load", "of_class", "prepare_frames", "track_clip"]
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,11 @@ class Clip:
     """In whose image the benchmark counts; None where it does not."""
     truth: Truth
     """Of these classes and those alike, in the sensor frame of each row's frame."""
-    period_s: float
-    """Median time between frames."""
+
+    @property
+    def stamps(self) -> Ints:
+        """(F,) nanoseconds."""
+        return np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
 
 
 def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
@@ -53,19 +56,16 @@ def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
     truth = sequence.truth()
     if truth is None:
         raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
-    given = list(sequence.frames())
     alike = {name for label in parameters.labels for name in (label, *rules.neighbours.get(label, ()))}
     rotation, translation = stack_poses(sequence.poses)
-    stamps = np.array([frame.stamp_ns for frame in given], dtype=np.int64)
     return Clip(
         name=sequence.name,
         labels=parameters.labels,
-        frames=prepare_frames(sequence.name, given, parameters),
+        frames=prepare_frames(sequence.name, list(sequence.frames()), parameters),
         rotation=rotation,
         translation=translation,
         camera=getattr(sequence, "camera", None),
         truth=truth.to_sensor(sequence.poses).take(np.isin(truth.names, sorted(alike))),
-        period_s=float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else parameters.nominal_period,
     )
 
 
@@ -99,35 +99,73 @@ def prepare_frames(name: str, given: Sequence[DetectionFrame], parameters: Param
     return tuple(frames)
 
 
-def track_clip(clip: Clip, parameters: Parameters, modules: Modules | None = None) -> ResultTable:
-    """Return the tracks of a clip in the sensor frame of each frame, with image boxes where there is a camera."""
-    tracker = Tracker(parameters, modules)
-    density = tracker.initial()
-    found = []
+def rows_of(frame: Frame, rows: Ints) -> Frame:
+    """Return a frame with some of its detections; all keep their place in `source`."""
+    return Frame(
+        stamp_ns=frame.stamp_ns,
+        center=frame.center[rows],
+        size=frame.size[rows],
+        yaw=frame.yaw[rows],
+        velocity=frame.velocity[rows],
+        score=frame.score[rows],
+        label=frame.label[rows],
+        source=frame.source[rows],
+        cloud=frame.cloud,
+    )
+
+
+def of_class(clip: Clip, name: str, rules: Rules) -> Clip:
+    """Return a clip with the detections and the truth of one class only, for parameters with this class only."""
+    index = clip.labels.index(name)
+    frames = []
     for frame in clip.frames:
+        chosen = rows_of(frame, np.flatnonzero(frame.label == index))
+        frames.append(
+            Frame(**{**{key: getattr(chosen, key) for key in _COLUMNS}, "label": np.zeros_like(chosen.label)})
+        )
+    alike = (name, *rules.neighbours.get(name, ()))
+    truth = clip.truth.take(np.isin(clip.truth.names, alike))
+    return Clip(clip.name, (name,), tuple(frames), clip.rotation, clip.translation, clip.camera, truth)
+
+
+_COLUMNS = ("stamp_ns", "center", "size", "yaw", "velocity", "score", "source", "cloud")
+
+
+def track_clip(clip: Clip, parameters: Parameters, modules: Modules | None = None) -> ResultTable:
+    """Return the tracks of a clip in the world frame, with image boxes where there is a camera."""
+    tracker = Tracker(parameters, modules)
+    least = min(one.score_filter for one in parameters.classes.values())
+    density = tracker.initial()
+    found: list[tuple[int, Tracks]] = []
+    for index, frame in enumerate(clip.frames):
+        # Nothing there and nothing new: the step would give the same density with another stamp, which nothing reads.
+        empty = not len(density.bernoulli) and not len(density.poisson)
+        if empty and not (frame.score >= least).any():
+            continue
         result = tracker.step(density, frame)
         density = result.density
-        found.append(result.tracks)
-    count = np.array([len(tracks.id) for tracks in found], dtype=np.int64)
-    if not count.sum():
+        if len(result.tracks.id):
+            found.append((index, result.tracks))
+    if not found:
         return empty_table(parameters.labels)
-    when: Ints = np.repeat(np.arange(len(found)), count)
-    center, yaw = to_sensor(
-        clip.rotation[when],
-        clip.translation[when],
-        np.concatenate([tracks.center for tracks in found]),
-        np.concatenate([tracks.yaw for tracks in found]),
-    )
-    size = np.concatenate([tracks.size for tracks in found])
-    image = clip.camera.boxes(center, size, yaw)[0] if clip.camera else np.full((len(when), 4), np.nan)
+    when: Ints = np.repeat([index for index, _ in found], [len(tracks.id) for _, tracks in found]).astype(np.int64)
+    center, size, yaw = (np.concatenate([getattr(tracks, key) for _, tracks in found]) for key in _BOX)
+    if clip.camera is None:
+        image = np.full((len(when), 4), np.nan)
+    else:
+        local, turned = to_sensor(clip.rotation[when], clip.translation[when], center, yaw)
+        image = clip.camera.boxes(local, size, turned)[0]
     return ResultTable(
         labels=parameters.labels,
         frame=when,
-        id=np.concatenate([tracks.id for tracks in found]),
-        label=np.concatenate([tracks.label for tracks in found]),
+        id=np.concatenate([tracks.id for _, tracks in found]),
+        label=np.concatenate([tracks.label for _, tracks in found]),
         center=center,
         size=size,
         yaw=yaw,
-        score=np.concatenate([tracks.score for tracks in found]),
+        score=np.concatenate([tracks.score for _, tracks in found]),
         box2d=image,
     )
+
+
+_BOX = ("center", "size", "yaw")

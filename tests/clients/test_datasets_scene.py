@@ -1,0 +1,483 @@
+"""Generated scenes: physically sane, calibrated and reproducible."""
+
+import hashlib
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from optipmb_client.datasets import DatasetError, Truth, open_dataset
+from optipmb_client.datasets.scene.dataset import MIN_POINTS, RADIUS, SceneSequence, visits
+from optipmb_client.datasets.scene.detector import CLASSES, FALSE, MIN_SCORE, detection_probability
+from optipmb_client.datasets.scene.lidar import BEAMS, GROUND, NOTHING, cast, scan
+from optipmb_client.datasets.scene.paths import Path, resample, smooth, speed_limit
+from optipmb_client.datasets.scene.roads import MOVEMENTS, conflicts, fixed_boxes, parking_places
+from optipmb_client.evaluation import Rules, evaluate_clear, iou_bev
+from optipmb_client.geometry import points_in_box, rotation_of, to_sensor, wrap_angle
+
+RATE = 10.0
+CAR, PEDESTRIAN, CYCLIST = range(3)
+
+
+def scene(seed: int = 0, frames: int = 150, **options: float) -> SceneSequence:
+    """Give one generated scene."""
+    sequence = open_dataset("scene", seed=seed, frames=frames, **options).sequences(["all"])[0]
+    assert isinstance(sequence, SceneSequence)
+    return sequence
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[SceneSequence]:
+    """Four scenes of half a minute."""
+    return [scene(seed, 300) for seed in range(4)]
+
+
+def digest(sequence: SceneSequence) -> str:
+    """Give a digest of all that a scene offers."""
+    total = hashlib.sha256()
+    for frame in sequence.frames():
+        assert frame.cloud is not None
+        columns = (frame.label, frame.center, frame.size, frame.yaw, frame.score, frame.cloud.xyz, *frame.pose)
+        for column in columns:
+            total.update(np.ascontiguousarray(column).tobytes())
+    truth = sequence.truth()
+    for column in (truth.id, truth.center, truth.yaw, truth.velocity, truth.points, truth.covered):
+        total.update(np.ascontiguousarray(column).tobytes())
+    return total.hexdigest()
+
+
+def test_the_same_seed_gives_the_same_bytes_in_another_process() -> None:
+    """Detections, clouds, poses and truth, whatever was asked first; another seed or scene gives others."""
+    here = scene(5, 12)
+    here.truth()
+    program = "import sys; sys.path[:0] = sys.argv[1:]; from test_datasets_scene import digest, scene; print(digest(scene(5, 12)))"
+    folders = [path for path in sys.path if path.endswith("support")] + [str(__file__).rpartition("/")[0]]
+    there = subprocess.run([sys.executable, "-c", program, *folders], capture_output=True, text=True, check=True)
+    assert digest(here) == digest(here) == there.stdout.strip()
+    assert digest(here) != digest(scene(6, 12))
+    other = open_dataset("scene", seed=5, frames=12).sequences(["0001"])[0]
+    assert isinstance(other, SceneSequence)
+    assert digest(here) != digest(other)
+
+
+def test_clouds_and_velocities_are_options() -> None:
+    """Without them everything else is the same; velocities are near those of the truth."""
+    plain, rich = scene(2, 5), scene(2, 5, clouds=0, velocity=1)
+    assert plain.has_clouds
+    assert not rich.has_clouds
+    for a, b in zip(plain.frames(), rich.frames(), strict=True):
+        assert b.cloud is None
+        assert a.velocity is None
+        assert b.velocity is not None
+        assert b.velocity.shape == (len(b), 2)
+        np.testing.assert_array_equal(a.center, b.center)
+
+
+def test_detected_velocities_are_over_ground_along_the_axes_of_the_sensor() -> None:
+    """Turned by the sensor's pose, detected velocities agree with the true ones, whatever way the sensor drives."""
+    sequence = scene(1, 60, velocity=1)
+    error = []
+    for frame in sequence.frames():
+        _, found = sequence.observe(frame.index)
+        assert frame.velocity is not None
+        real = found.source != FALSE
+        turned = frame.velocity[real] @ rotation_of(frame.pose.quaternion)[:2, :2].T
+        error.append(turned - sequence._world.velocity[frame.index, found.source[real]])
+    assert np.quantile(np.linalg.norm(np.vstack(error), axis=1), 0.5) < 0.6
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("frames", 0, "a number from 1"),
+        ("vehicles", 51, "a number from 0 to 50"),
+        ("rate", 0.1, "a number from 0.5"),
+        ("seed", 0.5, "a number from 0"),
+        ("colour", 1, "an unknown option"),
+    ],
+)
+def test_options_out_of_their_bounds_are_told(option: str, value: float, expected: str) -> None:
+    """The error names the option and its bounds."""
+    with pytest.raises(DatasetError, match=f"option {option}: .*{expected}"):
+        open_dataset("scene", **{option: value})
+
+
+def test_scenes_have_names_of_four_digits() -> None:
+    """Other names, splits of other datasets, and a root are refused."""
+    dataset = open_dataset("scene")
+    assert [sequence.name for sequence in dataset.sequences(["0003", "all", "0003"])] == ["0003", "0000"]
+    for name in ("train", "1", "00000", "no"):
+        with pytest.raises(DatasetError, match="four digits"):
+            dataset.sequences([name])
+    with pytest.raises(DatasetError, match="nothing, for scenes are generated"):
+        open_dataset("scene", "/data")
+
+
+@pytest.mark.parametrize("crowd", [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (50, 100, 30)])
+def test_any_crowd_makes_a_scene(crowd: tuple[int, int, int]) -> None:
+    """An empty town, single road users, and as many as are allowed."""
+    vehicles, pedestrians, cyclists = crowd
+    sequence = scene(0, 3, vehicles=vehicles, pedestrians=pedestrians, cyclists=cyclists)
+    assert len(list(sequence.frames())) == 3
+    truth = sequence.truth()
+    assert len(np.unique(truth.id)) <= sum(crowd)
+    assert np.bincount(sequence._world.label, minlength=3).tolist() == [vehicles, pedestrians, cyclists]
+
+
+def test_one_frame_is_a_scene_too() -> None:
+    """The shortest scene, at the lowest and the highest rate."""
+    for rate in (0.5, 50.0):
+        (frame,) = scene(0, 1, rate=rate).frames()
+        assert frame.stamp_ns == 0
+        assert len(frame) > 0
+
+
+def test_stamps_follow_the_rate() -> None:
+    """At 20 Hz frames are 50 ms apart."""
+    assert [frame.stamp_ns for frame in scene(0, 4, rate=20.0).frames()] == [0, 50_000_000, 100_000_000, 150_000_000]
+
+
+def test_speeds_and_accelerations_are_those_of_road_users(scenes: list[SceneSequence]) -> None:
+    """No class is faster or accelerates harder than its kind, and positions change as velocities say."""
+    bounds = {CAR: (12.0, 6.5, 1.2), PEDESTRIAN: (2.2, 3.0, 2.5), CYCLIST: (7.0, 5.0, 1.2)}
+    for sequence in scenes:
+        world = sequence._world
+        acceleration = np.linalg.norm(np.diff(world.velocity, axis=0), axis=2) * RATE
+        turn = np.abs(wrap_angle(np.diff(world.yaw, axis=0))) * RATE
+        moved = np.diff(world.center[..., :2], axis=0) * RATE
+        mean = 0.5 * (world.velocity[1:] + world.velocity[:-1])
+        drift = np.linalg.norm(moved - mean, axis=2)
+        for label, (speed, push, rate) in bounds.items():
+            who = world.label == label
+            assert np.linalg.norm(world.velocity[:, who], axis=2).max() < speed
+            assert acceleration[:, who].max() < push
+            assert turn[:, who].max() < rate
+            assert drift[:, who].max() < 0.5
+
+
+def test_everything_happens_that_makes_tracking_hard(scenes: list[SceneSequence]) -> None:
+    """Cars stop and start again, turn, reverse and park; pedestrians stand, cross roads and turn round."""
+    reversing = stopping = turning = standing = crossing = 0
+    for sequence in scenes:
+        world = sequence._world
+        speed = np.linalg.norm(world.velocity, axis=2)
+        heading = np.stack([np.cos(world.yaw), np.sin(world.yaw)], axis=2)
+        along = (world.velocity * heading).sum(axis=2)
+        cars, people = world.label == CAR, world.label == PEDESTRIAN
+        reversing += int((along[:, cars] < -0.5).any(axis=0).sum())
+        still = speed < 0.05
+        restarted = still[:-10] & (speed[10:] > 0.5)
+        stopping += int((restarted[:, cars] & (speed[:-10, cars].max(axis=0) > 5.0)).any(axis=0).sum())
+        turned = np.abs(np.unwrap(world.yaw, axis=0) - world.yaw[0])
+        turning += int((turned[:, cars].max(axis=0) > 1.2).sum())
+        standing += int((still[:, people].any(axis=0) & (speed[:, people].max(axis=0) > 0.8)).sum())
+        place = np.abs(world.center[:, people, :2])
+        crossing += int(((place < 3.0).any(axis=2) & (place.max(axis=2) < 12.0)).any(axis=0).sum())
+    assert reversing >= 8
+    assert stopping >= 10
+    assert turning >= 10
+    assert standing >= 10
+    assert crossing >= 10
+
+
+def test_vehicles_do_not_drive_through_each_other(scenes: list[SceneSequence]) -> None:
+    """No two vehicles or cyclists ever overlap, the carrier of the sensor included, nor does one hit a building or pole."""
+    place, extent = fixed_boxes()
+    for sequence in scenes:
+        world = sequence._world
+        wheels = np.flatnonzero(world.label != PEDESTRIAN)
+        carrier = world.carrier
+        for frame in range(0, len(sequence), 3):
+            center = np.vstack([world.center[frame, wheels], [[*carrier[frame, :2], 0.7]], place])
+            size = np.vstack([world.size[wheels], [[4.0, 1.8, 1.5]], extent])
+            yaw = np.concatenate([world.yaw[frame, wheels], carrier[frame, 2:], np.zeros(len(place))])
+            first, second = np.triu_indices(len(wheels) + 1, 1)
+            pole_first, pole = np.divmod(np.arange((len(wheels) + 1) * len(place)), len(place))
+            first = np.concatenate([first, pole_first])
+            second = np.concatenate([second, pole + len(wheels) + 1])
+            overlap = iou_bev((center[first], size[first], yaw[first]), (center[second], size[second], yaw[second]))
+            assert overlap.max(initial=0.0) < 0.02, (sequence._options.seed, frame, first[overlap.argmax()])
+
+
+def test_vehicles_do_not_run_over_pedestrians(scenes: list[SceneSequence]) -> None:
+    """No moving vehicle ever stands over the middle of a pedestrian."""
+    for sequence in scenes:
+        world = sequence._world
+        people = world.center[:, world.label == PEDESTRIAN]
+        for car in np.flatnonzero(world.label != PEDESTRIAN):
+            for frame in range(0, len(sequence), 5):
+                center, yaw = world.center[frame, car], float(world.yaw[frame, car])
+                assert not points_in_box(people[frame], center, world.size[car] + [0, 0, 2.0], yaw).any()
+
+
+def test_returned_points_lie_on_boxes_or_on_the_ground() -> None:
+    """Each point is within 15 cm of the surface of its box, or of the ground, whoever else stands near."""
+    sequence = scene(3, 40)
+    place, extent = fixed_boxes()
+    for frame in (0, 20, 39):
+        view, _ = sequence.observe(frame)
+        world = sequence._world
+        center, yaw = sequence._local(
+            frame, np.vstack([world.center[frame], place]), np.concatenate([world.yaw[frame], np.zeros(len(place))])
+        )
+        size = np.vstack([world.size, extent])
+        xyz = view.xyz.astype(np.float64)
+        assert np.abs(xyz[view.owner == GROUND, 2] + 1.75).max() < 0.15
+        for box in np.unique(view.owner[view.owner >= 0]):
+            points = xyz[view.owner == box]
+            assert points_in_box(points, center[box], size[box], float(yaw[box]), margin=0.15).all()
+            assert not points_in_box(points, center[box], size[box], float(yaw[box]), margin=-0.15).any()
+            assert view.points[box] == len(points)
+
+
+def test_the_cloud_has_the_pose_of_the_sensor() -> None:
+    """In the world frame the ground is at height 0."""
+    frame = next(scene(0, 1).frames())
+    assert frame.cloud is not None
+    world = frame.cloud.xyz @ rotation_of(frame.cloud.quaternion).T + frame.cloud.translation
+    assert abs(np.median(world[:, 2])) < 0.02
+    assert world[:, 2].min() > -0.2
+
+
+def box_at(x: float, y: float, length: float = 2.0, width: float = 2.0, height: float = 3.0) -> list[np.ndarray]:
+    """Give one box on the ground, 1.75 m below the sensor, as rows."""
+    return [np.array([[x, y, 0.5 * height - 1.75]]), np.array([[length, width, height]]), np.zeros(1)]
+
+
+def test_a_box_is_hit_where_its_near_side_is() -> None:
+    """A wall 10 m ahead returns every ray at 10 m / cos(azimuth), and hides nothing beside it."""
+    distance, owner, covered = cast(*box_at(11.0, 0.0), 1.75)
+    rows, columns = np.nonzero(owner == 0)
+    azimuth = columns * (2 * np.pi / owner.shape[1]) - np.pi
+    np.testing.assert_allclose(distance[rows, columns] * np.cos(azimuth), 10.0, rtol=1e-9)
+    assert np.abs(azimuth).max() <= np.arctan2(1.0, 10.0) + 1e-9
+    assert covered.tolist() == [0.0]
+    free = np.setdiff1d(np.arange(owner.shape[1]), columns)
+    assert ((owner[:, free] == GROUND) | (owner[:, free] == NOTHING)).all()
+    assert (BEAMS[rows].max() > 0) and (BEAMS[rows].min() < -0.1)
+
+
+def test_what_stands_before_a_box_covers_it() -> None:
+    """Wholly behind a wider wall a box has no points and is covered; half behind, half; without rays, unknown."""
+    both = [
+        np.concatenate(column)
+        for column in zip(box_at(10.0, 0.0, width=6.0, height=6.0), box_at(20.0, 0.0), strict=True)
+    ]
+    distance, owner, covered = cast(*both, 1.75)
+    assert (owner != 1).all()
+    assert covered.tolist() == [0.0, 1.0]
+    both = [np.concatenate(c) for c in zip(box_at(10.0, 3.0, 0.2, 6.0, 6.0), box_at(20.0, 0.0, 0.2, 4.0), strict=True)]
+    _, _, covered = cast(*both, 1.75)
+    assert covered[1] == pytest.approx(0.5, abs=0.06)
+    assert np.isnan(cast(*box_at(200.0, 0.0), 1.75)[2][0])
+
+
+def test_a_box_behind_the_seam_of_the_scan_is_hit_on_both_sides() -> None:
+    """Straight behind the sensor, where azimuths jump from pi to -pi, rays of both signs return."""
+    _, owner, _ = cast(*box_at(-10.0, 0.0), 1.75)
+    columns = np.unique(np.nonzero(owner == 0)[1])
+    assert columns.min() == 0
+    assert columns.max() == owner.shape[1] - 1
+
+
+def test_without_boxes_the_scan_is_ground() -> None:
+    """An empty place returns the ground and nothing else."""
+    nothing = (np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    view = scan(*nothing, 1.75, np.random.default_rng(0))
+    assert (view.owner == GROUND).all()
+    assert len(view.xyz) > 5000
+
+
+def test_hidden_objects_have_few_points(scenes: list[SceneSequence]) -> None:
+    """Covered ones return less than open ones at the same distance, wholly covered ones nothing, and those are ignored."""
+    for sequence in scenes[:2]:
+        truth = sequence.truth()
+        pose_xy = sequence._world.carrier[truth.frame, :2]
+        near = np.linalg.norm(truth.center[:, :2] - pose_xy, axis=1) < 40.0
+        assert (truth.points[truth.covered == 1.0] == 0).all()
+        hidden, clear = truth.covered > 0.8, truth.covered < 0.1
+        assert np.median(truth.points[near & hidden]) < 0.2 * np.median(truth.points[near & clear])
+        np.testing.assert_array_equal(truth.ignored, truth.points < MIN_POINTS)
+        assert (truth.occlusion[clear] == 0).all()
+        assert (truth.occlusion[hidden] == 2).all()
+
+
+def test_truth_holds_what_is_in_range(scenes: list[SceneSequence]) -> None:
+    """All within 60 m of the sensor, ids without gaps of more than a second, one box per id and frame."""
+    for sequence in scenes:
+        truth = sequence.truth()
+        reach = np.linalg.norm(truth.center[:, :2] - sequence._world.carrier[truth.frame, :2], axis=1)
+        assert reach.max() <= RADIUS
+        assert len(np.unique(truth.frame * 100_000 + truth.id)) == len(truth)
+        assert (np.diff(truth.frame) >= 0).all()
+        for identity in np.unique(truth.id):
+            assert np.diff(truth.frame[truth.id == identity]).max(initial=0) <= RATE + 1
+
+
+def test_a_stay_goes_on_over_a_short_break_only() -> None:
+    """With breaks of up to two frames allowed, a break of three begins a new stay; ids are in the order of time."""
+    inside = np.array([[1, 0], [1, 1], [0, 1], [0, 1], [1, 0], [1, 0], [0, 0], [1, 1]], dtype=np.bool_)
+    expected = [[0, -1], [0, 1], [-1, 1], [-1, 1], [0, -1], [0, -1], [-1, -1], [0, 2]]
+    assert visits(inside, 2).tolist() == expected
+
+
+def found_in(scenes: list[SceneSequence]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Give the points of all objects and whether each was found, and scores and truth of all detections."""
+    points, hits, scores, real = [], [], [], []
+    for sequence in scenes:
+        for frame in range(len(sequence)):
+            view, found = sequence.observe(frame)
+            rows = sequence._in_range(frame)
+            points.append(view.points[rows])
+            hits.append(np.isin(rows, found.source))
+            scores.append(found.score)
+            real.append(found.source != FALSE)
+    return tuple(np.concatenate(part) for part in (points, hits, scores, real))  # type: ignore[return-value]  # four parts
+
+
+def test_detection_and_scores_mean_something(scenes: list[SceneSequence]) -> None:
+    """More points are found more often, no points never; the share of true ones grows with the score and is the score."""
+    points, hits, scores, real = found_in(scenes)
+    edges = [1, 3, 8, 20, 60, 200, 100_000]
+    rates = [hits[(points >= a) & (points < b)].mean() for a, b in zip(edges, edges[1:], strict=False)]
+    assert not hits[points == 0].any()
+    assert (np.diff(rates) > 0).all(), rates
+    assert rates[0] < 0.6
+    assert rates[-1] > 0.95
+    bins = np.linspace(MIN_SCORE, 1.0, 7)
+    which = np.digitize(scores, bins[1:-1])
+    shares = np.array([real[which == k].mean() for k in range(6)])
+    means = np.array([scores[which == k].mean() for k in range(6)])
+    assert (np.diff(shares) > 0).all(), shares
+    np.testing.assert_allclose(shares, means, atol=0.06)
+    assert 0.02 < (~real).mean() < 0.4
+
+
+def test_the_chance_to_be_found_grows_with_points_and_ease() -> None:
+    """It is monotone in both and zero without points."""
+    points = np.arange(0, 1000)
+    chance = detection_probability(points, np.zeros(1000))
+    assert chance[0] == 0.0
+    assert (np.diff(chance) > 0).all()
+    assert chance[-1] < 1.0
+    assert detection_probability(np.array([5]), np.array([1.0])) > detection_probability(
+        np.array([5]), np.array([-1.0])
+    )
+
+
+def test_errors_of_detections_are_those_of_a_detector(scenes: list[SceneSequence]) -> None:
+    """Centimetres with many points, decimetres with few; headings are right but for a few that are turned round."""
+    errors, flips, many = [], [], []
+    for sequence in scenes:
+        world = sequence._world
+        for frame in range(0, len(sequence), 3):
+            view, found = sequence.observe(frame)
+            rows = np.flatnonzero((found.source != FALSE) & (found.label == CAR))
+            source = found.source[rows]
+            center, yaw = sequence._local(frame, world.center[frame, source], world.yaw[frame, source])
+            errors.append(np.linalg.norm(found.center[rows, :2] - center[:, :2], axis=1))
+            flips.append(np.abs(wrap_angle(found.yaw[rows] - yaw)) > 0.5 * np.pi)
+            many.append(view.points[source] > 100)
+    error, flip, rich = np.concatenate(errors), np.concatenate(flips), np.concatenate(many)
+    assert 0.03 < np.median(error[rich]) < 0.2
+    assert 1.5 * np.median(error[rich]) < np.median(error[~rich]) < 0.7
+    assert 0.0 < flip.mean() < 0.04
+
+
+def test_detections_are_where_the_truth_is(scenes: list[SceneSequence]) -> None:
+    """Taken as tracks with the ids of their sources, confident detections have a high precision and recall."""
+    sequence = scenes[0]
+    truth = sequence.truth()
+    local: Truth = truth.to_sensor(sequence.poses)
+    _, found = sequence.observe(100)
+    now = local.take(local.frame == 100)
+    near = np.linalg.norm(found.center[:, None, :2] - now.center[None, :, :2], axis=2) < 2.0
+    sure = found.score > 0.7
+    assert near[sure].any(axis=1).mean() > 0.8
+    assert near[:, ~now.ignored].any(axis=0).mean() > 0.8
+    result = evaluate_clear(truth, _table(truth), "Car", Rules(measure="distance", limit=2.0))
+    assert result.mota > 0.99
+
+
+def _table(truth: Truth):  # noqa: ANN202 - a table of results, imported where it is made
+    from optipmb_client.results import ResultTable  # noqa: PLC0415 - used here only
+
+    rows = truth.take(~truth.ignored)
+    columns = (rows.frame, rows.id, rows.label, rows.center, rows.size, rows.yaw)
+    return ResultTable(rows.labels, *columns, np.ones(len(rows)), rows.box2d)
+
+
+def test_truth_and_poses_agree(scenes: list[SceneSequence]) -> None:
+    """The sensor's own way of carrying boxes is that of its published poses."""
+    sequence = scenes[1]
+    world = sequence._world
+    for frame in (0, 150, 299):
+        pose = sequence.poses[frame]
+        ours = sequence._local(frame, world.center[frame], world.yaw[frame])
+        theirs = to_sensor(rotation_of(pose.quaternion), pose.translation, world.center[frame], world.yaw[frame])
+        np.testing.assert_allclose(ours[0], theirs[0], atol=1e-9)
+        assert np.abs(wrap_angle(ours[1] - theirs[1])).max() < 1e-9
+
+
+def test_a_frame_takes_less_than_40_ms() -> None:
+    """Scan and detections of a frame of the usual scene, the fastest of three rounds of twenty frames."""
+    sequence = scene(0, 20)
+    list(sequence.frames())
+    rounds = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        list(sequence.frames())
+        rounds.append((time.perf_counter() - begin) / 20)
+    assert min(rounds) < 0.04
+
+
+def test_only_ways_that_meet_conflict() -> None:
+    """Opposite ways straight on do not conflict, crossing ones do, and right turns into free lanes do not."""
+    table = conflicts()
+    index = {(m.kind, m.start, m.stop): i for i, m in enumerate(MOVEMENTS)}
+    assert table[index["car", 0, 2], index["car", 2, 0]] == -np.inf
+    assert table[index["car", 0, 2], index["car", 1, 3]] > 0.0
+    assert table[index["car", 0, 1], index["car", 2, 3]] == -np.inf
+    assert table[index["car", 0, 2], index["cycle", 0, 2]] == -np.inf
+    assert table[index["car", 0, 1], index["cycle", 0, 2]] > 0.0
+    np.testing.assert_array_equal(table > -np.inf, table.T > -np.inf)
+
+
+def test_parking_places_do_not_overlap() -> None:
+    """Cars on any two places keep clear of each other."""
+    places, headings = parking_places()
+    center = np.column_stack([places, np.zeros(len(places))])
+    first, second = np.triu_indices(len(places), 1)
+    size = np.tile([4.9, 2.1, 1.5], (len(first), 1))
+    assert iou_bev((center[first], size, headings[first]), (center[second], size, headings[second])).max() == 0.0
+
+
+def test_paths_are_walked_by_arc_length() -> None:
+    """Points a metre apart along the path are a metre apart on a line, and a smoothed corner is cut, not lengthened."""
+    path, arc = resample(np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]))
+    np.testing.assert_allclose(arc, [0.0, 10.0, 20.0])
+    np.testing.assert_allclose(path.at(np.array([0.0, 3.1, 12.0])), [[0, 0], [3.1, 0], [10, 2]], atol=1e-12)
+    bent, places = smooth(path, 4.0)
+    assert bent.length < path.length
+    assert (np.diff(places) > 0).all()
+    steps = np.linalg.norm(np.diff(bent.points, axis=0), axis=1)
+    np.testing.assert_allclose(steps, 0.25, atol=0.02)
+
+
+def test_speed_limits_are_reached_by_braking() -> None:
+    """Before a bend of 5 m radius the limit falls no faster than braking at 2 m/s2 allows, and in it it is sqrt(2 * 5)."""
+    angle = np.linspace(0, 0.5 * np.pi, 200)
+    bend = np.column_stack([50 + 5 * np.sin(angle), 5 - 5 * np.cos(angle)])
+    path, _ = resample(np.vstack([[0.0, 0.0], bend, [55.0, 40.0]]))
+    limit = speed_limit(Path(path.points), 20.0, 2.0, 2.0)
+    middle = int(53.9 / 0.25)
+    assert limit[middle] == pytest.approx(np.sqrt(10.0), rel=0.05)
+    assert limit[0] == pytest.approx(np.sqrt(10.0 + 2 * 2.0 * 50.0), rel=0.05)
+    assert (np.diff(limit**2) >= -2 * 2.0 * 0.25 - 1e-9).all()
+
+
+def test_the_classes_are_those_of_the_profile() -> None:
+    """Scenes use the kitti profile, whose classes are these."""
+    assert open_dataset("scene").profile == "kitti"
+    assert set(CLASSES) == {"Car", "Pedestrian", "Cyclist"}
