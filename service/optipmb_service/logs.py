@@ -4,12 +4,37 @@ from __future__ import annotations
 
 import logging
 import sys
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import structlog
 
 if TYPE_CHECKING:
     from structlog.typing import Processor
+
+EVENTS: Final = {
+    "starting": "The service compiles or loads its kernels; the first start after an installation takes a minute.",
+    "connecting": "As a client it waits for a router; nothing else happens until one answers. Check `connect`.",
+    "ready": "Streams and queries are served. stdout has the ready line.",
+    "unknown_environment": "Variables that start with `OPTIPMB_` and are no setting: usually a typing error.",
+    "peer_connected": "A node, router or service is linked to this process.",
+    "peer_lost": "That link is gone. A client links again by itself and recovers what the caches still hold.",
+    "session_opened": "A stream sent its first valid message, or parameters were set for it.",
+    "session_begun": "A density began: `first` frame, `publisher` restarted with a jump, a `jump` of stamps, `reset`, "
+    "`parameters`. Repeated jumps: check the sensor's clock.",
+    "session_closed": "A session was freed: `idle` for long, or by a `query`.",
+    "stream_stale": "No frame for `stale_s`: check the publisher.",
+    "stream_back": "Frames came again.",
+    "problem": "Something was refused or lost; `count` equal ones since the last line. See the problems below.",
+    "claim_failed": "The tracks of a stream cannot be published; the network is closing.",
+    "publish_failed": "Tracks could not be handed to Zenoh; the network is closing.",
+    "reply_failed": "Who asked was gone before the answer.",
+    "query": "A query was answered (level debug).",
+    "internal_error": "A fault of the service, with its traceback: report it. The stream goes on.",
+    "stop_asked": "SIGINT or SIGTERM came; the service ends within two seconds.",
+    "stop_asked_again": "Another signal came; it changes nothing.",
+    "stopped": "The end. `drained` is false when a step was abandoned because it took too long.",
+}
+"""Every event that is logged, and what an operator makes of it."""
 
 
 def configure(form: Literal["console", "json"], level: str) -> None:

@@ -18,6 +18,25 @@ import optipmb_schemas as schemas
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+CODES: Final = {
+    "malformed": ("The bytes are no message.", "Check the publisher's encoder; compare with the JSON Schemas."),
+    "wrong_type": ("Another message type than belongs on the key.", "Check the key and the encoding of the publisher."),
+    "unsupported_version": ("A major version that this service does not know.", "Update the service or the publisher."),
+    "too_large": ("A size, count or nesting above the limit.", "Send less, or raise `limits`."),
+    "missing_field": ("A required field is absent.", "Send the field that `path` names."),
+    "invalid_value": ("A field has a wrong value; the whole frame is refused.", "Look at `path`: NaN, sizes, scores?"),
+    "unknown_class": (
+        "Objects of a class that the profile lacks are left out; told once per session.",
+        "Choose another profile, or send the names of its classes.",
+    ),
+    "late": ("A later frame was tracked already.", "Publish in order; give frames one publisher."),
+    "duplicate_epoch": ("A publisher that another one has replaced still sends.", "Stop one of the two publishers."),
+    "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or give more processors."),
+    "refused": ("No room for another session, or a change that needs a restart.", "Raise `max_sessions`; see `path`."),
+    "internal": ("A fault of the service; the frame is skipped.", "Report it with the frame's `seq` and the log."),
+}
+"""Every code of a problem: what it means, and what to do."""
+
 MAX_TEXT: Final = 500
 """Characters of a text in a problem."""
 

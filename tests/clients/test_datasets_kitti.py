@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from optipmb_client.camera import SENSOR_FROM_CAMERA, sensor_from_kitti
+from optipmb_client.camera import SENSOR_FROM_CAMERA, alpha_of, sensor_from_kitti
 from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.datasets.kitti import SPLITS, KittiDataset, KittiSequence, read_scan
 from optipmb_client.datasets.kitti_files import (
@@ -246,6 +246,9 @@ def test_clouds_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
     assert cloud is not None
     with pytest.raises(DatasetError, match=r"000001.bin"):
         _ = cloud.xyz
+    # The written calibration has the velodyne 27 cm behind and 8 cm above the camera, looking the same way.
+    np.testing.assert_allclose(cloud.pose.translation, frames[1].pose.translation + [-0.27, 0.0, 0.08], atol=1e-12)
+    np.testing.assert_allclose(rotation_of(cloud.quaternion), np.eye(3), atol=1e-12)
     without = open_dataset("kitti", tmp_path, clouds=0).sequences(["all"])[0]
     assert not without.has_clouds
 
@@ -309,8 +312,7 @@ def test_the_alpha_of_real_labels_is_the_heading_seen_from_the_camera(real: Kitt
     (sequence,) = real.sequences(["0011"])
     file = read_labels(kitti_root() / "training/label_02/0011.txt", len(sequence))
     rows = np.array([name != "DontCare" for name in file.type])
-    seen = file.rotation_y - np.arctan2(file.bottom[:, 0], file.bottom[:, 2])
-    error = abs(wrap_angle(seen - file.alpha))[rows]
+    error = abs(wrap_angle(alpha_of(file.bottom, file.rotation_y) - file.alpha))[rows]
     assert np.median(error) < 0.01
     assert np.quantile(error, 0.99) < 0.1
 

@@ -97,12 +97,14 @@ class Collected:
     """What came in so far, and a way to wait for more."""
 
     items: list[tuple[str, bytes, str]] = field(default_factory=list)
+    times_ns: list[int] = field(default_factory=list)
     changed: threading.Condition = field(default_factory=threading.Condition)
 
     def add(self, key: str, payload: bytes, encoding: str) -> None:
         """Append one message and wake who waits."""
         with self.changed:
             self.items.append((key, payload, encoding))
+            self.times_ns.append(time.monotonic_ns())
             self.changed.notify_all()
 
     def wait(self, enough: Callable[[list[tuple[str, bytes, str]]], bool], what: str) -> None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 TABLES: list[type[BaseModel]] = [optipmb.Parameters, ClassParameters, ProcessNoise, MeasurementNoise, BirthSpread]
 PAPER: dict[str, dict[str, list[float]]] = {  # the paper's table of parameters, per column
-    "nuscenes": {
+    "nuscenes-paper": {
         "score_filter": [0.15, 0, 0.1, 0.16, 0.2, 0.1, 0], "nms_iou": [0.1] * 7, "survival": [0.99] * 7,
         "gate": [3, 10, 10, 4, 3, 10, 10], "detection": [0.8, 0.9, 0.9, 0.8, 0.8, 0.9, 0.9],
         "expected_points": [10] * 7, "detection_floor": [0.5] * 7,
@@ -28,7 +28,7 @@ PAPER: dict[str, dict[str, list[float]]] = {  # the paper's table of parameters,
         "poisson_steps": [3, 3, 3, 2, 2, 2, 2], "extract_new": [0.7, 0.7, 0.7, 0.7, 0.7, 0.7, 0.5],
         "extract_known": [0.95, 0.7, 0.8, 0.95, 0.8, 0.8, 0.9], "extract_misses": [3, 2, 2, 2, 2, 2, 2],
     },
-    "kitti": {
+    "kitti-paper": {
         "score_filter": [0.3], "nms_iou": [0.1], "survival": [1], "gate": [4], "detection": [0.9],
         "expected_points": [10], "detection_floor": [0.7], "birth_score": [0.65], "adaptive_birth_rate": [0.2],
         "undetected_birth_rate": [0.5], "clutter_rate": [10], "poisson_steps": [1], "extract_new": [0.85],
@@ -36,8 +36,8 @@ PAPER: dict[str, dict[str, list[float]]] = {  # the paper's table of parameters,
     },
 }  # fmt: skip
 CLASSES = {
-    "nuscenes": ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck"),
-    "kitti": ("Car", "Pedestrian", "Cyclist"),
+    "nuscenes-paper": ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck"),
+    "kitti-paper": ("Car", "Pedestrian", "Cyclist"),
 }
 
 
@@ -76,7 +76,7 @@ def toml(document: dict[str, Any]) -> str:
 
 def test_the_profiles_that_ship_are_listed_and_load() -> None:
     """Every listed profile loads under its name, with its origin."""
-    assert set(optipmb.profiles()) >= {"kitti", "nuscenes"}
+    assert set(optipmb.profiles()) == {"kitti", "kitti-paper", "nuscenes", "nuscenes-paper", "scene"}
     for name in optipmb.profiles():
         parameters = optipmb.load_profile(name)
         assert parameters.name == name
@@ -91,7 +91,15 @@ def test_the_profiles_hold_the_papers_table(profile: str) -> None:
     for field, values in PAPER[profile].items():
         for label, value in zip(parameters.labels, values, strict=False):
             assert getattr(parameters.classes[label], field) == value, f"{profile} {label} {field}"
-    assert parameters.nominal_period == {"kitti": 0.1, "nuscenes": 0.5}[profile]
+    assert parameters.nominal_period == {"kitti-paper": 0.1, "nuscenes-paper": 0.5}[profile]
+
+
+@pytest.mark.parametrize("profile", PAPER)
+def test_the_tuned_profiles_track_the_same_classes(profile: str) -> None:
+    """A tuned profile stands in for the paper's: the same classes in the same order, the same period."""
+    paper, tuned = optipmb.load_profile(profile), optipmb.load_profile(profile.removesuffix("-paper"))
+    assert tuned.labels == paper.labels
+    assert tuned.nominal_period == paper.nominal_period
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.__name__)

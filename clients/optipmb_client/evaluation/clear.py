@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from optipmb_client.datasets import Truth
+from optipmb_client.evaluation.assignment import by_frame, most_pairs, uncontested
 from optipmb_client.evaluation.cases import Case, Rules, prepare
 from optipmb_client.geometry import Bools, Ints
 from optipmb_client.results import ResultTable
@@ -215,45 +215,52 @@ def match_frames(case: Case, rules: Rules) -> tuple[Ints, np.ndarray]:
     """Return the track row (T,) that each truth row matches, -1 for none, and the measure (T,) of the match.
 
     In each frame the matches of most pairs with the least total cost are taken; with continuity, pairs that matched
-    before and still may are taken first.
+    before and still may are taken first. Of several objects that were with one track, the one that was last keeps it.
     """
     match = np.full(len(case.truth_frame), -1, dtype=np.int64)
     similarity = np.full(len(case.truth_frame), np.nan)
-    last: dict[int, int] = {}
-    order = np.argsort(case.truth_row, kind="stable")
-    frames = case.truth_frame[case.truth_row[order]]
-    bounds = np.flatnonzero(np.diff(frames, prepend=-1))
-    for pairs in np.split(order, bounds[1:]) if len(order) else []:
+    alone = uncontested(case.truth_row, case.track_row)
+    match[case.truth_row[alone]] = case.track_row[alone]
+    similarity[case.truth_row[alone]] = case.similarity[alone]
+    contested = np.flatnonzero(~alone)
+    earlier = _earlier_rows(case) if rules.continuity and len(contested) else np.empty(0, dtype=np.int64)
+    for pairs in by_frame(case.truth_frame[case.truth_row], contested):
         truth, track = case.truth_row[pairs], case.track_row[pairs]
-        chosen = np.zeros(len(pairs), dtype=np.bool_)
-        if rules.continuity:
-            chosen = np.array(
-                [
-                    last.get(t) == k
-                    for t, k in zip(case.truth_id[truth].tolist(), case.track_id[track].tolist(), strict=True)
-                ]
-            )
+        chosen = _kept(case, pairs, match, earlier) if rules.continuity else np.zeros(len(pairs), dtype=np.bool_)
         free = ~np.isin(truth, truth[chosen]) & ~np.isin(track, track[chosen])
-        chosen[np.flatnonzero(free)[_assign(truth[free], track[free], case.cost[pairs][free])]] = True
+        if free.any():
+            chosen[np.flatnonzero(free)[most_pairs(truth[free], track[free], case.cost[pairs][free])]] = True
         match[truth[chosen]] = track[chosen]
         similarity[truth[chosen]] = case.similarity[pairs][chosen]
-        last.update(zip(case.truth_id[truth[chosen]].tolist(), case.track_id[track[chosen]].tolist(), strict=True))
     return match, similarity
 
 
-def _assign(rows: Ints, columns: Ints, cost: np.ndarray) -> Ints:
-    """Return which pairs (row, column) to take so that most are taken, and of those ways the one of least cost."""
-    if not len(rows):
-        return np.empty(0, dtype=np.int64)
-    row_names, row = np.unique(rows, return_inverse=True)
-    column_names, column = np.unique(columns, return_inverse=True)
-    # A pair that may not match costs more than all others together, so it is taken only where nothing else is left.
-    table = np.full((len(row_names), len(column_names)), 1e6)
-    table[row, column] = cost
-    index = np.full(table.shape, -1, dtype=np.int64)
-    index[row, column] = np.arange(len(rows))
-    taken = index[linear_sum_assignment(table)]
-    return np.asarray(taken[taken >= 0], dtype=np.int64)
+def _kept(case: Case, pairs: Ints, match: Ints, earlier: Ints) -> Bools:
+    """Return which pairs of one frame are of an object and the track that it matched last."""
+    kept = np.zeros(len(pairs), dtype=np.bool_)
+    since: dict[int, tuple[int, int]] = {}
+    for place, (truth, track) in enumerate(
+        zip(case.truth_row[pairs].tolist(), case.track_row[pairs].tolist(), strict=True)
+    ):
+        row = int(earlier[truth])
+        while row >= 0 and match[row] < 0:
+            row = int(earlier[row])
+        if row >= 0 and case.track_id[match[row]] == case.track_id[track]:
+            frame = int(case.truth_frame[row])
+            rival = since.get(track)
+            if rival is None or frame > rival[0]:
+                since[track] = frame, place
+    kept[[place for _, place in since.values()]] = True
+    return kept
+
+
+def _earlier_rows(case: Case) -> Ints:
+    """Return for each truth row (T,) the row of the same object before it, -1 for the first."""
+    order = np.lexsort((case.truth_frame, case.truth_id))
+    earlier = np.full(len(order), -1, dtype=np.int64)
+    same = case.truth_id[order[1:]] == case.truth_id[order[:-1]]
+    earlier[order[1:][same]] = order[:-1][same]
+    return earlier
 
 
 def _switches(case: Case, rows: Ints, match: Ints, rules: Rules) -> list[Switch]:

@@ -161,14 +161,16 @@ def manoeuvre(lot: int) -> tuple[tuple[Floats, bool], ...]:
     turn = 1.0 if lot == 0 else -1.0
     x, aisle = 18.0 + 2.8 * 2.5, 22.0
     bend = _arc(np.array([x + 5.0, aisle + 5.0]), np.array([x, aisle + 5.0]), 0.5 * np.pi)
+    # It changes from forward to backwards where both of its axles have left the bend, lest its heading jump there.
+    past = bend[-1] + np.array([2.0, 0.0])
     out_of_place = np.vstack([[x, aisle + 6.5], bend])
     east = np.array([x + 11.0, aisle])
     west = np.array([x - 4.0, aisle])
     legs = (
         (np.vstack([out_of_place, east]), False),
         (np.vstack([west, east]), True),
-        (np.vstack([west, bend[-1]]), False),
-        (out_of_place, True),
+        (np.vstack([west, past]), False),
+        (np.vstack([out_of_place, past]), True),
     )
     return tuple((turn * points, backwards) for points, backwards in legs)
 

@@ -1,0 +1,314 @@
+"""What training data say about a class, without tracking anything: noise, motion, births, detections and false ones.
+
+Each figure comes from one place: R from detections minus labels, Q from the labels' trajectories, P^0 from the first
+detection of each object, p_d0 and mu_c / A from what is found and what is false. Standard deviations are winsorised
+(`robust.spread`). Estimates are where a search begins, not where it must end: a detector's errors last over frames,
+labels have errors of their own, and a motion model has to cover what it leaves out.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from optipmb import Parameters
+from optipmb_client.evaluation import Rules
+from optipmb_client.geometry import Floats, wrap_angle
+from optipmb_client.tuning.material import Clip
+from optipmb_client.tuning.pairing import (
+    Pairs,
+    Residuals,
+    Trajectory,
+    detected_frames,
+    pair_detections,
+    residuals,
+    trajectories,
+)
+from optipmb_client.tuning.robust import fit_motion, spread, usual
+from optipmb_client.tuning.values import Value, rounded, value_of
+
+__all__ = ["Estimate", "ScoreBin", "estimate"]
+
+WINDOW_S = 1.0
+"""Pieces of trajectories in which motion is fitted; at low frame rates four frames."""
+PAIR_LIMIT = 2.0
+"""Largest distance between a detection and its label, m; the gate where that is less."""
+RELIABLE_FLIPS = 0.002
+"""Headings count as reliable when fewer detections than this are turned round."""
+MOVING = 0.5
+"""Speed from which an object moves, m/s."""
+LEAST_PAIRS = 20
+"""With fewer detections on labels there is nothing to estimate from."""
+_BINS = 10
+_GAP_QUANTILE = 0.98
+_SMALL = 1e-2
+
+
+@dataclass(frozen=True)
+class ScoreBin:
+    """Detections with scores in a range."""
+
+    low: float
+    high: float
+    detections: int
+    score: float
+    """Mean."""
+    precision: float
+    """Share that belongs to a label."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What was found out about one class. Fields that nothing could be learnt about are NaN."""
+
+    name: str
+    labels: int
+    objects: int
+    detections: int
+    pairs: int
+    values: dict[str, Value]
+    """By path in the profile."""
+    flip_rate: float
+    """Share of detections whose heading is nearer to the opposite of the label's."""
+    lasting: float
+    """Correlation of the position errors of neighbouring detections of one object."""
+    usual_position: float
+    """Standard deviation of the usual position error, by the median, m."""
+    detection: float
+    """Share of labels found, from the score filter on."""
+    clutter: float
+    """False detections per frame, from the score filter on."""
+    clutter_area: float
+    """Area that false detections come from, m^2."""
+    longest_gap: float
+    """Nominal periods within which 98 of 100 breaks between detections of an object end."""
+    bins: tuple[ScoreBin, ...]
+    score_scale: float
+    score_shift: float
+    """Log odds that a detection is true = scale * logit(score) + shift; 1 and 0 when scores are calibrated."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as plain values; None for NaN."""
+        return {key: _plain(value) for key, value in asdict(self).items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Rules) -> Estimate:
+    """Return what clips with one class say about it.
+
+    Args:
+        clips: of this class only.
+        name: the class.
+        parameters: their score filter, gate, clutter rate and nominal period are used.
+        rules: of the benchmark: what is ignored and excused.
+
+    """
+    table = parameters.classes[name]
+    paths = [trajectories(clip, name) for clip in clips]
+    everything = [pair_detections(clip, name, 0.0, min(PAIR_LIMIT, table.gate), rules) for clip in clips]
+    pairs = [pair_detections(clip, name, table.score_filter, min(PAIR_LIMIT, table.gate), rules) for clip in clips]
+    errors = residuals(pairs, paths)
+    count = len(errors.heading)
+    values: dict[str, float] = {}
+    clutter_area = _area(pairs)
+    clutter = _ratio(sum(int(one.false.sum()) for one in pairs), sum(one.frames for one in pairs))
+    gap = _longest_gap(pairs, paths, parameters.nominal_period)
+    if count >= LEAST_PAIRS:
+        values |= _measurement(errors)
+        values |= _process([path for objects in paths for path in objects.values()], parameters.nominal_period)
+        values |= _birth(errors, pairs, paths)
+        values["area"] = table.clutter_rate * clutter_area / clutter if clutter > 0 else math.nan
+        values["max_misses"] = math.ceil(gap) if math.isfinite(gap) else math.nan
+    flips = float((np.abs(errors.heading) > 0.5 * np.pi).mean()) if count else math.nan
+    kept: dict[str, Value] = {path: _fitting(parameters, name, path, value) for path, value in values.items()
+                              if math.isfinite(value) and value > 0}
+    if count >= LEAST_PAIRS:
+        kept["heading_sign_reliable"] = flips < RELIABLE_FLIPS
+    bins, scale, shift = _scores(everything)
+    return Estimate(
+        name=name,
+        labels=sum(one.truth for one in pairs),
+        objects=sum(len(objects) for objects in paths),
+        detections=sum(len(one.score) for one in pairs),
+        pairs=count,
+        values=kept,
+        flip_rate=flips,
+        lasting=_lasting(errors, parameters.nominal_period),
+        usual_position=usual(errors.position),
+        detection=_ratio(sum(one.found for one in pairs), sum(one.truth for one in pairs)),
+        clutter=clutter,
+        clutter_area=clutter_area,
+        longest_gap=gap,
+        bins=bins,
+        score_scale=scale,
+        score_shift=shift,
+    )
+
+
+def _fitting(parameters: Parameters, name: str, path: str, value: float) -> Value:
+    """Return a value of the kind that the profile has at a path."""
+    kind = value_of(parameters, name, path)
+    return round(value) if isinstance(kind, int) else rounded(max(value, _SMALL))
+
+
+def _measurement(errors: Residuals) -> dict[str, float]:
+    return {
+        "measurement_noise.position": spread(errors.position),
+        "measurement_noise.heading": spread(wrap_angle(2.0 * errors.heading) / 2.0),
+        "measurement_noise.velocity": spread(errors.velocity[np.isfinite(errors.velocity).all(axis=1)]),
+    }
+
+
+def _process(paths: Sequence[Trajectory], period: float) -> dict[str, float]:
+    """Return Q: how much speed, acceleration, heading and turn rate change between neighbouring pieces.
+
+    The change of each over a time tau has the variance q^2 tau, beside what the model foresees and what the fit's own
+    error adds; position follows the model within the error of labels, and keeps what the profile has.
+    """
+    window = max(WINDOW_S, 4.0 * period)
+    changes: list[Floats] = []
+    errors: list[Floats] = []
+    for path in paths:
+        for part in _unbroken(path, 1.5 * period):
+            motion = fit_motion(part.time, part.position, part.yaw, window)
+            if len(motion.time) < 2:  # noqa: PLR2004  a change is between two
+                continue
+            # Most cars stand, most of the time; noise is for what moves.
+            moves = np.maximum(np.abs(motion.speed[1:]), np.abs(motion.speed[:-1])) > MOVING
+            tau = np.diff(motion.time)
+            foreseen = 0.5 * (motion.acceleration[1:] + motion.acceleration[:-1])
+            turned = 0.5 * (motion.turn_rate[1:] + motion.turn_rate[:-1])
+            changes.append(
+                np.column_stack(
+                    [
+                        np.diff(motion.speed) - foreseen * tau,
+                        np.diff(motion.acceleration),
+                        np.diff(motion.heading) - turned * tau,
+                        np.diff(motion.turn_rate),
+                    ]
+                )
+                / np.sqrt(tau)[:, None]
+            )
+            errors.append((motion.variance[1:] + motion.variance[:-1]) / tau[:, None])
+            changes[-1], errors[-1] = changes[-1][moves], errors[-1][moves]
+    if sum(map(len, changes)) < LEAST_PAIRS:
+        return {}
+    table, noise = np.concatenate(changes), np.median(np.concatenate(errors), axis=0)
+    found = {}
+    for column, key in enumerate(("speed", "acceleration", "heading", "turn_rate")):
+        square = spread(table[:, column]) ** 2
+        # A tenth remains in any case: that the fit explains all of it is chance.
+        found[f"process_noise.{key}"] = math.sqrt(max(square - float(noise[column]), 0.1 * square))
+    return found
+
+
+def _unbroken(path: Trajectory, longest: float) -> list[Trajectory]:
+    """Return the pieces of a trajectory without gaps in time."""
+    cuts = np.flatnonzero(np.diff(path.time) > longest) + 1
+    rows = np.split(np.arange(len(path.time)), cuts)
+    return [
+        Trajectory(*(getattr(path, key)[part] for key in ("frame", "time", "position", "yaw", "velocity", "ignored")))
+        for part in rows
+    ]
+
+
+def _birth(
+    errors: Residuals, pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]
+) -> dict[str, float]:
+    """Return P^0 from the first detection of each object, and from what objects do."""
+    first = errors.first
+    velocity = errors.velocity[first]
+    starts: list[Floats] = []
+    for found, objects in zip(pairs, paths, strict=True):
+        for identity, path in objects.items():
+            frames = detected_frames(found, identity)
+            if len(frames):
+                starts.append(path.velocity[np.searchsorted(path.frame, frames[0])])
+    speeds = np.linalg.norm(np.array(starts).reshape(-1, 2), axis=1)
+    speeds = speeds[np.isfinite(speeds)]
+    return {
+        "birth.position": spread(errors.position[first]),
+        "birth.heading": spread(wrap_angle(2.0 * errors.heading[first]) / 2.0),
+        "birth.speed": spread(velocity[np.isfinite(velocity).all(axis=1)]),
+        # Most objects of many classes stand; those that do not are the ones that need it.
+        "birth.unknown_speed": float(np.sqrt(np.mean(speeds**2))) if len(speeds) else math.nan,
+    }
+
+
+def _lasting(errors: Residuals, period: float) -> float:
+    """Return the correlation of position errors of neighbouring frames."""
+    pair = np.flatnonzero(errors.gap < 1.5 * period)  # NaN is not less
+    if len(pair) < LEAST_PAIRS:
+        return math.nan
+    limit = 3.0 * usual(errors.position)
+    here = np.clip(errors.position, -limit, limit)
+    return float((here[pair] * here[pair - 1]).sum() / (here[pair] ** 2).sum())
+
+
+def _longest_gap(pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]], period: float) -> float:
+    """Return the nominal periods within which nearly all breaks between detections of an object end."""
+    gaps: list[float] = []
+    for found, objects in zip(pairs, paths, strict=True):
+        for identity, path in objects.items():
+            frames = detected_frames(found, identity)
+            time = path.time[np.searchsorted(path.frame, frames)]
+            gaps += [float(one) / period - 1.0 for one in np.diff(time) if one > 1.5 * period]
+    return float(np.quantile(gaps, _GAP_QUANTILE)) if gaps else math.nan
+
+
+def _area(pairs: Sequence[Pairs], cell: float = 5.0) -> float:
+    """Return the area of the cells around the sensor in which there are detections."""
+    cells = {tuple(row) for one in pairs for row in np.floor(one.place / cell).astype(np.int64).tolist()}
+    return cell * cell * len(cells)
+
+
+def _scores(pairs: Sequence[Pairs]) -> tuple[tuple[ScoreBin, ...], float, float]:
+    """Return how often detections of each score are true, and the fit of the log odds (Platt, 1999)."""
+    score = np.concatenate([one.score for one in pairs]) if pairs else np.empty(0)
+    true = np.concatenate([one.object >= 0 for one in pairs]) if pairs else np.empty(0, dtype=np.bool_)
+    counted = true | (np.concatenate([one.false for one in pairs]) if pairs else true)
+    score, true = score[counted], true[counted]
+    edges = np.linspace(0.0, 1.0, _BINS + 1)
+    which = np.clip(np.digitize(score, edges) - 1, 0, _BINS - 1)
+    bins = tuple(
+        ScoreBin(
+            low=float(edges[i]),
+            high=float(edges[i + 1]),
+            detections=int((which == i).sum()),
+            score=float(score[which == i].mean()),
+            precision=float(true[which == i].mean()),
+        )
+        for i in range(_BINS)
+        if (which == i).any()
+    )
+    scale, shift = _platt(score, true) if true.any() and not true.all() else (math.nan, math.nan)
+    return bins, scale, shift
+
+
+def _platt(score: Floats, true: np.ndarray) -> tuple[float, float]:
+    """Fit log odds = scale * logit(score) + shift by Newton's method, held by a weak prior at scale 1, shift 0."""
+    clipped = np.clip(score, 1e-4, 1.0 - 1e-4)
+    design = np.column_stack([np.log(clipped / (1.0 - clipped)), np.ones(len(score))])
+    weights, prior = np.array([1.0, 0.0]), np.array([1.0, 0.0])
+    for _ in range(50):
+        odds = 1.0 / (1.0 + np.exp(-np.clip(design @ weights, -30.0, 30.0)))
+        slope = design.T @ (true - odds) - 0.1 * (weights - prior)
+        bend = (design * (odds * (1.0 - odds))[:, None]).T @ design + 0.1 * np.eye(2)
+        step = np.linalg.solve(bend, slope)
+        weights = weights + np.clip(step, -1.0, 1.0)
+        if np.abs(step).max() < 1e-9:  # noqa: PLR2004  far below what is shown
+            break
+    return float(weights[0]), float(weights[1])
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else math.nan

@@ -1,0 +1,134 @@
+"""What is maximised: one figure of tracks over some sequences, of the detections as they are and of worse ones.
+
+Everything is tracked in this process or in a pool of processes, one sequence at a time; the same parameters give the
+same figure whatever the number of processes.
+"""
+
+import multiprocessing
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from types import TracebackType
+from typing import Self
+
+from optipmb import Parameters, warm_up
+from optipmb_client.tuning.figures import Figures
+from optipmb_client.tuning.material import Clip, track_clip
+from optipmb_client.tuning.scoring import Measured, Scorer
+
+__all__ = ["METRICS", "Bench", "metric"]
+
+METRICS: Mapping[str, str] = {
+    "combination": "mean of sAMOTA, AMOTA, MOTA and HOTA, less a tenth of the switches per object",
+    "samota": "sAMOTA",
+    "amota": "AMOTA",
+    "mota": "MOTA at the best threshold",
+    "hota": "HOTA of centres at that threshold",
+}
+_SWITCH = 0.1
+_REMEMBERED = 6
+
+
+def metric(name: str, figures: Figures, objects: int) -> float:
+    """Return one of `METRICS`; figures that are not defined count zero."""
+    values = {"samota": figures.samota, "amota": figures.amota, "mota": figures.mota, "hota": figures.hota}
+    if name != "combination":
+        return _defined(values[name])
+    mean = sum(_defined(value) for value in values.values()) / len(values)
+    return mean - _SWITCH * figures.best.switches / max(1, objects)
+
+
+def _defined(value: float) -> float:
+    return value if value == value else 0.0  # noqa: PLR0124  NaN is not itself
+
+
+class Bench:
+    """Sequences of one class, in one or more variants of their detections, and processes to track them.
+
+    Args:
+        variants: the same sequences once or several times: plain, degraded.
+        scorer: what compares tracks with the truth.
+        metric: one of `METRICS`.
+        jobs: number of processes; with one, all is done in this one.
+    """
+
+    def __init__(self, variants: Sequence[Sequence[Clip]], scorer: Scorer, metric: str, jobs: int = 1) -> None:
+        self.variants = variants
+        self.scorer = scorer
+        self.metric = metric
+        self.names = tuple(clip.name for clip in variants[0])
+        self.frames = sum(len(clip.frames) for clips in variants for clip in clips)
+        self._known: OrderedDict[tuple[str, int, int], Measured] = OrderedDict()
+        self._pool: ProcessPoolExecutor | None = None
+        if jobs > 1:
+            context = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
+            self._pool = ProcessPoolExecutor(jobs, context, _begin, (variants, scorer))
+        else:
+            warm_up()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def objects(self, clips: Sequence[int] | None = None) -> int:
+        """Return how many objects the truth of some sequences has."""
+        chosen = range(len(self.names)) if clips is None else clips
+        return sum(len(set(self._own(i).id[~self._own(i).ignored].tolist())) for i in chosen)
+
+    def boxes(self, clip: int) -> int:
+        """Return how many boxes the truth of a sequence has that count."""
+        return int((~self._own(clip).ignored).sum())
+
+    def _own(self, clip: int):  # type: ignore[no-untyped-def]
+        truth = self.variants[0][clip].truth
+        return truth.take(truth.names == self.scorer.name)
+
+    def measure(self, parameters: Parameters, clips: Sequence[int]) -> list[list[Measured]]:
+        """Return what tracking some sequences gave, for each variant."""
+        key = parameters.model_dump_json()
+        wanted = [(variant, clip) for variant in range(len(self.variants)) for clip in clips]
+        missing = [place for place in wanted if (key, *place) not in self._known]
+        if self._pool is None:
+            found = [_measure(self.variants[v][c], self.scorer, parameters) for v, c in missing]
+        else:
+            tasks = [self._pool.submit(_measure_held, v, c, parameters) for v, c in missing]
+            found = [task.result() for task in tasks]
+        for place, one in zip(missing, found, strict=True):
+            self._known[(key, *place)] = one
+        result = [[self._known[(key, variant, clip)] for clip in clips] for variant in range(len(self.variants))]
+        while len(self._known) > _REMEMBERED * len(self.variants) * len(self.names):
+            self._known.popitem(last=False)
+        return result
+
+    def figures(self, measured: Sequence[Sequence[Measured]]) -> tuple[Figures, ...]:
+        """Return the figures of each variant."""
+        return tuple(self.scorer.figures(one) for one in measured)
+
+    def value(self, figures: Sequence[Figures], clips: Sequence[int]) -> float:
+        """Return the mean of the metric over the variants."""
+        objects = self.objects(clips)
+        return sum(metric(self.metric, one, objects) for one in figures) / len(figures)
+
+
+def _measure(clip: Clip, scorer: Scorer, parameters: Parameters) -> Measured:
+    return scorer.measure(clip, track_clip(clip, parameters))
+
+
+_held: tuple[Sequence[Sequence[Clip]], Scorer] | None = None
+
+
+def _begin(variants: Sequence[Sequence[Clip]], scorer: Scorer) -> None:
+    """Keep in a process of the pool what all its tasks need."""
+    global _held  # noqa: PLW0603  a process of a pool has no other place to keep anything
+    _held = (variants, scorer)
+    warm_up()
+
+
+def _measure_held(variant: int, clip: int, parameters: Parameters) -> Measured:
+    assert _held is not None  # noqa: S101  the pool has called _begin
+    return _measure(_held[0][variant][clip], _held[1], parameters)

@@ -1,0 +1,164 @@
+"""The search for better values: trials one after the other, kept in a file so that it can be taken up again.
+
+Trials alternate between proposals of Optuna's TPE sampler (Bergstra et al., 2011), which models where good values lie,
+and small moves away from the best trial so far, which in many dimensions finds the last part of the way faster. Before
+each trial the chance of both is seeded anew from the seed and the number of trials done, so a search that was
+interrupted goes on as if it had not been.
+"""
+
+import json
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optipmb_client.errors import UsageError
+from optipmb_client.tuning.space import Dimension
+from optipmb_client.tuning.values import Value
+
+if TYPE_CHECKING:
+    import optuna
+
+__all__ = ["Outcome", "Search"]
+
+_WARMUP = 8
+"""Trials before TPE has anything to model."""
+_SPREAD = 0.12
+"""Standard deviation of a small move, as a share of the range."""
+_MOVED = 4
+"""The most values that a small move changes."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One trial."""
+
+    number: int
+    values: Mapping[str, Value]
+    score: float
+
+
+class Search:
+    """One study in a storage.
+
+    Args:
+        storage: path of the SQLite file; several studies share it.
+        name: of the study.
+        settings: what the study depends on; taking it up again with other settings is refused.
+        space: what is searched.
+        starts: values that are tried first.
+        seed: of all chance.
+
+    Raises:
+        UsageError: Optuna is not installed, or the file has this study with other settings.
+    """
+
+    def __init__(
+        self,
+        storage: Path,
+        name: str,
+        settings: Mapping[str, Any],
+        space: Sequence[Dimension],
+        starts: Sequence[Mapping[str, Value]],
+        seed: int,
+    ) -> None:
+        self._optuna = _load_optuna()
+        self._space = space
+        self._starts = starts
+        self._seed = seed
+        self._distributions = {one.path: self._distribution(one) for one in space}
+        storage.parent.mkdir(parents=True, exist_ok=True)
+        self._study = self._optuna.create_study(
+            storage=f"sqlite:///{storage}", study_name=name, direction="maximize", load_if_exists=True
+        )
+        text = json.dumps(settings, sort_keys=True)
+        known = self._study.user_attrs.get("settings")
+        if known is None:
+            self._study.set_user_attr("settings", text)
+        elif known != text:
+            raise UsageError(f"{storage}: study {name!r} has other settings; choose another --out, or remove the file")
+        # Asking a sampler takes a dozen writes; a study in memory is asked, and the file gets whole trials.
+        self._memory = self._optuna.create_study(direction="maximize")
+        self._memory.add_trials(self._study.get_trials(deepcopy=False))
+
+    def _distribution(self, one: Dimension) -> "optuna.distributions.BaseDistribution":
+        distributions = self._optuna.distributions
+        if one.kind == "whole":
+            return distributions.IntDistribution(int(one.low), int(one.high), log=one.low >= 1)
+        return distributions.FloatDistribution(one.low, one.high, log=one.kind == "log")
+
+    def outcomes(self) -> list[Outcome]:
+        """Return the trials that are done, in order."""
+        return [
+            Outcome(i, json.loads(trial.user_attrs["values"]), float(trial.value or 0.0))
+            for i, trial in enumerate(self._memory.get_trials(deepcopy=False))
+        ]
+
+    def best(self) -> Outcome:
+        """Return the best trial, the earliest of equals."""
+        return max(self.outcomes(), key=lambda one: (one.score, -one.number))
+
+    def run(
+        self,
+        trials: int,
+        score: Callable[[Mapping[str, Value]], float],
+        on_trial: Callable[[Outcome], None] = lambda _outcome: None,
+    ) -> Outcome:
+        """Go on until there are `trials` trials; return the best."""
+        done = self.outcomes()
+        while len(done) < trials:
+            number = len(done)
+            rng = np.random.Generator(np.random.PCG64([self._seed, number]))
+            if number < len(self._starts):
+                values = {one.path: one.value(float(self._starts[number][one.path])) for one in self._space}
+            elif number >= _WARMUP and number % 2:
+                values = self._moved(max(done, key=lambda one: (one.score, -one.number)).values, rng)
+            else:
+                values = {}
+            outcome = self._trial(number, values, rng, score)
+            done.append(outcome)
+            on_trial(outcome)
+        return max(done, key=lambda one: (one.score, -one.number))
+
+    def _moved(self, best: Mapping[str, Value], rng: np.random.Generator) -> dict[str, Value]:
+        count = int(rng.integers(1, min(_MOVED, len(self._space)) + 1))
+        chosen = set(rng.choice(len(self._space), size=count, replace=False).tolist())
+        steps = _SPREAD * rng.standard_normal(len(self._space))
+        return {
+            one.path: one.moved(float(best[one.path]), float(steps[i])) if i in chosen else best[one.path]
+            for i, one in enumerate(self._space)
+        }
+
+    def _trial(
+        self,
+        number: int,
+        values: dict[str, Value],
+        rng: np.random.Generator,
+        score: Callable[[Mapping[str, Value]], float],
+    ) -> Outcome:
+        if values:
+            self._memory.enqueue_trial(values)
+        self._memory.sampler = self._sampler(int(rng.integers(2**31)))
+        trial = self._memory.ask(self._distributions)
+        chosen = values or {one.path: one.value(trial.params[one.path]) for one in self._space}
+        trial.set_user_attr("values", json.dumps(chosen, sort_keys=True))
+        found = score(chosen)
+        self._study.add_trial(self._memory.tell(trial, found))
+        return Outcome(number, chosen, found)
+
+    def _sampler(self, seed: int) -> "optuna.samplers.BaseSampler":
+        return self._optuna.samplers.TPESampler(seed=seed, n_startup_trials=_WARMUP, multivariate=True)
+
+
+def _load_optuna() -> Any:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import optuna  # noqa: PLC0415  an extra that only this needs
+    except ImportError as error:
+        raise UsageError("tuning needs Optuna: install optipmb[tune]") from error
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    return optuna

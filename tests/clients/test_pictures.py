@@ -1,0 +1,85 @@
+"""Pictures of sequences from above."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from optipmb_client.datasets import DataSequence, Truth, open_dataset
+from optipmb_client.errors import ClientError
+from optipmb_client.evaluation import ClearResult, Rules, evaluate_clear
+from optipmb_client.pictures import draw_tracks
+from optipmb_client.results import ResultTable, empty_table
+
+PNG = b"\x89PNG\r\n\x1a\n"
+RULES = Rules(measure="distance", limit=2.0)
+
+
+def scene() -> tuple[DataSequence, Truth, ResultTable]:
+    """Give a short scene, its truth, and the truth as tracks with one change of identity and some misses."""
+    sequence = open_dataset("scene", frames=30).sequences(["all"])[0]
+    truth = sequence.truth()
+    assert truth is not None
+    rows = truth.take(~truth.ignored & (truth.frame % 7 != 3))
+    identity = np.where((rows.id == rows.id[0]) & (rows.frame > 15), 900, rows.id)
+    columns = (rows.frame, identity, rows.label, rows.center, rows.size, rows.yaw)
+    return sequence, truth, ResultTable(rows.labels, *columns, np.ones(len(rows)), rows.box2d)
+
+
+def text_of(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: object) -> list[str]:
+    """Draw, and give all texts of the picture."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - matplotlib is an extra
+    from matplotlib.text import Text  # noqa: PLC0415 - matplotlib is an extra
+
+    found: list[str] = []
+    save = Figure.savefig
+
+    def remember(figure: Figure, *args: object, **options: object) -> None:
+        save(figure, *args, **options)
+        found.extend(text.get_text() for text in figure.findobj(Text))
+
+    monkeypatch.setattr(Figure, "savefig", remember)
+    draw_tracks(path, *arguments)  # type: ignore[arg-type]  # passed on as they are
+    return found
+
+
+def test_a_picture_shows_tracks_truth_sensor_and_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Axes in metres, a legend for each kind of line and mark, every track's id, and the change of identity by name."""
+    sequence, truth, tracks = scene()
+    results: list[ClearResult] = [evaluate_clear(truth, tracks, name, RULES) for name in truth.labels]
+    assert sum(len(result.switches) for result in results) == 1
+    path = tmp_path / "new" / "tracks.png"
+    texts = text_of(path, monkeypatch, sequence, tracks, truth, results)
+    assert path.read_bytes().startswith(PNG)
+    assert any("(m)" in text for text in texts)
+    for name in ("truth", "sensor", "miss", "change of id"):
+        assert name in texts
+    assert {str(identity) for identity in np.unique(tracks.id)} <= set(texts)
+    assert f"{tracks.id[0]} to 900" in texts
+
+
+def test_the_same_tracks_give_the_same_bytes(tmp_path: Path) -> None:
+    """A picture has no date in it."""
+    sequence, truth, tracks = scene()
+    for name in ("a.png", "b.png"):
+        draw_tracks(tmp_path / name, sequence, tracks, truth)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_a_sequence_without_tracks_or_truth_is_drawn_too(tmp_path: Path) -> None:
+    """Only the sensor's path, and also when there is a single track far away."""
+    sequence, truth, tracks = scene()
+    draw_tracks(tmp_path / "none.png", sequence, empty_table())
+    draw_tracks(tmp_path / "truth.png", sequence, empty_table(), truth)
+    far = tracks.take(np.arange(1))
+    draw_tracks(tmp_path / "far.png", sequence, replace(far, center=far.center + np.array([900.0, 0.0, 0.0])))
+    assert len(list(tmp_path.glob("*.png"))) == 3
+
+
+def test_without_matplotlib_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The extra is named."""
+    sequence, _, tracks = scene()
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ClientError, match=r"optipmb\[plot\]"):
+        draw_tracks(tmp_path / "a.png", sequence, tracks)

@@ -1,0 +1,82 @@
+"""What docs/operation.md says is what the code does."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+from typing import get_args
+
+import optipmb_service
+from optipmb_schemas import Code
+from optipmb_service.logs import EVENTS
+from optipmb_service.problems import CODES
+from optipmb_service.reference import main, page
+from optipmb_service.settings import load
+
+FILE = Path(__file__).parents[2] / "docs" / "operation.md"
+SOURCES = sorted(Path(optipmb_service.__file__).parent.glob("*.py"))
+LEVELS = {"debug", "info", "warning", "error", "exception"}
+
+
+def calls(names: set[str]) -> list[ast.Call]:
+    """All calls of functions and methods of these names in the service."""
+    found = []
+    for source in SOURCES:
+        for part in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+            if isinstance(part, ast.Call):
+                name = part.func.attr if isinstance(part.func, ast.Attribute) else getattr(part.func, "id", "")
+                if name in names:
+                    found.append(part)
+    return found
+
+
+def texts(part: ast.AST) -> set[str]:
+    """All words of small letters that a part of the code holds as texts."""
+    values = {node.value for node in ast.walk(part) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    return {value for value in values if re.fullmatch("[a-z_]+", value)}
+
+
+def test_the_tables_are_current() -> None:
+    """`python -m optipmb_service.reference docs/operation.md` would change nothing."""
+    assert page(FILE.read_text(encoding="utf-8")) == FILE.read_text(encoding="utf-8")
+    assert main(["--check", str(FILE)]) == 0
+
+
+def test_a_page_that_is_not_current_is_found(tmp_path: Path) -> None:
+    """The check sees a table that was not made anew, and writing makes it anew."""
+    copy = tmp_path / "page.md"
+    copy.write_text(FILE.read_text(encoding="utf-8").replace("`cloud_wait_s`", "`cloud_wait`"), encoding="utf-8")
+    assert main(["--check", str(copy)]) == 1
+    assert main([str(copy)]) == 0
+    assert main(["--check", str(copy)]) == 0
+
+
+def test_every_log_event_is_described() -> None:
+    """The events that the code logs and those of the table are the same."""
+    logged = set()
+    for call in calls(LEVELS):
+        receiver = call.func.value if isinstance(call.func, ast.Attribute) else None
+        if (isinstance(receiver, ast.Name) and receiver.id == "log") or isinstance(receiver, ast.Call):
+            logged |= texts(call.args[0])
+    assert logged == set(EVENTS)
+
+
+def test_every_problem_is_described() -> None:
+    """The codes that the code reports, with those of the schemas, are those of the table."""
+    reported = set(get_args(Code))
+    for call in calls({"problem_of", "_problem", "_report"}):
+        code = call.args[0] if call.args else None
+        reported |= texts(code) if isinstance(code, ast.Constant) else set()
+        reported |= {text for keyword in call.keywords if keyword.arg == "code" for text in texts(keyword.value)}
+    assert reported == set(CODES)
+
+
+def test_the_example_is_a_settings_file(tmp_path: Path) -> None:
+    """The TOML on the page is accepted as it stands."""
+    (example,) = re.findall(r"```toml\n(.*?)```", FILE.read_text(encoding="utf-8"), re.DOTALL)
+    file = tmp_path / "settings.toml"
+    file.write_text(example, encoding="utf-8")
+    settings = load(file).settings
+    assert (settings.instance, settings.limits.max_points) == ("edge-1", 300_000)
+    assert list(settings.profiles) == ["garage/*/lidar*", "yard/crane/*"]
