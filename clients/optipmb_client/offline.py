@@ -75,6 +75,36 @@ class NamedTracks:
         """(N,)."""
         return self.tracks.existence
 
+    @property
+    def yaw_rate(self) -> Floats:
+        """(N,)."""
+        return self.tracks.yaw_rate
+
+    @property
+    def acceleration(self) -> Floats:
+        """(N,)."""
+        return self.tracks.acceleration
+
+    @property
+    def covariance(self) -> Floats:
+        """(N, 6, 6)."""
+        return self.tracks.covariance
+
+    @property
+    def age(self) -> Floats:
+        """(N,)."""
+        return self.tracks.age
+
+    @property
+    def time_since_detection(self) -> Floats:
+        """(N,)."""
+        return self.tracks.time_since_detection
+
+    @property
+    def detection(self) -> Ints:
+        """(N,)."""
+        return self.tracks.detection
+
 
 @dataclass(frozen=True)
 class TrackedSequence:
@@ -145,9 +175,12 @@ def track(
     profile: str,
     classes: Sequence[str] = (),
     modules: Modules | None = None,
+    full: bool = False,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Iterator[TrackedSequence]:
     """Track sequences one after the other and write the result file of each into `out`; yield each when it is done.
+
+    With `full`, all that is known of the tracks is written too, beside each result file.
 
     Raises:
         UsageError: No such profile or class, or values that the tracker refuses.
@@ -164,7 +197,7 @@ def track(
             steps.append(took)
             clouds += frame.cloud is not None
             on_frame()
-        file = write_results(dataset, sequence, out, results)
+        file = write_results(dataset, sequence, out, results, full=full)
         identities = {int(number) for tracks in results.values() for number in tracks.id}
         seconds = time.monotonic() - begun
         yield TrackedSequence(sequence.name, file, len(results), clouds, len(identities), seconds, latency(steps))

@@ -11,7 +11,7 @@ import numpy as np
 
 from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame, Truth
 from optipmb_client.errors import UsageError
-from optipmb_client.results import TrackRows
+from optipmb_client.results.full import FullRows, full_path, write_full
 
 __all__ = ["Latency", "Preloaded", "latency", "selected_frames", "write_results"]
 
@@ -82,9 +82,18 @@ def selected_frames(sequence: DataSequence, classes: Sequence[str]) -> Iterator[
         )
 
 
-def write_results(dataset: Dataset, sequence: DataSequence, out: Path, tracks: Mapping[int, TrackRows]) -> Path:
-    """Write the result file of a sequence from its tracks by frame index, in order of frames; return its path."""
+def write_results(
+    dataset: Dataset, sequence: DataSequence, out: Path, tracks: Mapping[int, FullRows], *, full: bool = False
+) -> Path:
+    """Write the result file of a sequence from its tracks by frame index, in order of frames; return its path.
+
+    With `full`, a file with all columns is put beside it; without, one of an earlier run is removed.
+    """
     with dataset.writer(out, sequence) as writer:
         for index in sorted(tracks):
             writer.add(index, sequence.poses[index], tracks[index])
+    if full:
+        write_full(full_path(writer.path), tracks)
+    else:
+        full_path(writer.path).unlink(missing_ok=True)
     return writer.path

@@ -88,9 +88,12 @@ def replay(  # noqa: PLR0913  one argument per decision of the caller
     classes: Sequence[str] = (),
     streams: int = 1,
     prefix: str = PREFIX,
+    full: bool = False,
     on_frame: Callable[[], None] = lambda: None,
 ) -> list[ReplayedSequence]:
     """Replay sequences, `streams` of them at once, and write the result file of each into `out`.
+
+    With `full`, all that is known of the tracks is written too, beside each result file.
 
     Raises:
         ServiceUnavailable: No service answers.
@@ -98,7 +101,7 @@ def replay(  # noqa: PLR0913  one argument per decision of the caller
         UsageError: No such class.
     """
     run = f"{dataset.name}-{secrets.token_hex(3)}"
-    task = _Task(connection, dataset, out, profile, pace, classes, prefix, on_frame)
+    task = _Task(connection, dataset, out, profile, pace, classes, prefix, full, on_frame)
     work = [_Replay(task, sequence, f"replay/{run}/{sequence.name}") for sequence in sequences]
     with concurrent.futures.ThreadPoolExecutor(max_workers=streams, thread_name_prefix="replay") as pool:
         futures = [pool.submit(_replay_and_write, one) for one in work]
@@ -121,7 +124,7 @@ def _replay_and_write(one: "_Replay") -> ReplayedSequence:
     if one.task.stop.is_set():
         raise concurrent.futures.CancelledError
     seconds = time.monotonic() - begun
-    file = write_results(one.task.dataset, one.sequence, one.task.out, one.results)
+    file = write_results(one.task.dataset, one.sequence, one.task.out, one.results, full=one.task.full)
     return ReplayedSequence(
         name=one.sequence.name,
         stream=one.stream,
@@ -151,6 +154,7 @@ class _Task:
     pace: Pace
     classes: Sequence[str]
     prefix: str
+    full: bool
     on_frame: Callable[[], None]
     stop: threading.Event = field(default_factory=threading.Event)
 

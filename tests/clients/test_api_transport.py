@@ -73,11 +73,14 @@ def test_what_is_sent_just_before_closing_arrives(endpoint: str) -> None:
 
 def test_a_late_subscriber_gets_the_history_of_the_cache(endpoint: str) -> None:
     """A subscriber that comes after the messages gets the newest ones that the publisher keeps, in order."""
-    inbox = Inbox(100)
-    with Connection(endpoint) as sender, Connection(endpoint) as receiver:
+    early, inbox = Inbox(100), Inbox(100)
+    with Connection(endpoint) as sender, Connection(endpoint) as witness, Connection(endpoint) as receiver:
+        witness.subscribe("a/*", early)
         small = sender.cached_sender("a/small", "application/msgpack;optipmb.Detections.v1", cache=3)
         for number in range(5):
             small.put(b"%d" % number)
+        while (arrival := early.get(10.0)) and arrival.payload != b"4":  # none is under way when the late one comes
+            pass
         receiver.subscribe("a/*", inbox)
         arrivals = [inbox.get(10.0) for _ in range(3)]
     assert [arrival.payload for arrival in arrivals if arrival] == [b"2", b"3", b"4"]

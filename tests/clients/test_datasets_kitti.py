@@ -247,7 +247,9 @@ def test_clouds_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"000001.bin"):
         _ = cloud.xyz
     # The written calibration has the velodyne 27 cm behind and 8 cm above the camera, looking the same way.
-    np.testing.assert_allclose(cloud.pose.translation, frames[1].pose.translation + [-0.27, 0.0, 0.08], atol=1e-12)
+    np.testing.assert_allclose(
+        cloud.pose.translation, frames[1].pose.translation + np.array([-0.27, 0.0, 0.08]), atol=1e-12
+    )
     np.testing.assert_allclose(rotation_of(cloud.quaternion), np.eye(3), atol=1e-12)
     without = open_dataset("kitti", tmp_path, clouds=0).sequences(["all"])[0]
     assert not without.has_clouds

@@ -11,7 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+import zenoh
+import zenoh.ext
 from optipmb_schemas import (
+    Detections,
     Keys,
     Problem,
     ResetRequest,
@@ -234,6 +237,24 @@ def test_the_service_fetches_what_it_missed(start: Callable[..., Any]) -> None:
     endpoint = free_endpoint()
     with open_router(endpoint), Node(endpoint) as node:
         node.send(*(SENSOR.detections(seq) for seq in range(5)))
+        start(listen=None, connect=[endpoint])
+        assert [plain(message) for message in node.tracks(SENSOR.stream, 5)] == offline(SENSOR, range(5))
+
+
+def test_the_service_fetches_history(start: Callable[..., Any]) -> None:
+    """The same from a publisher that keeps a cache and sends no heartbeats."""
+    endpoint = free_endpoint()
+    with open_router(endpoint), Node(endpoint) as node:
+        publisher = zenoh.ext.declare_advanced_publisher(
+            node.session,
+            KEYS.detections(SENSOR.stream),
+            encoding=encoding_of(Detections),
+            cache=zenoh.ext.CacheConfig(10),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+            publisher_detection=True,
+        )
+        for seq in range(5):
+            publisher.put(encode(SENSOR.detections(seq)))
         start(listen=None, connect=[endpoint])
         assert [plain(message) for message in node.tracks(SENSOR.stream, 5)] == offline(SENSOR, range(5))
 

@@ -140,8 +140,17 @@ def test_an_old_frame_is_no_jump() -> None:
         Verdict.LATE,
         Verdict.NEXT,
     ]
-    arrived = [mark(seq, seq * 4) for seq in range(20) if seq != 1]
-    assert verdicts([*arrived, mark(1, 4)])[-1] is Verdict.LATE
+    arrived = [mark(seq, seq * 2) for seq in range(20) if seq != 1]
+    assert verdicts([*arrived, mark(1, 2)])[-1] is Verdict.LATE
+
+
+def test_what_was_sent_before_a_jump_does_not_come_after_it() -> None:
+    """A straggler from before a jump is late even while nothing of the new era is processed."""
+    timeline, found = Timeline(LIMIT), []
+    for one in (mark(0, 0), mark(5, 6), mark(4, 1.5)):
+        decision, timeline = timeline.judge(one)
+        found.append(decision.verdict)
+    assert found == [Verdict.FIRST, Verdict.RESTART, Verdict.LATE]
 
 
 def test_a_restarted_publisher_continues_the_density() -> None:

@@ -240,8 +240,12 @@ class Node:
                     publisher_detection=True,
                 )
             else:
+                # A test's clouds must not be dropped by its own side when the machine is busy.
                 self._publishers[key] = self.session.declare_publisher(
-                    key, encoding=encoding_of(kind), priority=zenoh.Priority.DATA_LOW
+                    key,
+                    encoding=encoding_of(kind),
+                    priority=zenoh.Priority.DATA_LOW,
+                    congestion_control=zenoh.CongestionControl.BLOCK,
                 )
         return self._publishers[key]
 

@@ -21,6 +21,7 @@ __all__ = [
     "Connect",
     "DatasetName",
     "Detections",
+    "Full",
     "Options",
     "Out",
     "Prefix",
@@ -56,6 +57,9 @@ Options = Annotated[
 ]
 Tracks = Annotated[Path, typer.Option("--tracks", help="Folder with the result files of track or replay.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results; made if needed.")]
+Full = Annotated[
+    bool, typer.Option("--full", help="Also write all that is known of the tracks, with covariances, as .npz files.")
+]
 Profile = Annotated[str | None, typer.Option("--profile", help="Parameter profile; default: the dataset's own.")]
 Connect = Annotated[
     list[str] | None,

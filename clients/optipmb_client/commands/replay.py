@@ -13,6 +13,7 @@ from optipmb_client.commands.options import (
     Connect,
     DatasetName,
     Detections,
+    Full,
     Options,
     Out,
     Prefix,
@@ -40,6 +41,7 @@ def replay(  # noqa: PLR0913  these are the command's options
     out: Out = Path("out/replay"),
     profile: Profile = None,
     classes: Classes = None,
+    full: Full = False,
     connect: Connect = None,
     config: Config = None,
     speed: Annotated[
@@ -73,6 +75,7 @@ def replay(  # noqa: PLR0913  these are the command's options
             classes=classes or (),
             streams=streams,
             prefix=prefix,
+            full=full,
             on_frame=progress.advance,
         )
     if as_json:

@@ -7,6 +7,7 @@ from optipmb_client.commands.options import (
     Classes,
     DatasetName,
     Detections,
+    Full,
     Options,
     Out,
     Profile,
@@ -29,6 +30,7 @@ def track(  # noqa: PLR0913  these are the command's options
     out: Out = Path("out/track"),
     profile: Profile = None,
     classes: Classes = None,
+    full: Full = False,
     as_json: AsJson = False,
 ) -> None:
     """Track a dataset in this process, without a service, and write its result files.
@@ -43,7 +45,7 @@ def track(  # noqa: PLR0913  these are the command's options
     results = []
     with FrameProgress("tracking", sum(map(len, chosen))) as progress:
         for result in offline.track(
-            opened, chosen, out, profile=name, classes=classes or (), on_frame=progress.advance
+            opened, chosen, out, profile=name, classes=classes or (), full=full, on_frame=progress.advance
         ):
             results.append(result)
             if not as_json:

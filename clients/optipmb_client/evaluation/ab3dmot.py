@@ -38,7 +38,7 @@ IOU_LIMITS = (0.25, 0.5, 0.7)
 POINTS = 40
 """Recall points (L)."""
 
-_NEIGHBOURS = {"Car": ("Van",), "Pedestrian": ("Person_sitting",)}
+_NEIGHBOURS: dict[str, tuple[str, ...]] = {"Car": ("Van",), "Pedestrian": ("Person_sitting",)}
 _MIN_HEIGHT = 25.0
 _MOSTLY = 0.8
 _HARDLY = 0.2

@@ -1,8 +1,8 @@
 """What is compared: the truth and the tracks of one class in one sequence, and how well each pair of them agrees.
 
 Conventions: truth and tracks are in the same frame of reference, whichever that is. A cost is smaller for better pairs:
-one minus the intersection over union of the boxes, or the distance of the centres in the plane in metres. Pairs are
-prepared once; every metric, and every threshold on scores, works on them.
+one minus the intersection over union of the boxes (in space, or in the image), or the distance of the centres in the
+plane in metres. Pairs are prepared once; every metric, and every threshold on scores, works on them.
 """
 
 from dataclasses import dataclass, field, replace
@@ -11,11 +11,11 @@ from typing import Literal
 import numpy as np
 
 from optipmb_client.datasets import Truth
-from optipmb_client.evaluation.overlap import iou_3d
+from optipmb_client.evaluation.overlap import iou_2d, iou_3d
 from optipmb_client.geometry import Bools, Floats, Ints
 from optipmb_client.results import ResultTable
 
-Measure = Literal["iou_3d", "distance"]
+Measure = Literal["iou_3d", "iou_2d", "distance"]
 
 
 @dataclass(frozen=True)
@@ -111,6 +111,10 @@ def prepare(truth: Truth, tracks: ResultTable, name: str, rules: Rules, sequence
             (wanted.center[truth_row], wanted.size[truth_row], wanted.yaw[truth_row]),
             (found.center[track_row], found.size[track_row], found.yaw[track_row]),
         )
+        cost = 1.0 - similarity
+        near = similarity >= rules.limit
+    elif rules.measure == "iou_2d":
+        similarity = iou_2d(wanted.box2d[truth_row], found.box2d[track_row])
         cost = 1.0 - similarity
         near = similarity >= rules.limit
     else:

@@ -39,6 +39,14 @@ def iou_bev(first: tuple[Floats, Floats, Floats], second: tuple[Floats, Floats, 
     return np.asarray(common / (area - common), dtype=np.float64)
 
 
+def iou_2d(first: Floats, second: Floats) -> Floats:
+    """Return the intersection over union (P,) of pairs of image boxes (P, 4) x1 y1 x2 y2; 0 for boxes without area."""
+    low, high = np.maximum(first[:, :2], second[:, :2]), np.minimum(first[:, 2:], second[:, 2:])
+    common = np.prod(np.maximum(high - low, 0.0), axis=1)
+    area = np.prod(first[:, 2:] - first[:, :2], axis=1) + np.prod(second[:, 2:] - second[:, :2], axis=1)
+    return np.asarray(np.divide(common, area - common, out=np.zeros(len(common)), where=common > 0.0), dtype=np.float64)
+
+
 def intersection_area(first: tuple[Floats, Floats, Floats], second: tuple[Floats, Floats, Floats]) -> Floats:
     """Return the area (P,) common to the outlines of pairs of boxes; arguments as in `iou_3d`."""
     (center_a, size_a, yaw_a), (center_b, size_b, yaw_b) = first, second

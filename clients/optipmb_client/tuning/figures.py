@@ -1,296 +1,204 @@
-"""Figures of one class from tracks in memory, fast enough to be asked for thousands of times.
+"""The figures that tuning looks at, of one class over several sequences, by the functions of `evaluation`.
 
-Conventions: a case is what `optipmb_client.evaluation.prepare` makes of one sequence; cases are joined into one before
-counting, so every figure is over all their sequences together. Scores of tracks are the mean scores of whole tracks.
-
-    sMOTA(r) = min(1, max(0, 1 - (FP + FN + IDS - (1 - r) GT) / (r GT)))
-
-sAMOTA and AMOTA are the means of sMOTA and MOTA over forty recalls r, AMOTP that of MOTP; recalls that are not reached
-count zero (Weng et al., AB3DMOT, 2020). MOTA and the counts are those at the threshold of these with the highest MOTA.
-HOTA (Luiten et al., 2020) is of the same tracks, with the similarity max(0, 1 - d / 2 m) of centres in the plane.
+Conventions: scores of tracks are the mean scores of whole tracks. The averages over recalls are those of AB3DMOT's
+protocol, with 3D overlap for KITTI and with the distance of centres up to two metres elsewhere, and those of the
+nuScenes benchmark for nuScenes. All single figures are those at the threshold with the highest MOTA.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
-from optipmb_client.evaluation import Case, Rules
+from optipmb_client.evaluation import Case, Rules, clear, combine
+from optipmb_client.evaluation.ab3dmot import evaluate_ab3dmot
+from optipmb_client.evaluation.assignment import assign_frames, best_pairs
 from optipmb_client.geometry import Bools, Floats, Ints
-from optipmb_client.tuning.kernels import match, match_similar, switches
 
-__all__ = ["Counts", "Figures", "Joined", "count", "figures", "hota", "join", "recall_thresholds"]
+__all__ = ["HOTA_DISTANCE", "Figures", "ab3dmot_figures", "distance_figures", "hota"]
 
-RECALLS = 40
 HOTA_DISTANCE = 2.0
-_ALPHAS = np.arange(0.05, 0.99, 0.05)
-
-
-@dataclass(frozen=True)
-class Joined:
-    """The cases of several sequences as one."""
-
-    truth_id: Ints
-    """(T,) from 0 on"""
-    ignored: Bools
-    """(T,)"""
-    order: Ints
-    """(T,) rows by object, then by frame"""
-    track_id: Ints
-    """(K,) from 0 on"""
-    excused: Bools
-    """(K,)"""
-    mean: Floats
-    """(K,) mean score of the track"""
-    truth_row: Ints
-    """(P,) ascending"""
-    track_row: Ints
-    """(P,)"""
-    cost: Floats
-    """(P,)"""
-    similarity: Floats
-    """(P,)"""
-    bounds: Ints
-    """(G + 1,) where the pairs of a frame begin"""
-
-    @property
-    def truth(self) -> int:
-        """Truth boxes that count."""
-        return int((~self.ignored).sum())
-
-
-def join(cases: Sequence[Case]) -> Joined:
-    """Return several cases as one; they keep their order."""
-    truth_id, track_id, truth_row, track_row, group = [], [], [], [], []
-    objects = tracks = rows = found = frames = 0
-    for case in cases:
-        names, identity = np.unique(case.truth_id, return_inverse=True)
-        truth_id.append(identity.astype(np.int64) + objects)
-        objects += len(names)
-        names, identity = np.unique(case.track_id, return_inverse=True)
-        track_id.append(identity.astype(np.int64) + tracks)
-        tracks += len(names)
-        truth_row.append(case.truth_row + rows)
-        track_row.append(case.track_row + found)
-        group.append(case.truth_frame[case.truth_row] + frames)
-        rows += len(case.truth_id)
-        found += len(case.track_id)
-        frames += 1 + int(max(case.truth_frame.max(initial=0), case.track_frame.max(initial=0)))
-    joined, pairs = np.concatenate(truth_row), np.concatenate(group)
-    order = np.argsort(joined, kind="stable")
-    identity = np.concatenate(truth_id)
-    starts = np.flatnonzero(np.diff(pairs[order], prepend=-1))
-    return Joined(
-        truth_id=identity,
-        ignored=np.concatenate([case.ignored for case in cases]),
-        order=np.argsort(identity, kind="stable"),
-        track_id=np.concatenate(track_id),
-        excused=np.concatenate([case.excused for case in cases]),
-        mean=np.concatenate([case.mean_scores() for case in cases]),
-        truth_row=joined[order],
-        track_row=np.concatenate(track_row)[order],
-        cost=np.concatenate([case.cost for case in cases])[order],
-        similarity=np.concatenate([case.similarity for case in cases])[order],
-        bounds=np.append(starts, len(order)).astype(np.int64),
-    )
-
-
-@dataclass(frozen=True)
-class Counts:
-    """What matching gives for the tracks from a threshold on."""
-
-    threshold: float
-    truth: int
-    true: int
-    false: int
-    switches: int
-    similarity: float
-    """Sum over the true ones."""
-
-    @property
-    def missed(self) -> int:
-        """Truth boxes that nothing matches."""
-        return self.truth - self.true
-
-    @property
-    def errors(self) -> int:
-        """FP + FN + IDS."""
-        return self.false + self.missed + self.switches
-
-    @property
-    def mota(self) -> float:
-        """MOTA; NaN without truth."""
-        return 1.0 - self.errors / self.truth if self.truth else math.nan
-
-    @property
-    def motp(self) -> float:
-        """MOTP; NaN without matches."""
-        return self.similarity / self.true if self.true else math.nan
-
-
-def count(case: Joined, rules: Rules, threshold: float = -math.inf) -> tuple[Counts, Ints]:
-    """Return the counts for the tracks with a mean score from `threshold` on, and the pair (T,) of each truth row."""
-    kept = case.mean >= threshold
-    pair = match(
-        case.truth_row,
-        case.track_row,
-        case.cost,
-        case.bounds,
-        case.truth_id,
-        case.track_id,
-        kept,
-        rules.continuity,
-    )
-    hit = pair >= 0
-    used = case.track_row[pair[hit]]
-    follower = np.full(len(pair), -1, dtype=np.int64)
-    follower[hit] = case.track_id[used]
-    free = kept & ~case.excused
-    free[used] = False
-    counted = pair[hit & ~case.ignored]
-    return (
-        Counts(
-            threshold=threshold,
-            truth=case.truth,
-            true=len(counted),
-            false=int(free.sum()),
-            switches=int(switches(case.order, case.truth_id, case.ignored, follower, rules.memory)),
-            similarity=float(case.similarity[counted].sum()),
-        ),
-        pair,
-    )
-
-
-def recall_thresholds(scores: Floats, truth: int, steps: int = RECALLS) -> list[tuple[float, float]]:
-    """Return (threshold, recall) of the scores of true positives at which the recalls 1/steps .. 1 are reached best.
-
-    Scores are walked through from the highest; each recall takes the score whose own recall is nearest. There are fewer
-    than `steps` where the highest recalls are not reached.
-    """
-    ordered = np.sort(scores)[::-1]
-    wanted, found = 0.0, []
-    for i, score in enumerate(ordered.tolist()):
-        here = (i + 1) / truth
-        after = (i + 2) / truth if i < len(ordered) - 1 else here
-        if after - wanted < wanted - here and i < len(ordered) - 1:
-            continue
-        found.append((score, wanted))
-        wanted += 1.0 / steps
-    return found[1:]
+"""Metres at which the similarity of two centres is zero."""
+_ALPHAS: Floats = np.arange(0.05, 0.99, 0.05)
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures of one class."""
+    """Figures of one class; NaN where they are not defined."""
 
     samota: float
     amota: float
     amotp: float
-    best: Counts
-    """At the threshold with the highest MOTA."""
+    mota: float
+    motp: float
     hota: float
     deta: float
     assa: float
+    ids: float
+    frag: float
+    fp: float
+    fn: float
+    gt: float
+    threshold: float
+    """Lowest mean score of the tracks that the single figures are of."""
 
-    @property
-    def mota(self) -> float:
-        """MOTA at the best threshold."""
-        return self.best.mota
-
-    @property
-    def motp(self) -> float:
-        """MOTP at the best threshold."""
-        return self.best.motp
-
-    def to_json(self) -> dict[str, float | int | None]:
+    def to_json(self) -> dict[str, float | None]:
         """Return the figures by their usual names; None for those that are not defined."""
-        values = {
-            "sAMOTA": self.samota,
-            "AMOTA": self.amota,
-            "AMOTP": self.amotp,
-            "MOTA": self.mota,
-            "MOTP": self.motp,
-            "HOTA": self.hota,
-            "DetA": self.deta,
-            "AssA": self.assa,
-            "IDS": self.best.switches,
-            "FP": self.best.false,
-            "FN": self.best.missed,
-            "GT": self.best.truth,
-            "threshold": self.best.threshold,
+        return {
+            _NAMES.get(item.name, item.name): _plain(getattr(self, item.name)) for item in fields(self)
         }
-        return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in values.items()}
 
 
-def figures(case: Joined, rules: Rules, near: Joined | None = None) -> Figures:
-    """Return the figures of a joined case.
+_NAMES = {
+    "samota": "sAMOTA",
+    "amota": "AMOTA",
+    "amotp": "AMOTP",
+    "mota": "MOTA",
+    "motp": "MOTP",
+    "hota": "HOTA",
+    "deta": "DetA",
+    "assa": "AssA",
+    "ids": "IDS",
+    "frag": "FRAG",
+    "fp": "FP",
+    "fn": "FN",
+    "gt": "GT",
+}
+
+
+def _plain(value: float) -> Any:
+    if not math.isfinite(value):
+        return None
+    return int(value) if value == int(value) and abs(value) > 1 else value
+
+
+def ab3dmot_figures(cases: Sequence[Case], near: Sequence[Case], limit: float) -> Figures:
+    """Return the figures of AB3DMOT's protocol.
 
     Args:
-        case: truth and tracks with the pairs that may match by the rules.
-        rules: of the case.
-        near: the same truth and tracks with the pairs of centres within two metres, for HOTA; without it HOTA is NaN.
+        cases: by the rules of the protocol.
+        near: the same with the pairs of centres within two metres, for HOTA.
+        limit: least overlap of a pair that matches.
 
     """
-    everything, pair = count(case, rules)
-    hit = pair >= 0
-    scores = case.mean[case.track_row[pair[hit & ~case.ignored]]]
-    points = recall_thresholds(scores, case.truth) if case.truth else []
-    counts = [count(case, rules, threshold)[0] for threshold, _ in points]
-    best = max(counts, key=lambda one: one.mota, default=everything)
-    scaled = [
-        min(1.0, max(0.0, 1.0 - (one.errors - (1.0 - recall) * one.truth) / (recall * one.truth)))
-        for one, (_, recall) in zip(counts, points, strict=True)
-    ]
-    alike = (math.nan,) * 3 if near is None else hota(near, case, rules, best.threshold)
+    found = evaluate_ab3dmot(cases, limit)
+    best = found.best
+    alike = hota([_counted(case, other, found.threshold) for case, other in zip(cases, near, strict=True)])
     return Figures(
-        samota=math.fsum(scaled) / RECALLS,
-        amota=math.fsum(max(0.0, one.mota) for one in counts) / RECALLS,
-        amotp=math.fsum(one.motp for one in counts if one.true) / RECALLS,
-        best=best,
+        samota=found.samota,
+        amota=found.amota,
+        amotp=found.amotp,
+        mota=best.mota,
+        motp=best.motp,
         hota=alike[0],
         deta=alike[1],
         assa=alike[2],
+        ids=best.switches,
+        frag=best.fragments,
+        fp=best.false,
+        fn=best.missed,
+        gt=best.truth,
+        threshold=found.threshold,
     )
 
 
-def hota(near: Joined, case: Joined, rules: Rules, threshold: float = -math.inf) -> tuple[float, float, float]:
-    """Return HOTA, DetA and AssA of the tracks with a mean score from `threshold` on.
+def distance_figures(cases: Sequence[Case], rules: Rules) -> Figures:
+    """Return the figures where boxes match by the distance of their centres.
 
-    Ignored truth does not take part, nor do tracks that match it by the rules, nor unmatched tracks that are excused.
+    The averages are those of AB3DMOT's protocol with the similarity 1 - d / limit; the single figures are those of
+    CLEAR MOT, where changes of identity over breaks count too.
     """
-    _, pair = count(case, rules, threshold)
-    kept = case.mean >= threshold
-    hit = pair >= 0
+    similar = [replace(case, similarity=1.0 - case.similarity / rules.limit) for case in cases]
+    found = evaluate_ab3dmot(similar, 0.0)
+    best = combine(clear(case.keep(case.mean_scores() >= found.threshold), rules) for case in cases)
+    alike = hota([_counted(case, case, found.threshold) for case in cases])
+    return Figures(
+        samota=found.samota,
+        amota=found.amota,
+        amotp=rules.limit * (1.0 - found.amotp),
+        mota=best.mota,
+        motp=best.motp,
+        hota=alike[0],
+        deta=alike[1],
+        assa=alike[2],
+        ids=len(best.switches),
+        frag=best.fragments,
+        fp=best.false,
+        fn=best.missed,
+        gt=best.truth,
+        threshold=found.threshold,
+    )
+
+
+def _counted(case: Case, near: Case, threshold: float) -> Case:
+    """Return what takes part in HOTA.
+
+    Truth that is ignored does not, nor do tracks below the threshold, tracks that match ignored truth by the rules of
+    the case, and unmatched ones that are excused.
+    """
+    kept = case.mean_scores() >= threshold
+    pairs = np.flatnonzero(kept[case.track_row])
+    frame, row, column = case.truth_frame[case.truth_row[pairs]], case.truth_row[pairs], case.track_row[pairs]
+    taken = assign_frames(frame, row, column, 2.0 - case.cost[pairs] / (1.0 + case.cost[pairs].max(initial=0.0)), best_pairs)
     used = np.zeros(len(kept), dtype=np.bool_)
-    used[case.track_row[pair[hit]]] = True
+    used[column[taken]] = True
     kept &= used | ~case.excused
-    kept[case.track_row[pair[hit & case.ignored]]] = False
-    counts = ~near.ignored
-    use = kept[near.track_row] & counts[near.truth_row] & (near.similarity < HOTA_DISTANCE)
-    truth_row, track_row = near.truth_row[use], near.track_row[use]
-    alike = 1.0 - near.similarity[use] / HOTA_DISTANCE
-    gt, tracks = int(counts.sum()), int(kept.sum())
-    if not len(alike):
-        return (0.0, 0.0, 0.0) if gt or tracks else (math.nan,) * 3
-    group = np.searchsorted(near.bounds, np.flatnonzero(use), side="right")
-    bounds = np.append(np.flatnonzero(np.diff(group, prepend=-1)), len(group)).astype(np.int64)
-    rows = np.bincount(truth_row, alike, len(near.truth_id))[truth_row]
-    columns = np.bincount(track_row, alike, len(kept))[track_row]
-    share = alike / np.maximum(rows + columns - alike, np.finfo(np.float64).eps)
-    truth_id, track_id = near.truth_id[truth_row], near.track_id[track_row]
-    keys, which = np.unique(truth_id * (near.track_id.max() + 1) + track_id, return_inverse=True)
-    length = np.empty(len(keys))
-    length[which] = (np.bincount(near.truth_id[counts], minlength=near.truth_id.max() + 1)[truth_id]
-                     + np.bincount(near.track_id[kept], minlength=near.track_id.max() + 1)[track_id])
-    potential = np.bincount(which, share, len(keys))
-    aligned = potential / (length - potential)
-    chosen = match_similar(truth_row, track_row, aligned[which] * alike, bounds)
+    kept[column[taken][case.ignored[row[taken]]]] = False
+    return _without_truth(near.keep(kept), near.ignored)
+
+
+def _without_truth(case: Case, dropped: Bools) -> Case:
+    place = np.cumsum(~dropped) - 1
+    pairs = ~dropped[case.truth_row]
+    return replace(
+        case,
+        truth_frame=case.truth_frame[~dropped],
+        truth_id=case.truth_id[~dropped],
+        ignored=case.ignored[~dropped],
+        truth_row=place[case.truth_row[pairs]].astype(np.int64),
+        track_row=case.track_row[pairs],
+        cost=case.cost[pairs],
+        similarity=case.similarity[pairs],
+    )
+
+
+def hota(cases: Sequence[Case]) -> tuple[float, float, float]:
+    """Return HOTA, DetA and AssA (Luiten et al., 2020) of centres: similarity max(0, 1 - d / 2 m), d in `similarity`."""
+    parts = [_alignment(case) for case in cases]
+    gt, tracks = sum(len(case.truth_id) for case in cases), sum(len(case.track_id) for case in cases)
+    if not gt:
+        return (math.nan,) * 3
     deta, assa = np.empty(len(_ALPHAS)), np.empty(len(_ALPHAS))
     for i, alpha in enumerate(_ALPHAS):
-        matched = chosen & (alike >= alpha - np.finfo(np.float64).eps)
-        true = int(matched.sum())
-        common = np.bincount(which[matched], minlength=len(keys))
-        assa[i] = float((common * common / np.maximum(1.0, length - common)).sum()) / max(1, true)
+        true, together = 0, 0.0
+        for which, alike, length in parts:
+            matched = alike >= alpha - np.finfo(np.float64).eps
+            common = np.bincount(which[matched], minlength=len(length))
+            together += float((common * common / np.maximum(1.0, length - common)).sum())
+            true += int(matched.sum())
+        assa[i] = together / max(1, true)
         deta[i] = true / max(1, gt + tracks - true)
     return float(np.sqrt(deta * assa).mean()), float(deta.mean()), float(assa.mean())
+
+
+def _alignment(case: Case) -> tuple[Ints, Floats, Floats]:
+    """Return the matched pairs of a sequence: which couple of ids each is of, its similarity; and per couple the boxes
+    that the two ids have together.
+    """
+    use = case.similarity < HOTA_DISTANCE
+    row, column = case.truth_row[use], case.track_row[use]
+    alike = 1.0 - case.similarity[use] / HOTA_DISTANCE
+    if not len(row):
+        return np.empty(0, dtype=np.int64), np.empty(0), np.empty(0)
+    truth_id = np.unique(case.truth_id, return_inverse=True)[1]
+    track_id = np.unique(case.track_id, return_inverse=True)[1]
+    rows, columns = np.bincount(row, alike)[row], np.bincount(column, alike)[column]
+    share = alike / np.maximum(rows + columns - alike, np.finfo(np.float64).eps)
+    couples, which = np.unique(np.column_stack([truth_id[row], track_id[column]]), axis=0, return_inverse=True)
+    length: Floats = (np.bincount(truth_id)[couples[:, 0]] + np.bincount(track_id)[couples[:, 1]]).astype(np.float64)
+    potential = np.bincount(which, share, len(couples))
+    weight = (potential / (length - potential))[which] * alike
+    taken = assign_frames(case.truth_frame[row], row, column, weight, best_pairs)
+    return which[taken].astype(np.int64), alike[taken], length

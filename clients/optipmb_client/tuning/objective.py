@@ -35,7 +35,7 @@ def metric(name: str, figures: Figures, objects: int) -> float:
     if name != "combination":
         return _defined(values[name])
     mean = sum(_defined(value) for value in values.values()) / len(values)
-    return mean - _SWITCH * figures.best.switches / max(1, objects)
+    return mean - _SWITCH * _defined(figures.ids) / max(1, objects)
 
 
 def _defined(value: float) -> float:

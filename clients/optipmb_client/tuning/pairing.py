@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optipmb_client.evaluation import Rules, prepare
+from optipmb_client.evaluation import Rules
+from optipmb_client.evaluation.assignment import assign_frames, most_pairs
+from optipmb_client.evaluation.cases import prepare
 from optipmb_client.geometry import Bools, Floats, Ints, to_sensor, to_world, wrap_angle
 from optipmb_client.results import ResultTable
-from optipmb_client.tuning.figures import count, join
 from optipmb_client.tuning.material import Clip
 
 __all__ = ["Pairs", "Residuals", "Trajectory", "detected_frames", "pair_detections", "residuals", "trajectories"]
@@ -116,17 +117,15 @@ def pair_detections(clip: Clip, name: str, least: float, limit: float, rules: Ru
     image = clip.camera.boxes(local, size, turned)[0] if clip.camera else np.full((len(when), 4), np.nan)
     rows = np.arange(len(when))
     table = ResultTable((name,), when, rows, np.zeros_like(rows), local, size, turned, score, image)
-    near = Rules("distance", limit, False, False, rules.neighbours, rules.min_height, rules.regions)  # noqa: FBT003
+    near = Rules("distance", limit, neighbours=rules.neighbours, min_height=rules.min_height, regions=rules.regions)
     case = prepare(clip.truth, table, name, near)
-    counts, pair = count(join([case]), near)
-    order = np.argsort(case.truth_row, kind="stable")
-    hit = np.flatnonzero(pair >= 0)
+    pairs = assign_frames(case.truth_frame[case.truth_row], case.truth_row, case.track_row, case.cost, most_pairs)
+    label, matched = case.truth_row[pairs], case.track_row[pairs]
     owner = np.full(len(when), -1, dtype=np.int64)
     # Labels of a class alike are ignored, and no examples of this one.
     names = clip.truth.take(np.argsort(clip.truth.frame, kind="stable")).names
-    matched = case.track_row[order][pair[hit]]
-    same = names[hit] == name
-    owner[matched[same]] = case.truth_id[hit[same]]
+    same = names[label] == name
+    owner[matched[same]] = case.truth_id[label[same]]
     false = ~case.excused
     false[matched] = False
     return Pairs(
@@ -139,8 +138,8 @@ def pair_detections(clip: Clip, name: str, least: float, limit: float, rules: Ru
         velocity=velocity,
         object=owner,
         false=false,
-        truth=counts.truth,
-        found=counts.true,
+        truth=int((~case.ignored).sum()),
+        found=int((~case.ignored[label]).sum()),
         frames=len(frames),
     )
 

@@ -6,14 +6,23 @@ all of them, those of a fold, or all but one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
-from optipmb_client.evaluation import Case, Rules, prepare
-from optipmb_client.results import ResultTable
-from optipmb_client.tuning.figures import HOTA_DISTANCE, Figures, figures, join
-from optipmb_client.tuning.material import Clip
+from optipmb_client.datasets import DataSequence
+from optipmb_client.datasets.nuscenes import NuScenesSequence
+from optipmb_client.evaluation import Case, Rules, default_rules
+from optipmb_client.evaluation.ab3dmot import ab3dmot_rules
+from optipmb_client.evaluation.cases import prepare
+from optipmb_client.evaluation.nuscenes_figures import evaluate_class
+from optipmb_client.evaluation.nuscenes_matching import Pairing, pair
+from optipmb_client.evaluation.nuscenes_scene import NuScenesConfig, NuScenesScene, prepare_scene
 from optipmb_client.geometry import to_sensor
+from optipmb_client.results import ResultTable
+from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
+from optipmb_client.tuning.figures import HOTA_DISTANCE, Figures, ab3dmot_figures, distance_figures
+from optipmb_client.tuning.material import Clip
 
-__all__ = ["Measured", "Scorer"]
+__all__ = ["BoxScorer", "Measured", "NuScenesScorer", "Scorer", "rules_of", "scorer_of"]
 
 
 @dataclass(frozen=True)
@@ -24,10 +33,28 @@ class Measured:
     """By the rules of the benchmark."""
     near: Case
     """By the distance of the centres, for HOTA."""
+    official: Pairing | None = None
+    """By the rules of the nuScenes benchmark."""
+
+
+class Scorer(Protocol):
+    """Compares tracks with the truth, for one class."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102 - the class
+
+    @property
+    def rules(self) -> Rules: ...  # noqa: D102 - what is ignored, and what is excused
+
+    def measure(self, clip: Clip, tracks: ResultTable) -> Measured:
+        """Compare the tracks of a clip, in the world frame, with its truth."""
+
+    def figures(self, measured: Sequence[Measured]) -> Figures:
+        """Return the figures of some sequences together."""
 
 
 @dataclass(frozen=True)
-class Scorer:
+class BoxScorer:
     """The figures of one class by some rules."""
 
     name: str
@@ -44,6 +71,72 @@ class Scorer:
 
     def figures(self, measured: Sequence[Measured]) -> Figures:
         """Return the figures of some sequences together."""
-        return figures(
-            join([one.case for one in measured]), self.rules, join([one.near for one in measured])
+        cases = [one.case for one in measured]
+        if self.rules.measure == "distance":
+            return distance_figures(cases, self.rules)
+        return ab3dmot_figures(cases, [one.near for one in measured], self.rules.limit)
+
+
+@dataclass(frozen=True)
+class NuScenesScorer:
+    """The figures of one class by the nuScenes benchmark; HOTA and sAMOTA by the distance of the centres."""
+
+    boxes: BoxScorer
+    scenes: dict[str, NuScenesScene]
+    config: NuScenesConfig
+
+    @property
+    def name(self) -> str:
+        """The class."""
+        return self.boxes.name
+
+    @property
+    def rules(self) -> Rules:
+        """What is ignored, and what is excused."""
+        return self.boxes.rules
+
+    def measure(self, clip: Clip, tracks: ResultTable) -> Measured:
+        """Compare the tracks of a clip, in the world frame, with its truth."""
+        scene = self.scenes[clip.name]
+        label = NUSCENES_CLASSES.index(self.name)
+        found = pair(
+            scene.truth,
+            scene.tracks(tracks, self.config),
+            label,
+            len(scene.stamp_us),
+            self.config.match_distance,
         )
+        return replace(self.boxes.measure(clip, tracks), official=found)
+
+    def figures(self, measured: Sequence[Measured]) -> Figures:
+        """Return the figures of some sequences together."""
+        found = evaluate_class([one.official for one in measured if one.official is not None], self.config)
+        best = found.best
+        return replace(
+            self.boxes.figures(measured),
+            amota=found.amota,
+            amotp=found.amotp,
+            mota=best.mota,
+            motp=best.motp,
+            ids=best.ids,
+            frag=best.frag,
+            fp=best.fp,
+            fn=best.fn,
+            gt=best.gt,
+            threshold=best.threshold,
+        )
+
+
+def rules_of(dataset: str) -> Rules:
+    """Return the rules by which boxes of a dataset are compared here."""
+    return ab3dmot_rules() if dataset == "kitti" else default_rules(dataset)
+
+
+def scorer_of(dataset: str, name: str, sequences: Sequence[DataSequence]) -> Scorer:
+    """Return the scorer of a class of a dataset."""
+    boxes = BoxScorer(name, rules_of(dataset))
+    scenes = [sequence for sequence in sequences if isinstance(sequence, NuScenesSequence)]
+    if not scenes or len(scenes) < len(sequences):
+        return boxes
+    config = NuScenesConfig(class_range={name: NuScenesConfig().class_range[name]})
+    return NuScenesScorer(boxes, {scene.name: prepare_scene(scene, config) for scene in scenes}, config)

@@ -1,0 +1,294 @@
+"""Tuning one class from beginning to end: estimate, search with sequences left out, search with all, weigh, report.
+
+The parts that judge and the parts that choose never see the same sequences: for each group that is left out there is a
+search of its own on the rest, and what it found is judged on the group. The profile comes from one more search, on all
+sequences. Both are kept in one file; an interrupted session goes on where it was.
+"""
+
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optipmb import Parameters
+from optipmb_client.tuning.degrade import Degradation, degrade
+from optipmb_client.tuning.estimate import estimate
+from optipmb_client.tuning.evidence import Evidence, prune
+from optipmb_client.tuning.figures import Figures
+from optipmb_client.tuning.folds import deal
+from optipmb_client.tuning.material import Clip
+from optipmb_client.tuning.objective import Bench
+from optipmb_client.tuning.scoring import Measured, Scorer
+from optipmb_client.tuning.search import Outcome, Search
+from optipmb_client.tuning.space import Dimension, dimensions, penalty, repaired
+from optipmb_client.tuning.values import Value, only, value_of, with_values
+from optipmb_client.tuning.watch import Quiet, Watch
+
+__all__ = ["FoldResult", "Plan", "Refined", "refine"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a session is run."""
+
+    metric: str = "combination"
+    trials: int = 60
+    """Of the search on all sequences."""
+    fold_trials: int = 30
+    """Of each search with sequences left out."""
+    folds: int = 3
+    copies: int = 1
+    """Degraded copies of the detections beside the plain ones."""
+    degradation: Degradation = Degradation()
+    seed: int = 0
+    everything: bool = False
+    """Search the values of the paper's table too."""
+    penalty: float = 0.0005
+    """What a value costs when it is a whole range away from where it began."""
+    evidence: float = 1.0
+    """Standard errors by which a changed value must pay."""
+    jobs: int = 1
+
+
+@dataclass(frozen=True)
+class FoldResult:
+    """Sequences that were left out, judged with what was found without them."""
+
+    sequences: tuple[str, ...]
+    parameters: Parameters
+    before: tuple[Figures, ...]
+    """Of each variant of the detections, with the parameters before."""
+    after: tuple[Figures, ...]
+    value_before: float
+    value_after: float
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What a session found out about one class."""
+
+    name: str
+    plan: Plan
+    sequences: tuple[str, ...]
+    parameters: Parameters
+    """With this class only."""
+    evidence: tuple[Evidence, ...]
+    before: tuple[Figures, ...]
+    """All sequences, of each variant of the detections."""
+    after: tuple[Figures, ...]
+    """The same with the new parameters; these sequences chose them."""
+    folds: tuple[FoldResult, ...]
+    crossed: tuple[Figures, ...]
+    """All sequences together, each with the parameters that were found without it; empty without folds."""
+    value_before: float
+    value_after: float
+    value_crossed: float | None
+    trials: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything as plain values."""
+        names = ("plain", *(f"degraded {i + 1}" for i in range(self.plan.copies)))
+
+        def table(figures: tuple[Figures, ...]) -> dict[str, Any]:
+            return {name: one.to_json() for name, one in zip(names, figures, strict=False)}
+
+        return {
+            "class": self.name,
+            "plan": {key: value for key, value in asdict(self.plan).items() if key != "jobs"},
+            "sequences": list(self.sequences),
+            "trials": self.trials,
+            "objective": {
+                "before": self.value_before,
+                "after": self.value_after,
+                "cross-validated": self.value_crossed,
+                "held out, mean": _mean([fold.value_after for fold in self.folds]),
+                "held out, spread": _spread([fold.value_after for fold in self.folds]),
+                "held out, gain": _mean([fold.value_after - fold.value_before for fold in self.folds]),
+                "held out, spread of the gain": _spread([f.value_after - f.value_before for f in self.folds]),
+            },
+            "before": table(self.before),
+            "after": table(self.after),
+            "cross-validated": table(self.crossed),
+            "folds": [
+                {
+                    "sequences": list(fold.sequences),
+                    "objective": {"before": fold.value_before, "after": fold.value_after},
+                    "before": table(fold.before),
+                    "after": table(fold.after),
+                }
+                for fold in self.folds
+            ],
+            "evidence": [
+                {**asdict(one), "error": one.error if math.isfinite(one.error) else None} for one in self.evidence
+            ],
+        }
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+def _spread(values: Sequence[float]) -> float | None:
+    return float(np.std(values, ddof=1)) if len(values) > 1 else None
+
+
+def refine(
+    clips: Sequence[Clip],
+    scorer: Scorer,
+    parameters: Parameters,
+    plan: Plan,
+    storage: Path,
+    context: Mapping[str, Any],
+    watch: Watch | None = None,
+) -> Refined:
+    """Tune one class.
+
+    Args:
+        clips: with this class only.
+        scorer: of this class.
+        parameters: where the search begins; other classes in them do not matter.
+        plan: how.
+        storage: the file that keeps the trials.
+        context: what else the trials depend on, such as the names of the data.
+        watch: told how far it has come.
+
+    Raises:
+        UsageError: the storage holds trials of another session.
+
+    """
+    name, watch = scorer.name, watch or Quiet()
+    base = only(parameters, name)
+    variants = [clips, *([degrade(clip, plan.degradation, plan.seed, i) for clip in clips] for i in range(plan.copies))]
+    everyone = tuple(range(len(clips)))
+    with Bench(variants, scorer, plan.metric, plan.jobs) as bench:
+        groups = deal([bench.boxes(i) for i in everyone], plan.folds)
+        trials = len(groups) * plan.fold_trials + plan.trials
+        watch.begin(name, trials)
+        work = _Work(bench, base, plan, storage, dict(context), watch)
+        folds: list[FoldResult] = []
+        crossed: dict[int, list[Measured]] = {}
+        for number, group in enumerate(groups):
+            title = f"{name} without group {number + 1} of {len(groups)}"
+            rest = tuple(i for i in everyone if i not in group)
+            folds.append(work.judge(work.search(title, rest, plan.fold_trials), group, crossed))
+        best = work.search(f"{name} all", everyone, plan.trials)
+        chosen, evidence = prune(bench, base, name, best, plan.evidence, watch)
+        found = with_values(base, name, repaired(chosen, base, name))
+        before, value_before = work.figures(base, everyone)
+        after, value_after = work.figures(found, everyone)
+        together = work.together(crossed, everyone) if crossed else ()
+        return Refined(
+            name=name,
+            plan=plan,
+            sequences=bench.names,
+            parameters=found,
+            evidence=evidence,
+            before=before,
+            after=after,
+            folds=tuple(folds),
+            crossed=together,
+            value_before=value_before,
+            value_after=value_after,
+            value_crossed=bench.value(together, everyone) if together else None,
+            trials=trials,
+        )
+
+
+def _starts(
+    base: Parameters, name: str, space: Sequence[Dimension], estimated: Mapping[str, Value]
+) -> list[dict[str, Value]]:
+    """Return the values that are tried first: of the profile, estimated, half-way, and with the estimate of R only."""
+    known = {one.path: value_of(base, name, one.path) for one in space}
+    guess = {path: estimated.get(path, value) for path, value in known.items()}
+    noise = {path: guess[path] if path.startswith("measurement_noise") else value for path, value in known.items()}
+    between = {one.path: one.moved(one.start, 0.5 * one.offset(float(guess[one.path]))) for one in space}
+    return [known, guess, between, noise]
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What the searches of one class share."""
+
+    bench: Bench
+    base: Parameters
+    plan: Plan
+    storage: Path
+    context: dict[str, Any]
+    watch: Watch
+
+    @property
+    def name(self) -> str:
+        return self.bench.scorer.name
+
+    def search(self, title: str, clips: tuple[int, ...], trials: int) -> dict[str, Value]:
+        """Return the best values of some trials on some sequences, which alone are looked at."""
+        plain = [self.bench.variants[0][i] for i in clips]
+        estimated = estimate(plain, self.name, self.base, self.bench.scorer.rules).values
+        seen = {path: value for path, value in estimated.items() if path in _SEEN}
+        base = with_values(self.base, self.name, seen)
+        space = dimensions(base, self.name, estimated, plain, everything=self.plan.everything)
+        plan = asdict(self.plan)
+        settings = {
+            **self.context,
+            **{key: plan[key] for key in _SETTLED},
+            "sequences": [clip.name for clip in plain],
+            "base": zlib.crc32(base.model_dump_json().encode()),
+            "space": [list(asdict(one).values()) for one in space],
+        }
+        starts = _starts(base, self.name, space, estimated)
+        search = Search(self.storage, title, settings, space, starts, zlib.crc32(f"{self.plan.seed} {title}".encode()))
+        self.watch.note(f"searching: {title}")
+        best = -math.inf
+        for outcome in search.outcomes()[:trials]:
+            best = max(best, outcome.score)
+            self.watch.trial(best)
+
+        def heard(outcome: Outcome) -> None:
+            nonlocal best
+            best = max(best, outcome.score)
+            self.watch.trial(best)
+
+        def score(values: Mapping[str, Value]) -> float:
+            allowed = repaired(values, base, self.name)
+            _, value = self.figures(with_values(base, self.name, allowed), clips)
+            return value - penalty(space, values, self.plan.penalty)
+
+        return {**seen, **search.run(trials, score, heard).values}
+
+    def figures(self, parameters: Parameters, clips: tuple[int, ...]) -> tuple[tuple[Figures, ...], float]:
+        """Return the figures of each variant and the objective."""
+        figures = self.bench.figures(self.bench.measure(parameters, clips))
+        return figures, self.bench.value(figures, clips)
+
+    def judge(
+        self, values: Mapping[str, Value], group: tuple[int, ...], crossed: dict[int, list[Measured]]
+    ) -> FoldResult:
+        """Judge values by sequences that did not choose them; keep what tracking those gave in `crossed`."""
+        found = with_values(self.base, self.name, repaired(values, self.base, self.name))
+        before, value_before = self.figures(self.base, group)
+        after, value_after = self.figures(found, group)
+        measured = self.bench.measure(found, group)
+        for place, clip in enumerate(group):
+            crossed[clip] = [variant[place] for variant in measured]
+        names = tuple(self.bench.names[i] for i in group)
+        return FoldResult(names, found, before, after, value_before, value_after)
+
+    def together(self, crossed: Mapping[int, list[Measured]], clips: tuple[int, ...]) -> tuple[Figures, ...]:
+        """Return the figures of all sequences, each with the parameters found without it.
+
+        Those in no group have no truth of this class; they are tracked with the parameters before.
+        """
+        rest = tuple(i for i in clips if i not in crossed)
+        own = self.bench.measure(self.base, rest)
+        parts = {**crossed, **{clip: [variant[place] for variant in own] for place, clip in enumerate(rest)}}
+        return self.bench.figures([[parts[i][variant] for i in clips] for variant in range(len(self.bench.variants))])
+
+
+_SEEN = ("heading_sign_reliable",)
+"""What is taken from the estimate as it is: it is seen, not searched."""
+_SETTLED = ("metric", "copies", "degradation", "seed", "everything", "penalty")
+"""What of a plan the trials depend on; their number is not in it, so there can be more later."""
