@@ -11,6 +11,7 @@ import typer
 from optipmb_schemas import MessageError
 
 from optipmb_client.arguments import spread
+from optipmb_client.commands.ablate import ablate
 from optipmb_client.commands.demo import demo
 from optipmb_client.commands.evaluate import evaluate
 from optipmb_client.commands.options import MANY
@@ -18,6 +19,7 @@ from optipmb_client.commands.plot import plot
 from optipmb_client.commands.replay import replay
 from optipmb_client.commands.status import status
 from optipmb_client.commands.track import track
+from optipmb_client.commands.tune import tune
 from optipmb_client.datasets import DatasetError
 from optipmb_client.errors import ClientError, UsageError
 
@@ -34,7 +36,7 @@ _OptionError: Any = typer.BadParameter.__base__
 app = typer.Typer(
     name="optipmb", help="Track objects in 3D: offline, or through a tracking service.", add_completion=False
 )
-for command in (demo, track, replay, evaluate, plot, status):
+for command in (demo, track, replay, evaluate, tune, ablate, plot, status):
     app.command()(command)
 
 

@@ -68,7 +68,7 @@ def run_command(
     try:
         profiles = Profiles.read(loaded.settings.profile, loaded.settings.profiles)
     except optipmb.ParameterError as error:
-        _wrong(f"profile: {error}")
+        _wrong(str(error))
     logs.configure(loaded.settings.log_format, loaded.settings.log_level)
     logs.unknown_environment(loaded.unknown)
     leave(asyncio.run(run(loaded.settings, profiles)))

@@ -65,9 +65,13 @@ class Profiles:
 
 
 def _loaded(name: str) -> optipmb.Parameters:
-    parameters = optipmb.load_profile(name)
+    try:
+        parameters = optipmb.load_profile(name)
+    except optipmb.ParameterError as error:
+        path = error.path if error.path == "profile" else f"profile {name}: {error.path}"
+        raise optipmb.ParameterError(path, error.expected, error.received) from error
     try:
         schemas.SessionParameters(profile=parameters.name)
     except schemas.MessageError as error:
-        raise optipmb.ParameterError("name", error.expected, error.received) from error
+        raise optipmb.ParameterError(f"profile {name}: name", error.expected, error.received) from error
     return parameters

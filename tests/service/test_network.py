@@ -363,7 +363,7 @@ def test_sessions_are_limited_and_idle_ones_freed(start: Callable[..., Any]) -> 
 
         def freed() -> bool:
             service.housekeeping()
-            return service.status().sessions == ()
+            return bool(service.status().sessions == ())
 
         until(freed, "the idle session is closed")
         node.send(other.detections(1))
@@ -410,7 +410,7 @@ def test_a_silent_stream_is_stale(start: Callable[..., Any]) -> None:
 
         def stale() -> bool:
             service.housekeeping()
-            return service.status().sessions[0].state == "stale"
+            return bool(service.status().sessions[0].state == "stale")
 
         until(stale, "the stream is stale")
         node.send(SENSOR.detections(1))

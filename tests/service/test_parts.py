@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import optipmb_service
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.clouds import Clouds
 from optipmb_service.inbox import Inbox, Pool
@@ -38,6 +38,7 @@ def packet(number: int) -> Packet:
 # Inbox and workers
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(0, 2), max_size=60), st.integers(1, 5), st.integers(1, 5))
 def test_an_inbox_is_bounded_ordered_and_counts(kinds: list[int], frames: int, clouds: int) -> None:
     """The newest frames and clouds stay, in order, clouds first; commands are never lost; the rest is counted."""
@@ -152,6 +153,7 @@ def problem(stream: str = "a/b/c", code: str = "late", count: int = 1) -> Proble
     return problem_of(code, stream=stream, instance="x", message="m", count=count)
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, SECOND)), max_size=80))
 def test_no_problem_is_lost_and_few_are_told(steps: list[tuple[int, int]]) -> None:
     """Counts on the key and in the log add up to what was reported, each kind at most once a second, once in ten."""
@@ -187,6 +189,7 @@ def test_elements_of_an_array_are_one_kind() -> None:
     assert [told.code for told in published].count("unknown_class") == 5
 
 
+@settings(deadline=None)
 @given(st.text(max_size=2000))
 def test_a_problem_takes_any_text(text: str) -> None:
     """Whatever was received, the problem can be made and its texts are printable."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.timing import WINDOW, Decision, Mark, Timeline, Verdict, hold_until
 
@@ -41,6 +41,7 @@ marks = st.builds(
 )
 
 
+@settings(deadline=None)
 @given(st.lists(marks, max_size=60))
 def test_no_frame_is_admitted_twice(arrived: list[Mark]) -> None:
     """Whatever arrives in whatever order, an (epoch, seq) is admitted at most once."""
@@ -49,6 +50,7 @@ def test_no_frame_is_admitted_twice(arrived: list[Mark]) -> None:
     assert len(admitted) == len(set(admitted))
 
 
+@settings(deadline=None)
 @given(st.lists(marks, max_size=60))
 def test_time_never_goes_back_in_a_generation(arrived: list[Mark]) -> None:
     """Within one life of a density stamps never fall, and (stamp, seq) rises within one era."""
@@ -63,6 +65,7 @@ def test_time_never_goes_back_in_a_generation(arrived: list[Mark]) -> None:
             places[decision.era] = (one.stamp_ns, one.seq)
 
 
+@settings(deadline=None)
 @given(st.lists(marks, max_size=60))
 def test_memory_is_bounded(arrived: list[Mark]) -> None:
     """Sequence numbers may leap by 2^62 without the memory of them growing beyond its window."""
@@ -70,6 +73,7 @@ def test_memory_is_bounded(arrived: list[Mark]) -> None:
     assert timeline.seen.bit_length() <= WINDOW
 
 
+@settings(deadline=None)
 @given(st.sets(st.integers(0, 300), min_size=1), st.data())
 def test_repeats_change_nothing(seqs: set[int], data: st.DataObject) -> None:
     """Frames sent again, as recovery does, leave the verdicts on the others as they were."""
@@ -82,6 +86,7 @@ def test_repeats_change_nothing(seqs: set[int], data: st.DataObject) -> None:
     assert (kept, gaps) == judge_all(stream)[:2]
 
 
+@settings(deadline=None)
 @given(st.lists(st.booleans(), min_size=1, max_size=300))
 def test_gaps_add_up(lost: list[bool]) -> None:
     """Of a stream that loses frames, those admitted and the gaps before them make the whole again."""
@@ -90,6 +95,7 @@ def test_gaps_add_up(lost: list[bool]) -> None:
     assert sum(gaps) + len(stream) == (stream[-1].seq - stream[0].seq + 1 if stream else 0)
 
 
+@settings(deadline=None)
 @given(st.permutations(range(12)))
 def test_frames_held_together_come_out_in_order(order: list[int]) -> None:
     """Frames that overtook each other before any was processed are all admitted and put in order without gaps."""
@@ -187,6 +193,7 @@ def test_a_continuing_epoch_does_not_reach_back() -> None:
     assert (first.verdict, second.verdict) == (Verdict.NEW_EPOCH, Verdict.LATE)
 
 
+@settings(deadline=None)
 @given(
     has_points=st.sampled_from([True, False, None]),
     newest=st.none() | st.integers(0, 10 * SECOND),

@@ -5,6 +5,7 @@ Nothing here sleeps: whoever waits is woken by a message, or fails at a deadline
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from dataclasses import dataclass, field
@@ -25,7 +26,6 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
-from routers import open_client
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -119,7 +119,7 @@ class Node:
 
     def __init__(self, endpoint: str, keys: Keys | None = None) -> None:
         self.keys = keys or Keys()
-        self.session = open_client(endpoint)
+        self.session = zenoh.open(_configuration(endpoint))
         self._publishers: dict[str, Any] = {}
         self._subscriptions: list[Any] = []
         self.tracks_seen = self._collect(self.keys.all("tracks"))
@@ -275,6 +275,23 @@ class Node:
                 return
 
         threading.Thread(target=loop, daemon=True).start()
+
+
+def _configuration(endpoint: str) -> zenoh.Config:
+    """What publishers should set: without the waits messages are dropped on a busy machine."""
+    waits = "transport/link/tx/queue/congestion_control/drop"
+    values: dict[str, object] = {
+        "mode": "client",
+        "connect/endpoints": [endpoint],
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+        f"{waits}/wait_before_drop": 1_000_000,
+        f"{waits}/max_wait_before_drop_fragments": 1_000_000,
+    }
+    config = zenoh.Config()
+    for key, value in values.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
 
 
 def until(true: Callable[[], bool], what: str, deadline_s: float = DEADLINE_S) -> None:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-KITTI = optipmb.load_profile("kitti")
-NUSCENES = optipmb.load_profile("nuscenes")
+KITTI = optipmb.load_profile("kitti-paper")
+NUSCENES = optipmb.load_profile("nuscenes-paper")
 HERE = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0, 0, 0]))
 
 
@@ -61,9 +61,10 @@ MANOEUVRES: dict[str, Callable[[float], tuple[float, float]]] = {
 
 @pytest.mark.parametrize("manoeuvre", MANOEUVRES)
 @pytest.mark.parametrize("velocity", ["known", "unknown"])
-@pytest.mark.parametrize("parameters", [KITTI, NUSCENES], ids=lambda parameters: parameters.name)
-def test_one_object_keeps_one_track(parameters: optipmb.Parameters, velocity: str, manoeuvre: str) -> None:
-    """A perfectly detected car that turns, stops or reverses has one id from first to last frame, near the truth."""
+@pytest.mark.parametrize("profile", optipmb.profiles())
+def test_one_object_keeps_one_track(profile: str, velocity: str, manoeuvre: str) -> None:
+    """Under every profile, a perfectly detected car that turns, stops or reverses has one id, near the truth."""
+    parameters = optipmb.load_profile(profile)
     label = parameters.labels[0] if "Car" in parameters.labels else "car"
     rows = drive(MANOEUVRES[manoeuvre], 12.0, parameters.nominal_period)
     frames = []

@@ -4,7 +4,6 @@ from collections.abc import Sequence as Many
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
 from optipmb_client.commands.options import (
     AsJson,
@@ -22,9 +21,9 @@ from optipmb_client.datasets import DataSequence
 from optipmb_client.errors import UsageError
 
 if TYPE_CHECKING:
-    from optipmb_client.evaluation import ClassResult, Rules
+    from rich.console import RenderableType
 
-SHOWN = ("MOTA", "MOTP", "precision", "recall", "GT", "FP", "FN", "IDS", "FRAG")
+    from optipmb_client.evaluation import ClassResult, Rules
 
 
 def evaluate(  # noqa: PLR0913  these are the command's options
@@ -45,30 +44,64 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     distance: Annotated[
         float | None, typer.Option(min=0.0, help="Boxes match up to this distance of their centres, in metres.")
     ] = None,
+    cutoff: Annotated[float, typer.Option(min=0.01, help="Cut-off distance of GOSPA and OSPA, in metres.")] = 2.0,
+    order: Annotated[float, typer.Option(min=1.0, help="Order of GOSPA and OSPA.")] = 2.0,
     as_json: AsJson = False,
 ) -> None:
-    """Compare result files with the truth: CLEAR MOT figures per class, for all tracks and for the best threshold.
+    """Compare result files with the truth, per class.
+
+    CLEAR MOT figures, HOTA of centres in the plane, GOSPA and OSPA; of KITTI, AB3DMOT's protocol and the HOTA of image
+    boxes (where TrackEval is installed). Tracks that were written with --full are tested for calibration too.
 
     The best threshold is the one on the mean score of a track that gives the highest MOTA.
     """
-    from optipmb_client.evaluation import evaluate_files  # noqa: PLC0415  loads the solvers of scipy
+    from optipmb_client.commands.tables import (  # noqa: PLC0415  loads the solvers of scipy
+        clear_table,
+        figure_tables,
+        nuscenes_table,
+    )
+    from optipmb_client.evaluation import evaluate_files  # noqa: PLC0415  as above
+    from optipmb_client.evaluation.figures import (  # noqa: PLC0415  as above
+        Settings,
+        evaluate_figures,
+        load_recordings,
+    )
+    from optipmb_client.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
 
     _, chosen = open_sequences(dataset, root, detections, sequences, option)
-    results = evaluate_files(chosen, tracks, classes or labels_of(chosen), _rules(dataset, iou, distance))
-    if not results:
+    sequence_names = [sequence.name for sequence in chosen]
+    names = tuple(classes or labels_of(chosen))
+    report: dict[str, Any] = {
+        "command": "evaluate",
+        "dataset": dataset,
+        "tracks": tracks,
+        "sequences": sequence_names,
+    }
+    head: list[RenderableType] = []
+    settings = Settings(cutoff=cutoff, order=order) if iou is None else Settings((iou,), cutoff, order)
+    if dataset == "nuscenes" and root is not None:
+        if iou is not None or distance is not None:
+            raise UsageError("--iou and --distance: the benchmark of nuScenes has its own rules")
+        scores = evaluate_nuscenes(root, tracks, sequence_names)
+        head = [nuscenes_table(scores, names)]
+        report["overall"] = scores.to_json()["overall"]
+        parts = {name: {"nuscenes": one.to_json()} for name, one in scores.classes.items() if name in names}
+        best = {name: scores.classes[name].best.threshold for name in parts}
+    else:
+        results = evaluate_files(chosen, tracks, names, _rules(dataset, iou, distance))
+        parts = {one.name: _figures(one) for one in results}
+        best = {} if dataset == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
+        if dataset != "kitti" or distance is not None:  # AB3DMOT's protocol gives them at its own threshold
+            head = [clear_table(results, metres=iou is None)]
+    figures = evaluate_figures(dataset, load_recordings(dataset, chosen, tracks), names, settings, best)
+    if not figures:
         raise UsageError("neither the truth nor the tracks have objects of these classes")
     if as_json:
-        print_json(
-            {
-                "command": "evaluate",
-                "dataset": dataset,
-                "tracks": tracks,
-                "sequences": [sequence.name for sequence in chosen],
-                "classes": {result.name: _figures(result) for result in results},
-            }
-        )
-    else:
-        print_table(_table(results))
+        report["classes"] = {one.name: {**parts.get(one.name, {}), **one.summary()} for one in figures}
+        print_json(report)
+        return
+    for table in (*head, *figure_tables(figures, cutoff)):
+        print_table(table)
 
 
 def labels_of(sequences: Many[DataSequence]) -> tuple[str, ...]:
@@ -95,23 +128,3 @@ def _figures(result: "ClassResult") -> dict[str, Any]:
         "best": {"score": result.sweep.thresholds[best], **result.sweep.results[best].summary()},
         "sequences": {name: single.summary() for name, single in result.sequences.items()},
     }
-
-
-def _table(results: Many["ClassResult"]) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for name in ("class", "score from", *SHOWN):
-        table.add_column(name, justify="left" if name == "class" else "right", no_wrap=True)
-    for result in results:
-        best = result.sweep.best
-        for name, threshold, figures in (
-            (result.name, "all", result.total.summary()),
-            ("", f"{result.sweep.thresholds[best]:.3f}", result.sweep.results[best].summary()),
-        ):
-            table.add_row(name, threshold, *(_shown(figures[column]) for column in SHOWN))
-    return table
-
-
-def _shown(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return str(value) if isinstance(value, int) else f"{value:.4f}"

@@ -22,6 +22,9 @@ Where the paper leaves a choice, the choices are those of its published evaluati
   share of an object's life that is followed treat the first and the last frame of the life in a way of their own.
 - AMOTA sums MOTA_r as it is, negative too. Among equal values of MOTA the highest threshold is the best one, and if no
   threshold has a MOTA above zero, all tracks are kept.
+
+Two accidents of the published code are not repeated: tracks exactly at a threshold are kept, whatever their mean score is
+rounded to, and no threshold knows what was matched at another. Either changes a count by one or two, if at all.
 """
 
 from collections.abc import Iterable, Sequence

@@ -1,0 +1,27 @@
+"""Tuning: from a detector's results and labels to a parameter profile, and what each module of the tracker is worth."""
+
+from optipmb_client.tuning.ablation import ROWS, Row, ablate
+from optipmb_client.tuning.display import TrialDisplay
+from optipmb_client.tuning.estimate import Estimate, estimate
+from optipmb_client.tuning.figures import Figures
+from optipmb_client.tuning.run import Source, Tuned, estimate_all, tune_all
+from optipmb_client.tuning.session import Plan, Refined, refine
+from optipmb_client.tuning.values import value_of
+
+__all__ = [
+    "ROWS",
+    "Estimate",
+    "Figures",
+    "Plan",
+    "Refined",
+    "Row",
+    "Source",
+    "TrialDisplay",
+    "Tuned",
+    "ablate",
+    "estimate",
+    "estimate_all",
+    "refine",
+    "tune_all",
+    "value_of",
+]

@@ -129,8 +129,11 @@ def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Ru
         values["area"] = table.clutter_rate * clutter_area / clutter if clutter > 0 else math.nan
         values["max_misses"] = math.ceil(gap) if math.isfinite(gap) else math.nan
     flips = float((np.abs(errors.heading) > 0.5 * np.pi).mean()) if count else math.nan
-    kept: dict[str, Value] = {path: _fitting(parameters, name, path, value) for path, value in values.items()
-                              if math.isfinite(value) and value > 0}
+    kept: dict[str, Value] = {
+        path: _fitting(parameters, name, path, value)
+        for path, value in values.items()
+        if math.isfinite(value) and value > 0
+    }
     if count >= LEAST_PAIRS:
         kept["heading_sign_reliable"] = flips < RELIABLE_FLIPS
     bins, scale, shift = _scores(everything)
@@ -221,9 +224,7 @@ def _unbroken(path: Trajectory, longest: float) -> list[Trajectory]:
     ]
 
 
-def _birth(
-    errors: Residuals, pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]
-) -> dict[str, float]:
+def _birth(errors: Residuals, pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]) -> dict[str, float]:
     """Return P^0 from the first detection of each object, and from what objects do."""
     first = errors.first
     velocity = errors.velocity[first]

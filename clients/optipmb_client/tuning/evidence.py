@@ -80,9 +80,7 @@ def weigh(
     return found
 
 
-def _values(
-    bench: Bench, parameters: Parameters, clips: tuple[int, ...], subsets: Sequence[tuple[int, ...]]
-) -> Floats:
+def _values(bench: Bench, parameters: Parameters, clips: tuple[int, ...], subsets: Sequence[tuple[int, ...]]) -> Floats:
     """Return the objective on subsets of the sequences."""
     measured = bench.measure(parameters, clips)
     return np.array(

@@ -1,11 +1,11 @@
 """What tuning works on: the detections of one class, ready to be tracked any number of times, and the truth.
 
-Conventions: frames are in the world frame, made once by `optipmb.make_frame`; so are the tracks. The truth is in the
-sensor frame of each row's frame, where the benchmarks compare.
+Conventions: frames are in the world frame, made once by `optipmb.make_frame`; so are the tracks. The truth is in
+the sensor frame of each row's frame, where KITTI compares, and in the world frame.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,6 +38,8 @@ class Clip:
     """In whose image the benchmark counts; None where it does not."""
     truth: Truth
     """Of these classes and those alike, in the sensor frame of each row's frame."""
+    world: Truth
+    """The same in the world frame."""
 
     @property
     def stamps(self) -> Ints:
@@ -57,6 +59,7 @@ def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
     if truth is None:
         raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
     alike = {name for label in parameters.labels for name in (label, *rules.neighbours.get(label, ()))}
+    kept = truth.take(np.isin(truth.names, sorted(alike)))
     rotation, translation = stack_poses(sequence.poses)
     return Clip(
         name=sequence.name,
@@ -65,7 +68,8 @@ def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
         rotation=rotation,
         translation=translation,
         camera=getattr(sequence, "camera", None),
-        truth=truth.to_sensor(sequence.poses).take(np.isin(truth.names, sorted(alike))),
+        truth=kept.to_sensor(sequence.poses),
+        world=kept,
     )
 
 
@@ -99,40 +103,34 @@ def prepare_frames(name: str, given: Sequence[DetectionFrame], parameters: Param
     return tuple(frames)
 
 
-def rows_of(frame: Frame, rows: Ints) -> Frame:
-    """Return a frame with some of its detections; all keep their place in `source`."""
-    return Frame(
-        stamp_ns=frame.stamp_ns,
-        center=frame.center[rows],
-        size=frame.size[rows],
-        yaw=frame.yaw[rows],
-        velocity=frame.velocity[rows],
-        score=frame.score[rows],
-        label=frame.label[rows],
-        source=frame.source[rows],
-        cloud=frame.cloud,
-    )
-
-
 def of_class(clip: Clip, name: str, rules: Rules) -> Clip:
     """Return a clip with the detections and the truth of one class only, for parameters with this class only."""
     index = clip.labels.index(name)
     frames = []
     for frame in clip.frames:
-        chosen = rows_of(frame, np.flatnonzero(frame.label == index))
-        frames.append(
-            Frame(**{**{key: getattr(chosen, key) for key in _COLUMNS}, "label": np.zeros_like(chosen.label)})
-        )
+        chosen = np.flatnonzero(frame.label == index)
+        columns = {key: getattr(frame, key)[chosen] for key in _COLUMNS}
+        frames.append(replace(frame, label=np.zeros(len(chosen), dtype=np.int64), **columns))
     alike = (name, *rules.neighbours.get(name, ()))
-    truth = clip.truth.take(np.isin(clip.truth.names, alike))
-    return Clip(clip.name, (name,), tuple(frames), clip.rotation, clip.translation, clip.camera, truth)
+    rows = np.isin(clip.truth.names, alike)
+    return replace(clip, labels=(name,), frames=tuple(frames), truth=clip.truth.take(rows), world=clip.world.take(rows))
 
 
-_COLUMNS = ("stamp_ns", "center", "size", "yaw", "velocity", "score", "source", "cloud")
+_COLUMNS = ("center", "size", "yaw", "velocity", "score", "source")
 
 
-def track_clip(clip: Clip, parameters: Parameters, modules: Modules | None = None) -> ResultTable:
-    """Return the tracks of a clip in the world frame, with image boxes where there is a camera."""
+def track_clip(
+    clip: Clip, parameters: Parameters, modules: Modules | None = None, *, every_frame: bool = False
+) -> ResultTable:
+    """Return the tracks of a clip in the world frame, with image boxes where there is a camera.
+
+    Args:
+        clip: with detections of the classes of the parameters.
+        parameters: with the classes of the clip.
+        modules: of the tracker.
+        every_frame: also step through frames in which nothing can happen; the tracks are the same.
+
+    """
     tracker = Tracker(parameters, modules)
     least = min(one.score_filter for one in parameters.classes.values())
     density = tracker.initial()
@@ -140,7 +138,7 @@ def track_clip(clip: Clip, parameters: Parameters, modules: Modules | None = Non
     for index, frame in enumerate(clip.frames):
         # Nothing there and nothing new: the step would give the same density with another stamp, which nothing reads.
         empty = not len(density.bernoulli) and not len(density.poisson)
-        if empty and not (frame.score >= least).any():
+        if empty and not every_frame and not (frame.score >= least).any():
             continue
         result = tracker.step(density, frame)
         density = result.density

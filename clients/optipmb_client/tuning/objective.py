@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Self
 
 from optipmb import Parameters, warm_up
+from optipmb_client.datasets import Truth
 from optipmb_client.tuning.figures import Figures
 from optipmb_client.tuning.material import Clip, track_clip
 from optipmb_client.tuning.scoring import Measured, Scorer
@@ -84,23 +85,27 @@ class Bench:
         """Return how many boxes the truth of a sequence has that count."""
         return int((~self._own(clip).ignored).sum())
 
-    def _own(self, clip: int):  # type: ignore[no-untyped-def]
+    def _own(self, clip: int) -> Truth:
         truth = self.variants[0][clip].truth
         return truth.take(truth.names == self.scorer.name)
 
-    def measure(self, parameters: Parameters, clips: Sequence[int]) -> list[list[Measured]]:
-        """Return what tracking some sequences gave, for each variant."""
+    def measure(
+        self, parameters: Parameters, clips: Sequence[int], variants: Sequence[int] | None = None
+    ) -> list[list[Measured]]:
+        """Return what tracking some sequences gave, for each variant, or each of some."""
         key = parameters.model_dump_json()
-        wanted = [(variant, clip) for variant in range(len(self.variants)) for clip in clips]
-        missing = [place for place in wanted if (key, *place) not in self._known]
+        chosen = range(len(self.variants)) if variants is None else variants
+        wanted = [(key, variant, clip) for variant in chosen for clip in clips]
+        missing = [place for place in wanted if place not in self._known]
         if self._pool is None:
-            found = [_measure(self.variants[v][c], self.scorer, parameters) for v, c in missing]
+            found = [_measure(self.variants[v][c], self.scorer, parameters) for _, v, c in missing]
         else:
-            tasks = [self._pool.submit(_measure_held, v, c, parameters) for v, c in missing]
+            tasks = [self._pool.submit(_measure_held, v, c, parameters) for _, v, c in missing]
             found = [task.result() for task in tasks]
-        for place, one in zip(missing, found, strict=True):
-            self._known[(key, *place)] = one
-        result = [[self._known[(key, variant, clip)] for clip in clips] for variant in range(len(self.variants))]
+        self._known.update(zip(missing, found, strict=True))
+        for place in wanted:
+            self._known.move_to_end(place)
+        result = [[self._known[(key, variant, clip)] for clip in clips] for variant in chosen]
         while len(self._known) > _REMEMBERED * len(self.variants) * len(self.names):
             self._known.popitem(last=False)
         return result

@@ -12,7 +12,7 @@ import numpy as np
 from optipmb_client.evaluation import Rules
 from optipmb_client.evaluation.assignment import assign_frames, most_pairs
 from optipmb_client.evaluation.cases import prepare
-from optipmb_client.geometry import Bools, Floats, Ints, to_sensor, to_world, wrap_angle
+from optipmb_client.geometry import Bools, Floats, Ints, to_sensor, wrap_angle
 from optipmb_client.results import ResultTable
 from optipmb_client.tuning.material import Clip
 
@@ -39,8 +39,7 @@ class Trajectory:
 
 def trajectories(clip: Clip, name: str) -> dict[int, Trajectory]:
     """Return the labelled objects of a class by id."""
-    truth = clip.truth.take(clip.truth.names == name)
-    center, yaw = to_world(clip.rotation[truth.frame], clip.translation[truth.frame], truth.center, truth.yaw)
+    truth = clip.world.take(clip.world.names == name)
     stamps = clip.stamps
     found = {}
     for identity in np.unique(truth.id).tolist():
@@ -50,9 +49,9 @@ def trajectories(clip: Clip, name: str) -> dict[int, Trajectory]:
         found[identity] = Trajectory(
             frame=frame,
             time=(stamps[frame] - stamps[0]) * 1e-9,
-            position=center[rows, :2],
-            yaw=yaw[rows],
-            velocity=_velocities(truth.velocity[rows], (stamps[frame] - stamps[0]) * 1e-9, center[rows, :2]),
+            position=truth.center[rows, :2],
+            yaw=truth.yaw[rows],
+            velocity=_velocities(truth.velocity[rows], (stamps[frame] - stamps[0]) * 1e-9, truth.center[rows, :2]),
             ignored=truth.ignored[rows],
         )
     return found
@@ -106,13 +105,10 @@ def pair_detections(clip: Clip, name: str, least: float, limit: float, rules: Ru
     """
     frames = clip.frames
     when: Ints = np.repeat(np.arange(len(frames)), [len(frame.score) for frame in frames]).astype(np.int64)
-    center, size, yaw, velocity, score = (
-        np.concatenate([np.asarray(getattr(frame, key)) for frame in frames]) for key in _COLUMNS
-    )
-    use = score >= least
-    when, center, size, yaw, velocity, score = (
-        column[use] for column in (when, center, size, yaw, velocity, score)
-    )
+    columns: dict[str, Floats] = {key: np.concatenate([getattr(frame, key) for frame in frames]) for key in _COLUMNS}
+    use = columns["score"] >= least
+    when = when[use]
+    center, size, yaw, velocity, score = (columns[key][use] for key in _COLUMNS)
     local, turned = to_sensor(clip.rotation[when], clip.translation[when], center, yaw)
     image = clip.camera.boxes(local, size, turned)[0] if clip.camera else np.full((len(when), 4), np.nan)
     rows = np.arange(len(when))
@@ -202,5 +198,4 @@ def _residuals(
 
 def detected_frames(pairs: Pairs, identity: int) -> Ints:
     """Return the frames in which an object is detected, ascending."""
-    return pairs.frame[pairs.object == identity]
-
+    return np.asarray(pairs.frame[pairs.object == identity], dtype=np.int64)

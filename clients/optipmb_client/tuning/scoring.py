@@ -13,13 +13,14 @@ from optipmb_client.datasets.nuscenes import NuScenesSequence
 from optipmb_client.evaluation import Case, Rules, default_rules
 from optipmb_client.evaluation.ab3dmot import ab3dmot_rules
 from optipmb_client.evaluation.cases import prepare
+from optipmb_client.evaluation.figures import CENTRE_DISTANCE
 from optipmb_client.evaluation.nuscenes_figures import evaluate_class
 from optipmb_client.evaluation.nuscenes_matching import Pairing, pair
 from optipmb_client.evaluation.nuscenes_scene import NuScenesConfig, NuScenesScene, prepare_scene
 from optipmb_client.geometry import to_sensor
 from optipmb_client.results import ResultTable
 from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
-from optipmb_client.tuning.figures import HOTA_DISTANCE, Figures, ab3dmot_figures, distance_figures
+from optipmb_client.tuning.figures import Figures, ab3dmot_figures, distance_figures
 from optipmb_client.tuning.material import Clip
 
 __all__ = ["BoxScorer", "Measured", "NuScenesScorer", "Scorer", "rules_of", "scorer_of"]
@@ -59,22 +60,25 @@ class BoxScorer:
 
     name: str
     rules: Rules
+    near: Rules
+    """By the distance of centres, for HOTA; the same where the rules are so themselves."""
 
     def measure(self, clip: Clip, tracks: ResultTable) -> Measured:
         """Compare the tracks of a clip, in the world frame, with its truth."""
+        near = prepare(clip.world, tracks, self.name, self.near, clip.name)
+        if self.rules.measure == "distance":
+            return Measured(near, near)
         when = tracks.frame
         center, yaw = to_sensor(clip.rotation[when], clip.translation[when], tracks.center, tracks.yaw)
         local = replace(tracks, center=center, yaw=yaw)
-        case = prepare(clip.truth, local, self.name, self.rules, clip.name)
-        near = replace(self.rules, measure="distance", limit=HOTA_DISTANCE)
-        return Measured(case, case if near == self.rules else prepare(clip.truth, local, self.name, near, clip.name))
+        return Measured(prepare(clip.truth, local, self.name, self.rules, clip.name), near)
 
     def figures(self, measured: Sequence[Measured]) -> Figures:
         """Return the figures of some sequences together."""
-        cases = [one.case for one in measured]
+        near = [one.near for one in measured]
         if self.rules.measure == "distance":
-            return distance_figures(cases, self.rules)
-        return ab3dmot_figures(cases, [one.near for one in measured], self.rules.limit)
+            return distance_figures(near, self.near)
+        return ab3dmot_figures([one.case for one in measured], near, self.rules, self.near)
 
 
 @dataclass(frozen=True)
@@ -134,7 +138,7 @@ def rules_of(dataset: str) -> Rules:
 
 def scorer_of(dataset: str, name: str, sequences: Sequence[DataSequence]) -> Scorer:
     """Return the scorer of a class of a dataset."""
-    boxes = BoxScorer(name, rules_of(dataset))
+    boxes = BoxScorer(name, rules_of(dataset), default_rules(dataset, "distance", CENTRE_DISTANCE))
     scenes = [sequence for sequence in sequences if isinstance(sequence, NuScenesSequence)]
     if not scenes or len(scenes) < len(sequences):
         return boxes

@@ -1,0 +1,95 @@
+"""`optipmb ablate`: what each module of the tracker is worth on a dataset."""
+
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from optipmb_client.commands.options import (
+    AsJson,
+    Classes,
+    DatasetName,
+    Detections,
+    Options,
+    Profile,
+    Root,
+    Sequences,
+    open_sequences,
+    print_json,
+    print_table,
+)
+from optipmb_client.progress import FrameProgress
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence as Many
+
+    from optipmb_client.tuning import Figures, Row
+
+MODULES = ("adp", "habm", "rpp", "ote")
+SHOWN = ("AMOTA", "AMOTP", "FN", "FP", "IDS", "sAMOTA", "MOTA", "MOTP", "HOTA")
+
+
+def ablate(
+    *,
+    dataset: DatasetName,
+    root: Root = None,
+    detections: Detections = None,
+    sequences: Sequences = None,
+    option: Options = None,
+    profile: Profile = None,
+    classes: Classes = None,
+    as_json: AsJson = False,
+) -> None:
+    """Track a dataset with every choice of the four modules on and off: the sixteen rows of the paper's ablation.
+
+    All classes of the profile are tracked, those named are shown. FPS are frames per second of the tracker alone.
+    """
+    from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
+    from optipmb_client.offline import read_profile  # noqa: PLC0415  as above
+
+    opened, chosen = open_sequences(dataset, root, detections, sequences, option)
+    name = profile or opened.profile
+    parameters = read_profile(name)
+    source = tuning.Source.of(dataset, detections, chosen, parameters, classes)
+    lengths = [len(clip.frames) for clip in source.clips] * len(tuning.ROWS)
+    done = iter(lengths)
+    with FrameProgress("ablation", sum(lengths)) as progress:
+        rows = list(
+            tuning.ablate(
+                dataset, chosen, source.clips, parameters, source.classes, lambda: progress.advance(next(done))
+            )
+        )
+    if as_json:
+        print_json(
+            {
+                "command": "ablate",
+                "dataset": dataset,
+                "profile": name,
+                "sequences": [sequence.name for sequence in chosen],
+                "rows": [row.to_json() for row in rows],
+            }
+        )
+        return
+    for label in source.classes:
+        print_table(_table(label, rows, [row.classes[label] for row in rows]))
+    if len(source.classes) > 1:
+        print_table(_table("all classes", rows, [row.overall for row in rows]))
+
+
+def _table(title: str, rows: "Many[Row]", figures: "Many[Figures]") -> Table:
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for name in (*(module.upper() for module in MODULES), *SHOWN, "FPS"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row, one in zip(rows, figures, strict=True):
+        values = one.to_json()
+        table.add_row(
+            *("x" if getattr(row.modules, module) else "" for module in MODULES),
+            *(_shown(values[name]) for name in SHOWN),
+            f"{row.frames_per_second:.0f}",
+        )
+    return table
+
+
+def _shown(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return str(int(value)) if value == int(value) else f"{value:.4f}"

@@ -1,0 +1,170 @@
+"""`optipmb tune`: from detections and labels to a parameter profile."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from optipmb_client.commands.options import (
+    AsJson,
+    Classes,
+    DatasetName,
+    Detections,
+    Options,
+    Out,
+    Profile,
+    Root,
+    Sequences,
+    open_sequences,
+    print_json,
+    print_table,
+    say,
+)
+from optipmb_client.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from optipmb_client.tuning import Estimate, Figures, Refined
+
+SHOWN = ("sAMOTA", "AMOTA", "MOTA", "MOTP", "HOTA", "IDS", "FP", "FN", "GT")
+METRICS = ("combination", "samota", "amota", "mota", "hota")
+
+
+def tune(  # noqa: PLR0913  these are the command's options
+    *,
+    dataset: DatasetName,
+    root: Root = None,
+    detections: Detections = None,
+    sequences: Sequences = None,
+    option: Options = None,
+    profile: Profile = None,
+    classes: Classes = None,
+    out: Out = Path("out/tune"),
+    estimate_only: Annotated[
+        bool, typer.Option("--estimate-only", help="Only what the data say by themselves.")
+    ] = False,
+    metric: Annotated[str, typer.Option(help=f"What is maximised: {', '.join(METRICS)}.")] = "combination",
+    trials: Annotated[int, typer.Option(min=1, help="Trials of the search on all sequences.")] = 120,
+    folds: Annotated[int, typer.Option(min=0, help="Groups of sequences that are left out in turn; 0: none.")] = 3,
+    fold_trials: Annotated[
+        int | None, typer.Option(min=1, help="Trials of the search without a group; default: half of --trials.")
+    ] = None,
+    degrade: Annotated[int, typer.Option(min=0, help="Degraded copies of the detections beside the plain ones.")] = 1,
+    everything: Annotated[bool, typer.Option("--all", help="Search the parameters of the paper's table too.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of all chance.")] = 0,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that track.")] = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate the parameters of each class from labelled data, then refine them by tracking.
+
+    A second call with the same --out goes on where the first one ended.
+    """
+    from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
+    from optipmb_client.offline import read_profile  # noqa: PLC0415  as above
+
+    if metric not in METRICS:
+        raise UsageError(f"--metric: one of {', '.join(METRICS)}, received {metric!r}")
+    opened, chosen = open_sequences(dataset, root, detections, sequences, option)
+    parameters = read_profile(profile or opened.profile)
+    source = tuning.Source.of(dataset, detections, chosen, parameters, classes)
+    estimates = tuning.estimate_all(source, parameters, out)
+    if not as_json:
+        for one in estimates.values():
+            print_table(_estimate(one, {path: tuning.value_of(parameters, one.name, path) for path in one.values}))
+    if estimate_only:
+        if as_json:
+            print_json({"command": "tune", "out": out, "estimates": {k: e.to_json() for k, e in estimates.items()}})
+        else:
+            say(f"estimates in {out}/estimate.json, as a profile in {out}/estimated.toml")
+        return
+    plan = tuning.Plan(
+        metric=metric,
+        trials=trials,
+        fold_trials=fold_trials or max(1, trials // 2),
+        folds=folds,
+        copies=degrade,
+        seed=seed,
+        everything=everything,
+        jobs=jobs,
+    )
+    with tuning.TrialDisplay() as display:
+        tuned = tuning.tune_all(source, parameters, plan, out, display)
+    if as_json:
+        results: Mapping[str, Any] = {name: one.to_json() for name, one in tuned.classes.items()}
+        print_json({"command": "tune", "profile": tuned.profile, "classes": results})
+        return
+    for refined in tuned.classes.values():
+        print_table(_report(refined))
+    say(f"profile in {tuned.profile}")
+
+
+def _estimate(found: "Estimate", before: "Mapping[str, object]") -> Group:
+    table = Table(box=None, pad_edge=False)
+    table.add_column(found.name)
+    table.add_column("profile", justify="right")
+    table.add_column("estimate", justify="right")
+    for path, value in found.values.items():
+        table.add_row(path, str(before[path]), str(value))
+    facts = (
+        f"{found.labels} boxes of {found.objects} objects, {found.detections} detections, {found.pairs} on labels; "
+        f"found {_share(found.detection)}, {found.clutter:.2f} false a frame; "
+        f"turned round {_share(found.flip_rate)}; errors of neighbouring frames correlate {found.lasting:.2f}"
+    )
+    scores = "score -> true: " + "  ".join(f"{one.score:.2f} -> {one.precision:.2f}" for one in found.bins)
+    return Group(table, Text(facts), Text(scores), Text())
+
+
+def _share(value: float) -> str:
+    return f"{100.0 * value:.1f} %"
+
+
+def _report(refined: "Refined") -> Group:
+    figures = Table(box=None, pad_edge=False)
+    figures.add_column(refined.name)
+    for name in SHOWN:
+        figures.add_column(name, justify="right")
+    copies = ("", *(f", degraded {i + 1}" for i in range(refined.plan.copies)))
+    for title, rows in (
+        ("before", refined.before),
+        ("cross-validated", refined.crossed),
+        ("after (on what chose it)", refined.after),
+    ):
+        for copy, row in zip(copies, rows, strict=False):
+            figures.add_row(title + copy, *_cells(row))
+    for fold in refined.folds:
+        figures.add_row(f"without {' '.join(fold.sequences)}: before", *_cells(fold.before[0]))
+        figures.add_row(f"without {' '.join(fold.sequences)}: after", *_cells(fold.after[0]))
+    evidence = Table(box=None, pad_edge=False)
+    for column in ("changed", "from", "to", "gain", "+-", "gains", "kept"):
+        evidence.add_column(column, justify="left" if column == "changed" else "right")
+    for one in refined.evidence:
+        error = f"{one.error:.5f}" if math.isfinite(one.error) else "-"
+        gains = f"{one.positive} of {one.groups}"
+        cells = (str(one.start), str(one.value), f"{one.gain:.5f}", error, gains, "yes" if one.kept else "no")
+        evidence.add_row(one.path, *cells)
+    return Group(figures, Text(), evidence, Text(_objective(refined)), Text())
+
+
+def _objective(refined: "Refined") -> str:
+    text = f"{refined.plan.metric}: before {refined.value_before:.4f}, after {refined.value_after:.4f}"
+    if refined.value_crossed is None:
+        return f"{text}; no sequences were left out, so how much of it holds elsewhere is not known"
+    gains = [fold.value_after - fold.value_before for fold in refined.folds]
+    shown = ", ".join(f"{gain:+.4f}" for gain in gains)
+    return f"{text}, cross-validated {refined.value_crossed:.4f}; gains on what was left out: {shown}"
+
+
+def _cells(figures: "Figures") -> list[str]:
+    values = figures.to_json()
+    return [_shown(values[name]) for name in SHOWN]
+
+
+def _shown(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return str(int(value)) if value == int(value) else f"{value:.4f}"

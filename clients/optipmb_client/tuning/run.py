@@ -1,0 +1,156 @@
+"""Tuning a dataset: its classes one after the other, and the files that come of it.
+
+In the output folder: `estimate.json` and `estimated.toml` (what the data say without tracking), `trials.db` (every
+trial, to go on from), `report.json` (figures, folds, evidence) and `tuned.toml`, the profile. The same data, options
+and versions give the same bytes of all but `trials.db`.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from optipmb import Parameters
+from optipmb_client.datasets import DataSequence
+from optipmb_client.errors import UsageError
+from optipmb_client.files import AtomicText
+from optipmb_client.tuning.estimate import Estimate, estimate
+from optipmb_client.tuning.material import Clip, load, of_class
+from optipmb_client.tuning.scoring import rules_of, scorer_of
+from optipmb_client.tuning.session import Plan, Refined, refine
+from optipmb_client.tuning.values import only, with_classes, with_values, write_profile
+from optipmb_client.tuning.watch import Watch
+
+__all__ = ["Source", "Tuned", "estimate_all", "tune_all"]
+
+
+@dataclass(frozen=True)
+class Source:
+    """The data."""
+
+    dataset: str
+    detections: str
+    """Name of the detector."""
+    sequences: Sequence[DataSequence]
+    clips: Sequence[Clip]
+    classes: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        dataset: str,
+        detections: str | None,
+        sequences: Sequence[DataSequence],
+        parameters: Parameters,
+        classes: Sequence[str] | None,
+    ) -> "Source":
+        """Read the sequences; the classes are those of the parameters that have labels, or those asked for.
+
+        Raises:
+            DatasetError: a sequence has no truth.
+            UsageError: a class is not in the parameters, or has no labels.
+
+        """
+        clips = [load(sequence, parameters, rules_of(dataset)) for sequence in sequences]
+        labelled = {name for clip in clips for name in set(clip.truth.names[~clip.truth.ignored].tolist())}
+        wanted = tuple(classes or (name for name in parameters.labels if name in labelled))
+        for name in wanted:
+            if name not in parameters.labels:
+                raise UsageError(
+                    f"--classes: the profile has no class {name!r} (it has: {', '.join(parameters.labels)})"
+                )
+            if name not in labelled:
+                raise UsageError(f"--classes: nothing in these sequences is labelled {name!r}")
+        if not wanted:
+            raise UsageError("nothing in these sequences is labelled with a class of the profile")
+        return cls(dataset, detections or "", sequences, clips, wanted)
+
+    def of_class(self, name: str) -> list[Clip]:
+        """Return the clips with one class only."""
+        return [of_class(clip, name, rules_of(self.dataset)) for clip in self.clips]
+
+    @property
+    def title(self) -> str:
+        """The data in a few words."""
+        detections = f", detections {Path(self.detections).name}" if self.detections else ""
+        return f"{self.dataset}{detections}, sequences {' '.join(one.name for one in self.sequences)}"
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What came of it."""
+
+    profile: Path
+    classes: dict[str, Refined]
+
+
+def estimate_all(source: Source, parameters: Parameters, out: Path) -> dict[str, Estimate]:
+    """Estimate every class, and write `estimate.json` and `estimated.toml`."""
+    found, tables = {}, {}
+    for name in source.classes:
+        clips, base = source.of_class(name), only(parameters, name)
+        found[name] = estimate(clips, name, base, rules_of(source.dataset))
+        tables[name] = with_values(base, name, found[name].values)
+    out.mkdir(parents=True, exist_ok=True)
+    _write_json(out / "estimate.json", {name: one.to_json() for name, one in found.items()})
+    provenance = f"{_from(parameters)}\n{_by('estimate')}: {source.title}; classes {' '.join(source.classes)}."
+    write_profile(out / "estimated.toml", with_classes(parameters, tables, _named(parameters, "estimated"), provenance))
+    return found
+
+
+def tune_all(source: Source, parameters: Parameters, plan: Plan, out: Path, watch: Watch) -> Tuned:
+    """Tune every class, and write `report.json` and `tuned.toml`.
+
+    Raises:
+        UsageError: the folder has trials of other data or options.
+
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    results = {}
+    for name in source.classes:
+        scorer = scorer_of(source.dataset, name, source.sequences)
+        context = {"dataset": source.dataset, "detections": source.detections, "detected": _sum(source.of_class(name))}
+        results[name] = refine(source.of_class(name), scorer, parameters, plan, out / "trials.db", context, watch)
+    _write_json(out / "report.json", {name: one.to_json() for name, one in results.items()})
+    scope = "all parameters" if plan.everything else "noise, birth spread, area, forgetting"
+    judged = f"{plan.folds} groups left out in turn" if any(one.folds for one in results.values()) else "none left out"
+    provenance = (
+        f"{_from(parameters)}\n{_by('tune')}: {source.title}; classes {' '.join(source.classes)}; {scope}; metric"
+        f" {plan.metric}; {plan.trials} trials; {judged}, {plan.fold_trials} trials each; detections plain and in"
+        f" {plan.copies} degraded copies; seed {plan.seed}."
+    )
+    tables = {name: one.parameters for name, one in results.items()}
+    profile = out / "tuned.toml"
+    write_profile(profile, with_classes(parameters, tables, _named(parameters, "tuned"), provenance))
+    return Tuned(profile, results)
+
+
+def _sum(clips: Sequence[Clip]) -> list[float]:
+    """Return a few numbers that other detections would not have."""
+    frames = [frame for clip in clips for frame in clip.frames]
+    return [
+        len(frames),
+        sum(len(frame.score) for frame in frames),
+        float(sum(float(frame.score.sum()) for frame in frames)),
+        float(sum(float(frame.center.sum()) for frame in frames)),
+    ]
+
+
+def _named(parameters: Parameters, what: str) -> str:
+    return parameters.name if parameters.name.endswith(what) else f"{parameters.name}-{what}"
+
+
+def _from(parameters: Parameters) -> str:
+    return f"{parameters.provenance or 'No provenance.'} (profile {parameters.name})"
+
+
+def _by(step: str) -> str:
+    return f"optipmb {version('optipmb')}, {step}"
+
+
+def _write_json(path: Path, content: Any) -> None:
+    file = AtomicText(path)
+    file.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    file.close()

@@ -1,0 +1,141 @@
+"""All figures together: from files, by the command, and of the real truth."""
+
+import json
+from pathlib import Path
+
+import pytest
+from evaluation_cases import write_kitti
+from optipmb_client.cli import run
+from optipmb_client.datasets import DatasetError, open_dataset
+from optipmb_client.evaluation.figures import Settings, evaluate_figures, load_recordings
+from real_data import kitti_root, nuscenes_root
+
+CLASSES = ("Car", "Pedestrian", "Cyclist")
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The root of a generated benchmark and a folder of results."""
+    root = tmp_path_factory.mktemp("kitti")
+    return write_kitti(root, root / "results", 1), root / "results"
+
+
+def test_the_real_truth_scores_a_hundred(tmp_path: Path) -> None:
+    """The truth of real sequences, as result files, is perfect by every measure; ids alone changed, the sets still are."""
+    lines = {}
+    sequences = open_dataset("kitti", kitti_root()).sequences(["0000", "0011"])
+    for sequence in sequences:
+        text = (kitti_root() / "training" / "label_02" / f"{sequence.name}.txt").read_text()
+        lines[sequence.name] = [
+            line.split() for line in text.splitlines() if "DontCare" not in line and " Van " not in line
+        ]
+        (tmp_path / f"{sequence.name}.txt").write_text(
+            "".join(" ".join([*line, "0.9\n"]) for line in lines[sequence.name])
+        )
+    for one in evaluate_figures("kitti", load_recordings("kitti", sequences, tmp_path), ("Car", "Pedestrian")):
+        for result in one.ab3dmot:
+            figures = result.summary()
+            assert [figures[name] for name in ("sAMOTA", "AMOTA", "MOTA")] == pytest.approx([1.0] * 3)
+            assert [figures[name] for name in ("FP", "FN", "IDS")] == [0, 0, 0]
+        assert one.everything.hota.hota == pytest.approx(1.0)
+        if one.everything.hota_2d is not None:
+            assert one.everything.hota_2d.hota == pytest.approx(1.0)
+        assert one.everything.gospa.gospa == pytest.approx(0.0, abs=1e-6)
+    for sequence in sequences:
+        fresh = [
+            " ".join([line[0], str(number), *line[2:], "0.9\n"]) for number, line in enumerate(lines[sequence.name])
+        ]
+        (tmp_path / f"{sequence.name}.txt").write_text("".join(fresh))
+    for one in evaluate_figures("kitti", load_recordings("kitti", sequences, tmp_path), ("Car", "Pedestrian")):
+        assert one.ab3dmot[0].best.switches > 0.5 * one.ab3dmot[0].best.truth
+        assert one.everything.hota.deta == pytest.approx(1.0)
+        assert one.everything.hota.assa < 0.05
+        assert one.everything.gospa.gospa == pytest.approx(0.0, abs=1e-6)
+
+
+def test_empty_results_score_zero(kitti: tuple[Path, Path], tmp_path: Path) -> None:
+    """Result files without a line give zeros, or nothing where a figure is not defined, and no error."""
+    sequences = open_dataset("kitti", kitti[0]).sequences(["all"])
+    for sequence in sequences:
+        (tmp_path / f"{sequence.name}.txt").write_text("")
+    for one in evaluate_figures("kitti", load_recordings("kitti", sequences, tmp_path), CLASSES):
+        assert {(result.samota, result.amota, result.best.mota) for result in one.ab3dmot} == {(0.0, 0.0, 0.0)}
+        assert one.everything.hota.hota == 0.0
+        assert one.everything.gospa.false == 0.0 < one.everything.gospa.missed
+        assert one.best is None
+
+
+def test_the_best_threshold_serves_all_figures(kitti: tuple[Path, Path]) -> None:
+    """Without the tracks below the best threshold fewer are false; another threshold may be given."""
+    recordings = load_recordings("kitti", open_dataset("kitti", kitti[0]).sequences(["all"]), kitti[1])
+    (cars,) = evaluate_figures("kitti", recordings, ("Car",))
+    assert cars.best is not None
+    assert cars.best.threshold == cars.ab3dmot[0].threshold
+    assert cars.best.gospa.false < cars.everything.gospa.false
+    (given,) = evaluate_figures("kitti", recordings, ("Car",), Settings(limits=(0.5,)), {"Car": 2.0})
+    assert [result.limit for result in given.ab3dmot] == [0.5]
+    assert given.best is not None
+    assert given.best.hota.hota == 0.0
+
+
+def test_the_command_shows_and_prints_the_figures_of_kitti(
+    kitti: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Tables name every class and every limit; JSON holds what the API gives, and no NaN."""
+    given = ("evaluate", "--dataset", "kitti", "--root", str(kitti[0]), "--tracks", str(kitti[1]), "--class", *CLASSES)
+    assert run([*given) == 0
+    shown = capsys.readouterr().out
+    for text in ("sAMOTA", "AMOTP", "centre HOTA", "GOSPA", "0.25", "0.7", *CLASSES):
+        assert text in shown
+    assert run([*given, "--json"]) == 0
+    classes = json.loads(capsys.readouterr().out, parse_constant=lambda text: pytest.fail(f"{text} in JSON"))["classes"]
+    recordings = load_recordings("kitti", open_dataset("kitti", kitti[0]).sequences(["all"]), kitti[1])
+    for one in evaluate_figures("kitti", recordings, CLASSES):
+        assert classes[one.name]["ab3dmot"]["0.25"] == one.ab3dmot[0].summary()
+        assert classes[one.name]["hota_centre"]["all"] == one.everything.hota.summary()
+        assert classes[one.name]["calibration"] is None
+    assert run([*given, "--iou", "0.4", "--cutoff", "1", "--json") == 0
+    chosen = json.loads(capsys.readouterr().out)["classes"]["Car"]
+    assert list(chosen["ab3dmot"]) == ["0.4"]
+    assert chosen["gospa"]["all"]["OSPA"] < 1.0
+
+
+def test_the_command_tests_the_calibration_of_full_tracks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of tracks that were written with --full the NEES and the reliability are shown."""
+    data = ("--dataset", "scene", "--option", "frames=30", "--option", "clouds=0")
+    assert run(["track", *data, "--out", str(tmp_path), "--full", "--json"]) == 0
+    assert run("evaluate", *data, "--tracks", str(tmp_path)) == 0
+    assert "NEES" in capsys.readouterr().out
+    assert run("evaluate", *data, "--tracks", str(tmp_path), "--json") == 0
+    car = json.loads(capsys.readouterr().out)["classes"]["Car"]["calibration"]
+    assert car["samples"] > 50
+    assert sum(tenth["count"] for tenth in car["existence"]) >= car["samples"]
+    assert 0.0 < car["coverage"] <= 1.0
+
+
+def test_the_command_knows_the_benchmark_of_nuscenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of nuScenes the official figures come with HOTA of centres, GOSPA and the calibration."""
+    data = ("--dataset", "nuscenes", "--root", str(nuscenes_root()), "--detections", "centerpoint")
+    assert run(["track", *data, "--option", "clouds=0", "--out", str(tmp_path), "--full", "--json"]) == 0
+    capsys.readouterr()
+    assert run("evaluate", *data, "--tracks", str(tmp_path), "--class", "car", "pedestrian") == 0
+    assert "AMOTA" in capsys.readouterr().out
+    assert run("evaluate", *data, "--tracks", str(tmp_path), "--class", "car", "pedestrian", "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    car = report["classes"]["car"]
+    assert list(report["classes"]) == ["car", "pedestrian"]
+    assert 0.5 < car["nuscenes"]["amota"] < 1.0
+    assert 0.3 < car["hota_centre"]["all"]["HOTA"] < car["hota_centre"]["best"]["HOTA"] < 1.0
+    assert car["calibration"]["samples"] > 100
+    assert run("evaluate", *data, "--tracks", str(tmp_path), "--iou", "0.5") == 2
+
+
+def test_results_must_be_there(kitti: tuple[Path, Path], tmp_path: Path) -> None:
+    """A missing result file is named, and so is one with frames that the sequence does not have."""
+    sequences = open_dataset("kitti", kitti[0]).sequences(["0000"])
+    with pytest.raises(DatasetError, match=r"0000\.txt"):
+        load_recordings("kitti", sequences, tmp_path)
+    line = (kitti[1] / "0000.txt").read_text().splitlines()[0].split()
+    (tmp_path / "0000.txt").write_text(" ".join(["999", *line[1:]]) + "\n")
+    with pytest.raises(DatasetError, match="frame 999"):
+        load_recordings("kitti", sequences, tmp_path)

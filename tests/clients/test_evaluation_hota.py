@@ -1,0 +1,177 @@
+"""HOTA of centres and of image boxes: known answers, and TrackEval as the twin."""
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluation_cases import TrackRow, TruthRow, followed, parked, shuffled, tracks_of, truth_of, write_kitti
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from optipmb_client.datasets import open_dataset
+from optipmb_client.errors import ClientError
+from optipmb_client.evaluation import hota_2d
+from optipmb_client.evaluation.cases import Case, Rules, prepare
+from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
+from optipmb_client.evaluation.hota import HotaResult, evaluate_hota
+
+PATIENT = settings(deadline=None, max_examples=60)  # other work on the machine may make any example slow
+NEAR = Rules("distance", 2.0)
+
+
+def hota_of(truth: list[TruthRow], tracks: list[TrackRow], ignored: tuple[int, ...] = ()) -> HotaResult:
+    """Evaluate centres of cars."""
+    return evaluate_hota([prepare(truth_of(truth, ignored=ignored), tracks_of(tracks), "Car", NEAR)], NEAR)
+
+
+CROWD = parked(8, 20)
+
+
+def test_the_truth_scores_a_hundred() -> None:
+    """Tracks equal to the truth have all four figures at 1."""
+    assert hota_of(CROWD, followed(CROWD)).summary() == {"HOTA": 1.0, "DetA": 1.0, "AssA": 1.0, "LocA": 1.0}
+
+
+def test_ids_shuffled_in_every_frame_collapse_the_association_alone() -> None:
+    """The same boxes with ids exchanged at random keep DetA and LocA and lose AssA."""
+    found = hota_of(CROWD, shuffled(followed(CROWD)))
+    assert (found.deta, found.loca) == (1.0, 1.0)
+    assert found.assa < 0.15
+    assert found.hota == pytest.approx(math.sqrt(found.assa))
+
+
+def test_one_switch_halves_the_association() -> None:
+    """An object followed half of its life each by two tracks: AssA 1/2, DetA 1, HOTA the root of 1/2."""
+    found = hota_of(parked(1, 10), [(frame, frame // 5, 0.0, 0.0, 0.9) for frame in range(10)])
+    assert (found.deta, found.assa) == (1.0, 0.5)
+    assert found.hota == pytest.approx(math.sqrt(0.5))
+
+
+def test_half_of_what_is_there() -> None:
+    """One of two objects followed: DetA 1/2, AssA 1; with a false track beside it DetA 1/3."""
+    truth = parked(2, 10)
+    found = hota_of(truth, [row for row in followed(truth) if row[1] == 0])
+    assert (found.deta, found.assa) == (0.5, 1.0)
+    false = hota_of(truth, [(f, i, x if i == 0 else 500.0, y, s) for f, i, x, y, s in followed(truth)])
+    assert found.hota == pytest.approx(math.sqrt(0.5))
+    assert false.deta == pytest.approx(1.0 / 3.0)
+
+
+def test_distance_lowers_the_levels_that_are_reached() -> None:
+    """Centres one metre off have similarity 1/2, so ten of nineteen levels are reached; two metres off, none."""
+    found = hota_of(CROWD, followed(CROWD, dx=1.0))
+    assert found.summary() == pytest.approx({"HOTA": 10 / 19, "DetA": 10 / 19, "AssA": 10 / 19, "LocA": 0.5})
+    assert hota_of(CROWD, followed(CROWD, dx=2.0)).summary() == {"HOTA": 0.0, "DetA": 0.0, "AssA": 0.0, "LocA": None}
+
+
+def test_no_tracks_score_zero_and_nothing_at_all_is_undefined() -> None:
+    """Empty results have HOTA 0; without truth and without tracks nothing is defined; neither fails."""
+    assert hota_of(CROWD, []).summary() == {"HOTA": 0.0, "DetA": 0.0, "AssA": 0.0, "LocA": None}
+    assert hota_of([], followed(CROWD)).hota == 0.0
+    assert set(hota_of([], []).summary().values()) == {None}
+
+
+def test_ignored_truth_takes_its_tracks_with_it() -> None:
+    """Tracks on ignored objects are neither right nor wrong; those beyond a similarity of a half are false."""
+    truth = parked(2, 10)
+    second = tuple(row for row, (_, one, *_) in enumerate(truth) if one == 1)
+    assert hota_of(truth, followed(truth), second).hota == 1.0
+    assert hota_of(truth, [row for row in followed(truth) if row[1] == 0], second).hota == 1.0
+    away = [(f, i, x + 1.1 * i, y, s) for f, i, x, y, s in followed(truth)]
+    assert hota_of(truth, away, second).deta == 0.5
+
+
+def test_sequences_are_counted_together() -> None:
+    """Two sequences are as one with all their objects and tracks, whose ids do not meet."""
+    chance = np.random.default_rng(5)
+    parts = [
+        [(f, i, x + float(chance.normal(0, 0.5)), y, s) for f, i, x, y, s in followed(CROWD) if chance.random() < 0.8]
+        for _ in range(2)
+    ]
+    apart = [prepare(truth_of(CROWD), tracks_of(tracks), "Car", NEAR) for tracks in parts]
+    truth = [(f + 50 * k, i + 50 * k, x, y) for k in range(2) for f, i, x, y in CROWD]
+    tracks = [(f + 50 * k, i + 50 * k, x, y, s) for k in range(2) for f, i, x, y, s in parts[k]]
+    assert evaluate_hota(apart, NEAR).summary() == pytest.approx(hota_of(truth, tracks).summary())
+
+
+def image_case(seed: int) -> Case:
+    """Prepare image boxes at random places, many of which overlap."""
+    chance = np.random.default_rng(seed)
+
+    def boxes(count: int) -> np.ndarray:
+        corner = chance.uniform(0, 60, (count, 2))
+        return np.hstack([corner, corner + chance.uniform(30, 60, (count, 2))])
+
+    truth = truth_of([(f, i, 0.0, 0.0) for f in range(12) for i in range(4) if chance.random() < 0.8])
+    tracks = tracks_of([(f, i, 0.0, 0.0, 0.9) for f in range(12) for i in range(5) if chance.random() < 0.8])
+    ignored = np.asarray(chance.random(len(truth)) < 0.2)
+    truth = replace(truth, box2d=boxes(len(truth)), ignored=ignored)
+    return prepare(truth, replace(tracks, box2d=boxes(len(tracks))), "Car", hota_2d.hota_2d_rules())
+
+
+@PATIENT
+@given(st.lists(st.integers(0, 2**32 - 1), min_size=1, max_size=3))
+def test_figures_are_those_of_trackeval(seeds: list[int]) -> None:
+    """On boxes at random places, over several sequences, our figures equal those of TrackEval's metric."""
+    pytest.importorskip("trackeval")
+    cases = [image_case(seed) for seed in seeds]
+    ours, theirs = evaluate_hota(cases, hota_2d.hota_2d_rules()), hota_2d.evaluate_hota_2d(cases)
+    for name, value in vars(ours).items():
+        assert value == pytest.approx(getattr(theirs, name)), name
+    assert ours.summary() == pytest.approx(theirs.summary())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_hota_of_image_boxes_is_the_benchmarks(seed: int, tmp_path: Path) -> None:
+    """On generated benchmarks cars and pedestrians have the figures of TrackEval's own reading of the same files."""
+    trackeval = pytest.importorskip("trackeval")
+    root, results = write_kitti(tmp_path, tmp_path / "results", seed), tmp_path / "results"
+    theirs = official(trackeval, tmp_path, root, results)
+    recordings = load_recordings("kitti", open_dataset("kitti", root).sequences(["all"]), results)
+    for one in evaluate_figures("kitti", recordings, ("Car", "Pedestrian")):
+        ours = one.everything.hota_2d
+        assert ours is not None
+        found = theirs[one.name.lower()]["HOTA"]
+        assert ours.hota == pytest.approx(found["HOTA"].mean(), abs=1e-9)
+        assert ours.deta == pytest.approx(found["DetA"].mean(), abs=1e-9)
+        assert ours.assa == pytest.approx(found["AssA"].mean(), abs=1e-9)
+        assert 0.1 < ours.hota < 0.9
+
+
+def official(trackeval: ModuleType, folder: Path, root: Path, results: Path) -> dict[str, Any]:
+    """Evaluate a folder of results with TrackEval alone; return its figures over all sequences by class."""
+    truth, tracks = folder / "gt", folder / "trackers" / "ours" / "data"
+    truth.mkdir()
+    tracks.parent.mkdir(parents=True)
+    (truth / "label_02").symlink_to(root / "training" / "label_02")
+    tracks.symlink_to(results)
+    poses = sorted((root / "training" / "poses").glob("*.txt"))
+    lines = [f"{path.stem} empty 000000 {len(path.read_text().splitlines()):06d}\n" for path in poses]
+    (truth / "evaluate_tracking.seqmap.training").write_text("".join(lines))
+    quiet = {"PRINT_CONFIG": False}
+    places = {"GT_FOLDER": str(truth), "TRACKERS_FOLDER": str(folder / "trackers")}
+    dataset = trackeval.datasets.Kitti2DBox({**quiet, **places})
+    names = (
+        "PRINT_RESULTS",
+        "TIME_PROGRESS",
+        "OUTPUT_SUMMARY",
+        "OUTPUT_DETAILED",
+        "PLOT_CURVES",
+        "DISPLAY_LESS_PROGRESS",
+    )
+    evaluator = trackeval.Evaluator(
+        {**quiet, **dict.fromkeys(names, False), "BREAK_ON_ERROR": True, "LOG_ON_ERROR": None}
+    )
+    found, _ = evaluator.evaluate([dataset], [trackeval.metrics.HOTA()])
+    return dict(found["Kitti2DBox"]["ours"]["COMBINED_SEQ"])
+
+
+def test_without_trackeval_the_hota_of_image_boxes_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the package is missing one clear line names the extra."""
+    monkeypatch.setitem(sys.modules, "trackeval", None)
+    with pytest.raises(ClientError, match=r"pip install 'optipmb\[evaluation\]'"):
+        hota_2d.evaluate_hota_2d([])

@@ -1,0 +1,118 @@
+"""The commands tune and ablate, on generated scenes."""
+
+import json
+from pathlib import Path
+
+import pytest
+from optipmb_client.cli import run
+from optipmb_client.tuning import ROWS
+from optipmb_client.tuning.evidence import prune
+from optipmb_client.tuning.material import load, of_class
+from optipmb_client.tuning.objective import Bench
+from optipmb_client.tuning.scoring import rules_of, scorer_of
+from optipmb_client.tuning.values import only, with_values
+from optipmb_client.tuning.watch import Quiet
+from tuning_cases import Habits, recorded
+
+import optipmb
+
+SCENE = ["--dataset", "scene", "--option", "frames=25", "--option", "clouds=0", "--sequences", "0000", "0001"]
+CARS = [*SCENE, "--profile", "kitti-paper", "--classes", "Car"]
+FEW = ["--trials", "5", "--fold-trials", "3", "--folds", "2"]
+
+
+def tune(out: Path, *options: str) -> None:
+    """Tune cars."""
+    assert run(["tune", *CARS, *FEW, "--out", str(out), *options]) == 0
+
+
+def test_the_same_seed_gives_the_same_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two sessions of five trials, one of them in two parts and one in two processes, give the same bytes."""
+    pytest.importorskip("optuna")
+    tune(tmp_path / "a")
+    shown = capsys.readouterr()
+    assert "cross-validated" in shown.out
+    assert "trial 11 of 11" in shown.err
+    tune(tmp_path / "b", "--trials", "3")
+    tune(tmp_path / "b", "--jobs", "2")
+    for name in ("tuned.toml", "report.json", "estimate.json", "estimated.toml"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_the_profile_loads_and_says_where_it_comes_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The profile has all classes, other values than before only for the class tuned, and tracks."""
+    pytest.importorskip("optuna")
+    tune(tmp_path, "--json", "--metric", "mota", "--degrade", "0", "--all")
+    report = json.loads(capsys.readouterr().out)
+    before, after = optipmb.load_profile("kitti-paper"), optipmb.load_profile(report["profile"])
+    assert after.labels == before.labels
+    assert after.classes["Cyclist"] == before.classes["Cyclist"]
+    for part in ("kitti-paper", "scene", "0000 0001", "Car", "mota", "seed 0", before.provenance.split(maxsplit=1)[0]):
+        assert part in after.provenance
+    car = report["classes"]["Car"]
+    assert len(car["folds"]) == 2
+    assert car["objective"]["after"] >= car["objective"]["before"] - 1e-9
+    changed = {one["path"] for one in car["evidence"] if one["kept"]}
+    table, other = (profile.model_dump()["classes"]["Car"] for profile in (before, after))
+    flat = {key for key in table if table[key] != other[key] and not isinstance(table[key], dict)}
+    assert flat <= changed
+    assert run(["track", *SCENE, "--profile", report["profile"], "--out", str(tmp_path / "tracks")]) == 0
+
+
+def test_estimates_alone_need_no_search(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """--estimate-only tracks nothing and writes a profile that loads."""
+    assert run(["tune", *SCENE, "--estimate-only", "--out", str(tmp_path)]) == 0
+    assert "measurement_noise.position" in capsys.readouterr().out
+    assert optipmb.load_profile(tmp_path / "estimated.toml").name.endswith("-estimated")
+    assert not (tmp_path / "trials.db").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ([*SCENE, "--classes", "Tram"], "no class 'Tram'"),
+        ([*CARS, "--metric", "beauty"], "one of combination"),
+        ([*SCENE, "--profile", "nuscenes"], "nothing in these sequences"),
+    ],
+)
+def test_wrong_wishes_are_told_in_one_line(
+    arguments: list[str], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The status is 2, and the line says what is wrong."""
+    assert run(["tune", *arguments, "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert text in error
+    assert "\n" not in error
+
+
+def test_a_change_that_does_not_pay_is_taken_back() -> None:
+    """Of two changed values, the one with a use is kept and the idle one is put back."""
+    parameters = with_values(only(optipmb.load_profile("kitti-paper"), "Car"), "Car", {"gate": 0.1})
+    rules = rules_of("scene")
+    sequences = [recorded(Habits(), seed, frames=25, name=f"{seed:04d}") for seed in range(3)]
+    clips = [of_class(load(one, optipmb.load_profile("kitti-paper"), rules), "Car", rules) for one in sequences]
+    with Bench([clips], scorer_of("scene", "Car", sequences), "mota") as bench:
+        chosen, evidence = prune(bench, parameters, "Car", {"gate": 4.0, "birth.acceleration": 1.1}, 1.0, Quiet())
+    assert chosen == {"gate": 4.0}
+    kept, dropped = evidence
+    assert kept.path == "gate"
+    assert kept.gain > 0.0
+    assert (dropped.path, dropped.kept) == ("birth.acceleration", False)
+
+
+def test_the_ablation_has_the_sixteen_rows_of_the_paper(capsys: pytest.CaptureFixture[str]) -> None:
+    """All choices of four modules, each once, from none to all; as a table and as JSON."""
+    assert len(set(ROWS)) == 16
+    assert (ROWS[0], len(ROWS[-1])) == (frozenset(), 4)
+    assert run(["ablate", *SCENE, "--classes", "Car"]) == 0
+    lines = capsys.readouterr().out.strip().splitlines()
+    assert len(lines) == 18
+    assert lines[-1].split()[:4] == ["x"] * 4
+    assert run(["ablate", *SCENE, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [sum(row["modules"].values()) for row in rows] == [len(on) for on in ROWS]
+    for row in rows:
+        assert row["frames_per_second"] > 0.0
+        assert set(row["classes"]) == {"Car", "Pedestrian", "Cyclist"}
+        assert row["overall"]["FN"] == sum(one["FN"] for one in row["classes"].values())
+    assert len({json.dumps(row["overall"]) for row in rows}) > 4

@@ -1,0 +1,116 @@
+"""The search: the same trials whenever and however often it is taken up, better ones than it began with."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from optipmb_client.errors import UsageError
+from optipmb_client.tuning.space import Dimension, dimensions, penalty, repaired
+from optipmb_client.tuning.values import Value, profile_text, value_of, with_classes, with_values, write_profile
+
+import optipmb
+
+pytest.importorskip("optuna")
+from optipmb_client.tuning.search import Outcome, Search
+
+SPACE = (*(Dimension(f"d{i}", "log", 0.1, 10.0, 1.0) for i in range(5)), Dimension("n", "whole", 1, 100, 30))
+START = {one.path: one.value(one.start) for one in SPACE}
+
+
+def valley(values: Mapping[str, Value], _best: Outcome | None = None) -> float:
+    """Rise towards d_i = 1.5, n = 20."""
+    return -sum(math.log(values[f"d{i}"] / 1.5) ** 2 for i in range(5)) - 0.01 * abs(values["n"] - 20)
+
+
+def search(path: Path, *, seed: int = 0, settings: dict[str, int] | None = None) -> Search:
+    """Open the search."""
+    return Search(path, "valley", settings or {"a": 1}, SPACE, [START], seed)
+
+
+class Stopped(Exception):  # noqa: N818  nothing went wrong
+    """The session was ended in the middle of a trial."""
+
+
+def test_an_interrupted_search_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
+    """Ended in the middle of a trial and taken up again, the trials are those of one go; another seed has others."""
+    whole = search(tmp_path / "whole.db")
+    whole.run(14, valley)
+    count = 0
+
+    def failing(values: Mapping[str, Value], _best: Outcome | None) -> float:
+        nonlocal count
+        count += 1
+        if count == 7:
+            raise Stopped
+        return valley(values)
+
+    with pytest.raises(Stopped):
+        search(tmp_path / "parts.db").run(14, failing)
+    assert len(search(tmp_path / "parts.db").outcomes()) == 6
+    search(tmp_path / "parts.db").run(11, valley)
+    parts = search(tmp_path / "parts.db")
+    parts.run(14, valley)
+    assert parts.outcomes() == whole.outcomes()
+    other = search(tmp_path / "other.db", seed=1)
+    other.run(14, valley)
+    assert other.outcomes() != whole.outcomes()
+
+
+def test_the_first_trial_is_the_start_and_the_best_is_better(tmp_path: Path) -> None:
+    """Forty trials get more than half of the way from the start to the top."""
+    heard: list[Outcome] = []
+    found = search(tmp_path / "a.db")
+    best = found.run(40, valley, heard.append)
+    assert heard[0].values == START
+    assert len(heard) == 40
+    assert best.score == max(one.score for one in heard) == valley(best.values)
+    assert best.score > 0.5 * valley(START)
+    for one in heard:
+        for dimension in SPACE:
+            value = one.values[dimension.path]
+            assert dimension.low <= value <= dimension.high
+            assert dimension.value(float(value)) == value
+
+
+def test_trials_of_another_session_are_not_mixed_in(tmp_path: Path) -> None:
+    """Other settings in the same file are an error that says what to do."""
+    search(tmp_path / "a.db").run(2, valley)
+    with pytest.raises(UsageError, match=r"choose another --out"):
+        search(tmp_path / "a.db", settings={"a": 2})
+
+
+def test_what_has_no_effect_is_not_searched() -> None:
+    """Without velocities and clouds their parameters are left alone; the paper's are searched only when asked for."""
+    parameters = optipmb.load_profile("kitti-paper")
+    own = {one.path for one in dimensions(parameters, "Car", {}, [], everything=False)}
+    everything = {one.path for one in dimensions(parameters, "Car", {}, [], everything=True)}
+    assert own < everything
+    assert not {"measurement_noise.velocity", "birth.speed", "expected_points"} & everything
+    assert "birth_score" in everything - own
+    assert {"process_noise.speed", "measurement_noise.position", "birth.position", "area", "max_misses"} <= own
+
+
+def test_leaving_the_start_costs() -> None:
+    """At the start nothing, and the more the farther."""
+    assert penalty(SPACE, START, 1.0) == 0.0
+    near, far = ({**START, "d0": value} for value in (1.2, 3.0))
+    assert 0.0 < penalty(SPACE, near, 1.0) < penalty(SPACE, far, 1.0)
+
+
+def test_every_choice_is_a_profile() -> None:
+    """Thresholds of extraction that contradict each other are put right."""
+    parameters = optipmb.load_profile("kitti-paper")
+    for values in ({"extract_new": 0.95}, {"extract_known": 0.5}, {"extract_new": 0.9, "extract_known": 0.4}):
+        changed = with_values(parameters, "Car", repaired(values, parameters, "Car"))
+        assert value_of(changed, "Car", "extract_new") <= value_of(changed, "Car", "extract_known")
+
+
+def test_a_profile_is_written_as_it_is_read(tmp_path: Path) -> None:
+    """Writing a profile and reading it gives the same parameters, whatever its texts hold."""
+    parameters = optipmb.load_profile("nuscenes-paper")
+    odd = with_classes(parameters, {}, "odd", 'one "line"\nanother \\ line\tand a \x07 bell')
+    for one in (parameters, odd):
+        write_profile(tmp_path / "p.toml", one)
+        assert optipmb.load_profile(tmp_path / "p.toml") == one
+    assert profile_text(parameters) == profile_text(parameters)
