@@ -43,7 +43,10 @@ class ResetRequest(Message):
 
 
 class SessionState(Message):
-    """Reply of `q/state` and `q/reset`: the state of one session. Counters start at the start of the session."""
+    """Reply of `q/state` and `q/reset`: the state of one session.
+
+    Counters go on through restarts and resets, and end with the session (`closed`).
+    """
 
     stream: Stream = Field(description="Name of the stream.")
     session: SessionId = Field(description="32 hexadecimal digits, as in the tracks.")

@@ -21,7 +21,7 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def test_the_real_truth_scores_a_hundred(tmp_path: Path) -> None:
-    """The truth of real sequences, as result files, is perfect by every measure; ids alone changed, the sets still are."""
+    """The truth of real sequences, as result files, is perfect by every measure; with other ids, its sets still are."""
     lines = {}
     sequences = open_dataset("kitti", kitti_root()).sequences(["0000", "0011"])
     for sequence in sequences:
@@ -83,7 +83,7 @@ def test_the_command_shows_and_prints_the_figures_of_kitti(
 ) -> None:
     """Tables name every class and every limit; JSON holds what the API gives, and no NaN."""
     given = ("evaluate", "--dataset", "kitti", "--root", str(kitti[0]), "--tracks", str(kitti[1]), "--class", *CLASSES)
-    assert run([*given) == 0
+    assert run([*given]) == 0
     shown = capsys.readouterr().out
     for text in ("sAMOTA", "AMOTP", "centre HOTA", "GOSPA", "0.25", "0.7", *CLASSES):
         assert text in shown
@@ -94,7 +94,7 @@ def test_the_command_shows_and_prints_the_figures_of_kitti(
         assert classes[one.name]["ab3dmot"]["0.25"] == one.ab3dmot[0].summary()
         assert classes[one.name]["hota_centre"]["all"] == one.everything.hota.summary()
         assert classes[one.name]["calibration"] is None
-    assert run([*given, "--iou", "0.4", "--cutoff", "1", "--json") == 0
+    assert run([*given, "--iou", "0.4", "--cutoff", "1", "--json"]) == 0
     chosen = json.loads(capsys.readouterr().out)["classes"]["Car"]
     assert list(chosen["ab3dmot"]) == ["0.4"]
     assert chosen["gospa"]["all"]["OSPA"] < 1.0
@@ -104,9 +104,9 @@ def test_the_command_tests_the_calibration_of_full_tracks(tmp_path: Path, capsys
     """Of tracks that were written with --full the NEES and the reliability are shown."""
     data = ("--dataset", "scene", "--option", "frames=30", "--option", "clouds=0")
     assert run(["track", *data, "--out", str(tmp_path), "--full", "--json"]) == 0
-    assert run("evaluate", *data, "--tracks", str(tmp_path)) == 0
+    assert run(["evaluate", *data, "--tracks", str(tmp_path)]) == 0
     assert "NEES" in capsys.readouterr().out
-    assert run("evaluate", *data, "--tracks", str(tmp_path), "--json") == 0
+    assert run(["evaluate", *data, "--tracks", str(tmp_path), "--json"]) == 0
     car = json.loads(capsys.readouterr().out)["classes"]["Car"]["calibration"]
     assert car["samples"] > 50
     assert sum(tenth["count"] for tenth in car["existence"]) >= car["samples"]
@@ -118,16 +118,16 @@ def test_the_command_knows_the_benchmark_of_nuscenes(tmp_path: Path, capsys: pyt
     data = ("--dataset", "nuscenes", "--root", str(nuscenes_root()), "--detections", "centerpoint")
     assert run(["track", *data, "--option", "clouds=0", "--out", str(tmp_path), "--full", "--json"]) == 0
     capsys.readouterr()
-    assert run("evaluate", *data, "--tracks", str(tmp_path), "--class", "car", "pedestrian") == 0
+    assert run(["evaluate", *data, "--tracks", str(tmp_path), "--class", "car", "pedestrian"]) == 0
     assert "AMOTA" in capsys.readouterr().out
-    assert run("evaluate", *data, "--tracks", str(tmp_path), "--class", "car", "pedestrian", "--json") == 0
+    assert run(["evaluate", *data, "--tracks", str(tmp_path), "--class", "car", "pedestrian", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     car = report["classes"]["car"]
     assert list(report["classes"]) == ["car", "pedestrian"]
     assert 0.5 < car["nuscenes"]["amota"] < 1.0
     assert 0.3 < car["hota_centre"]["all"]["HOTA"] < car["hota_centre"]["best"]["HOTA"] < 1.0
     assert car["calibration"]["samples"] > 100
-    assert run("evaluate", *data, "--tracks", str(tmp_path), "--iou", "0.5") == 2
+    assert run(["evaluate", *data, "--tracks", str(tmp_path), "--iou", "0.5"]) == 2
 
 
 def test_results_must_be_there(kitti: tuple[Path, Path], tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ ONE = parked(1, 1)
     ],
 )
 def test_single_frames(truth: list[TruthRow], tracks: list[TrackRow], expected: list[float]) -> None:
-    """A pair costs its distance, what is missed or false c / 2^(1/p) in GOSPA and c in OSPA, and nothing costs nothing."""
+    """A pair costs its distance, what is missed or false c / 2^(1/p) in GOSPA and c in OSPA, nothing costs nothing."""
     names = ("GOSPA", "localisation", "missed", "false", "OSPA")
     assert gospa_of(truth, tracks).summary() == pytest.approx(dict(zip(names, expected, strict=True)))
 

@@ -15,6 +15,8 @@ from optipmb_client.evaluation.overlap import iou_2d, iou_3d
 from optipmb_client.geometry import Bools, Floats, Ints
 from optipmb_client.results import ResultTable
 
+_DECIMALS = 12
+
 Measure = Literal["iou_3d", "iou_2d", "distance"]
 
 
@@ -86,7 +88,8 @@ class Case:
         """Return for each track row (K,) the mean score of its whole track."""
         _, which = np.unique(self.track_id, return_inverse=True)
         count = np.bincount(which)
-        return np.asarray((np.bincount(which, self.track_score) / np.maximum(count, 1))[which], dtype=np.float64)
+        # Tracks of equal scores are to have equal means, whatever summing them up has rounded.
+        return np.round(np.bincount(which, self.track_score) / np.maximum(count, 1), _DECIMALS)[which]
 
 
 def prepare(truth: Truth, tracks: ResultTable, name: str, rules: Rules, sequence: str = "") -> Case:
