@@ -46,5 +46,5 @@ def _from_score(table: ResultTable, results: Sequence[ClassResult], score: float
     best = {result.name: result.sweep.thresholds[result.sweep.best] for result in results}
     least = np.array([score if score is not None else best.get(label, 0.0) for label in table.labels])
     _, which = np.unique(table.id, return_inverse=True)
-    mean = np.bincount(which, table.score) / np.bincount(which)
+    mean = np.round(np.bincount(which, table.score) / np.bincount(which), 12)  # as thresholds are
     return table.take(np.asarray(mean[which] >= least[table.label], dtype=np.bool_))

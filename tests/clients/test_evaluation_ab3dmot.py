@@ -147,7 +147,7 @@ def test_recall_points_are_in_order(scores: list[float], missed: int) -> None:
 def naive(case: Case, threshold: float) -> Counts:
     """Count as the published evaluation does, box by box."""
     means = {
-        one: sum(case.track_score[case.track_id == one]) / sum(case.track_id == one)
+        one: round(sum(case.track_score[case.track_id == one]) / sum(case.track_id == one), 12)
         for one in set(case.track_id.tolist())
     }
     overlap = dict(

@@ -23,8 +23,8 @@ Where the paper leaves a choice, the choices are those of its published evaluati
 - AMOTA sums MOTA_r as it is, negative too. Among equal values of MOTA the highest threshold is the best one, and if no
   threshold has a MOTA above zero, all tracks are kept.
 
-Two accidents of the published code are not repeated: tracks exactly at a threshold are kept, whatever their mean score is
-rounded to, and no threshold knows what was matched at another. Either changes a count by one or two, if at all.
+Two accidents of the published code are not repeated. There a track exactly at a threshold is kept or not as its mean
+score is rounded, and a box that was matched at one threshold cannot be excused at another; either may change a count by one.
 """
 
 from collections.abc import Iterable, Sequence

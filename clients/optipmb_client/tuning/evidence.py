@@ -67,7 +67,7 @@ def weigh(
     clips = tuple(range(len(bench.names)))
     groups = deal([bench.boxes(i) for i in clips], GROUPS)
     subsets = [clips, *(tuple(i for i in clips if i not in group) for group in groups)]
-    chosen = _values(bench, with_values(base, name, values), clips, subsets)
+    chosen = _values(bench, with_values(base, name, repaired(values, base, name)), clips, subsets)
     found = []
     for path in paths:
         watch.note(f"{name}: weighing {path}")
@@ -112,7 +112,8 @@ def prune(
         watch: told how far it has come.
 
     """
-    chosen = {path: values[path] for path in changed(base, name, values)}
+    allowed = repaired(values, base, name)
+    chosen = {path: allowed[path] for path in changed(base, name, allowed)}
     first = weigh(bench, base, name, chosen, list(chosen), watch)
     best = _value(bench, base, name, chosen)
     dropped = []
