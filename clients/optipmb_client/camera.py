@@ -21,6 +21,9 @@ KITTI_IMAGE = (1242.0, 375.0)
 _NEAR = 0.1
 """Depth in metres in front of which nothing is projected."""
 
+_SHOWN = 0.5
+"""Part of a projected box that must lie in the image for the image to show it."""
+
 _EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]])
 
 
@@ -70,9 +73,10 @@ class Camera:
         The image box is the smallest that holds the part of the 3D box in front of the camera, clipped to the image.
 
         Returns:
-            (N, 4) x1 y1 x2 y2 in pixels, and (N,) whether any of it is in the image. What is not in the image (behind
-            the camera or beside its view) gets 0 0 0 0: a box without height, which the KITTI evaluation leaves out of
-            account.
+            (N, 4) x1 y1 x2 y2 in pixels, and (N,) whether the image shows it. What is behind the camera, beside its
+            view, or for more than half beside it gets 0 0 0 0: a box without height. Nobody can annotate what an image
+            does not show, and the KITTI evaluation leaves such boxes out of account as it does boxes that are for more
+            than half in unannotated regions.
 
         """
         corners = box_corners(center, size, yaw) @ SENSOR_FROM_CAMERA  # (N, 8, 3), camera frame
@@ -91,6 +95,9 @@ class Camera:
         limit = np.array([self.width - 1.0, self.height - 1.0])
         seen = np.asarray((least < limit).all(axis=1) & (most > 0.0).all(axis=1) & ahead.any(axis=1), dtype=np.bool_)
         boxes = np.concatenate([np.clip(least, 0.0, limit), np.clip(most, 0.0, limit)], axis=1)
+        with np.errstate(invalid="ignore"):  # what is not seen at all has infinite bounds
+            whole = np.prod(most - least, axis=1)
+        seen &= np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) >= _SHOWN * whole
         return np.where(seen[:, None], boxes, 0.0), seen
 
 

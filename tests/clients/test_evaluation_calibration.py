@@ -87,6 +87,18 @@ def test_the_band_is_known() -> None:
     assert found.band == pytest.approx((1.628, 2.411), abs=0.002)
 
 
+def test_the_interval_takes_objects_as_samples() -> None:
+    """Of two objects with errors 1, 1 and 3, 3 the standard error of the mean is 1, and nothing is known from one."""
+    none = np.empty(0)
+    nees = np.array([1.0, 1.0, 3.0, 3.0])
+    two = CalibrationResult(nees, np.array([0, 0, 1, 1]), none, none, none, np.empty(0, np.bool_))
+    assert two.interval == pytest.approx((2.0 - 1.96, 2.0 + 1.96), abs=1e-3)
+    one = CalibrationResult(nees, np.zeros(4, dtype=np.int64), none, none, none, np.empty(0, np.bool_))
+    assert np.isnan(one.interval).all()
+    both = two + one
+    assert both.owner.tolist() == [0, 0, 1, 1, 2, 2, 2, 2]
+
+
 def test_existence_is_compared_with_what_is_there() -> None:
     """Objects that exist as often as is told have deciles on the diagonal, with all tracks counted."""
     chance = np.random.default_rng(3)

@@ -1,21 +1,25 @@
 """The commands tune and ablate, on generated scenes."""
 
 import json
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 from optipmb_client.cli import run
 from optipmb_client.tuning import ROWS
-from optipmb_client.tuning.evidence import prune
+from optipmb_client.tuning.caution import Jury
+from optipmb_client.tuning.evidence import prune, weigh
 from optipmb_client.tuning.material import load, of_class
 from optipmb_client.tuning.objective import Bench
 from optipmb_client.tuning.scoring import rules_of, scorer_of
-from optipmb_client.tuning.values import only, with_values
+from optipmb_client.tuning.values import Value, only, value_of, with_values
 from optipmb_client.tuning.watch import Quiet
 from tuning_cases import Habits, recorded
 
 import optipmb
 
+PAGE = Path(__file__).parents[2] / "docs" / "tuning.md"
 SCENE = ["--dataset", "scene", "--option", "frames=25", "--option", "clouds=0", "--sequences", "0000", "0001"]
 CARS = [*SCENE, "--profile", "kitti-paper", "--classes", "Car"]
 FEW = ["--trials", "5", "--fold-trials", "3", "--folds", "2"]
@@ -52,7 +56,8 @@ def test_the_profile_loads_and_says_where_it_comes_from(tmp_path: Path, capsys: 
     car = report["classes"]["Car"]
     assert len(car["folds"]) == 2
     assert car["objective"]["after"] >= car["objective"]["before"] - 1e-9
-    changed = {one["path"] for one in car["evidence"] if one["kept"]}
+    assert all(one["value"] != one["start"] for one in car["evidence"])
+    changed = {one["path"] for one in car["evidence"]}
     table, other = (profile.model_dump()["classes"]["Car"] for profile in (before, after))
     flat = {key for key in table if table[key] != other[key] and not isinstance(table[key], dict)}
     assert flat <= changed
@@ -85,19 +90,49 @@ def test_wrong_wishes_are_told_in_one_line(
     assert "\n" not in error
 
 
-def test_a_change_that_does_not_pay_is_taken_back() -> None:
-    """Of two changed values, the one with a use is kept and the idle one is put back."""
-    parameters = with_values(only(optipmb.load_profile("kitti-paper"), "Car"), "Car", {"gate": 0.1})
-    rules = rules_of("scene")
-    sequences = [recorded(Habits(), seed, frames=25, name=f"{seed:04d}") for seed in range(3)]
-    clips = [of_class(load(one, optipmb.load_profile("kitti-paper"), rules), "Car", rules) for one in sequences]
-    with Bench([clips], scorer_of("scene", "Car", sequences), "mota") as bench:
-        chosen, evidence = prune(bench, parameters, "Car", {"gate": 4.0, "birth.acceleration": 1.1}, 1.0, Quiet())
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    """Three recordings of cars."""
+    whole, rules = optipmb.load_profile("kitti-paper"), rules_of("scene")
+    sequences = [recorded(Habits(), seed, frames=25, objects=10, name=f"{seed:04d}") for seed in range(3)]
+    clips = [of_class(load(one, whole, rules), "Car", rules) for one in sequences]
+    with Bench([clips], scorer_of("scene", "Car", sequences), "mota") as made:
+        yield made
+
+
+def test_a_change_that_does_not_pay_is_taken_back(bench: Bench) -> None:
+    """Of two changed values, the one with a use is kept and the idle one is put back; the use is told."""
+    start = with_values(only(optipmb.load_profile("kitti-paper"), "Car"), "Car", {"gate": 0.1})
+    before: dict[str, Value] = {"gate": 0.1, "birth.acceleration": value_of(start, "Car", "birth.acceleration")}
+    made = partial(with_values, start, "Car")
+    jury = Jury(bench, range(3), start)
+    chosen = prune(jury, made, before, {"gate": 4.0, "birth.acceleration": 1.1}, 1.0, Quiet())
     assert chosen == {"gate": 4.0}
-    kept, dropped = evidence
-    assert kept.path == "gate"
-    assert kept.gain > 0.0
-    assert (dropped.path, dropped.kept) == ("birth.acceleration", False)
+    (found,) = weigh(jury, made, before, chosen, Quiet())
+    assert (found.path, found.start, found.value, found.positive, found.groups) == ("gate", 0.1, 4.0, 3, 3)
+    assert found.gain > 3.0 * found.error > 0.0
+
+
+def test_the_start_needs_no_caution_and_others_do(bench: Bench) -> None:
+    """The cautious score of the start is its score; that of others is less than theirs by their error."""
+    start = only(optipmb.load_profile("kitti-paper"), "Car")
+    jury = Jury(bench, range(3), start)
+    assert jury.score(start, 5.0) == jury.gain(start).value
+    other = with_values(start, "Car", {"score_filter": 0.6})
+    found = jury.gain(other)
+    assert found.error > 0.0
+    assert jury.score(other, 2.0) == pytest.approx(found.value - 2.0 * found.error)
+
+
+def test_the_page_uses_options_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every command of docs/tuning.md has a help, and every option in it is named there."""
+    lines = [line for line in PAGE.read_text().splitlines() if line.startswith("optipmb ")]
+    assert len(lines) >= 6
+    for line in lines:
+        command, *words = line.split()[1:]
+        assert run([command, "--help"]) == 0
+        text = capsys.readouterr().out
+        assert all(word in text for word in words if word.startswith("--")), line
 
 
 def test_the_ablation_has_the_sixteen_rows_of_the_paper(capsys: pytest.CaptureFixture[str]) -> None:

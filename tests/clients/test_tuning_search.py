@@ -52,6 +52,9 @@ def test_an_interrupted_search_goes_on_as_if_it_had_not_been(tmp_path: Path) -> 
     parts = search(tmp_path / "parts.db")
     parts.run(14, valley)
     assert parts.outcomes() == whole.outcomes()
+    assert [list(one.values) for one in parts.outcomes()] == [list(START)] * 14
+    first = [one.score for one in whole.outcomes()[:5]]
+    assert whole.run(5, valley).score == max(first)
     other = search(tmp_path / "other.db", seed=1)
     other.run(14, valley)
     assert other.outcomes() != whole.outcomes()

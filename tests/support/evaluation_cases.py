@@ -90,9 +90,9 @@ CLASSES = {"Car": SIZE, "Van": (5.0, 2.0, 2.2), "Pedestrian": (0.8, 0.6, 1.75), 
 def write_kitti(root: Path, results: Path, seed: int, sequences: Sequence[str] = ("0000", "0001")) -> Path:
     """Write a small benchmark with all that its rules name, and disturbed tracks of it; return its root.
 
-    Objects drive ahead of a camera that stands; some are vans, some hidden or cut by the image for a while, some so
-    near to others that a track could be either's. Tracks are inaccurate, lost and taken up under another id, twice on
-    one object, false, small, or in regions without annotations. Their scores say a little about all that.
+    Objects drive ahead of a camera that drives along a bend; some are vans, some hidden or cut by the image for a
+    while, some so near to others that a track could be either's. Tracks are inaccurate, lost and taken up under another
+    id, twice on one object, false, small, or in regions without annotations. Their scores say a little about all that.
     """
     chance = np.random.default_rng(seed)
     for folder in ("calib", "poses", "label_02"):
@@ -107,13 +107,19 @@ def write_kitti(root: Path, results: Path, seed: int, sequences: Sequence[str] =
             f"P2: {' '.join(map(str, PROJECTION.ravel()))}\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: {unit}\n"
         )
         (root / "training" / "calib" / f"{sequence}.txt").write_text(calibration)
-        (root / "training" / "poses" / f"{sequence}.txt").write_text(f"{unit}\n" * frames)
+        (root / "training" / "poses" / f"{sequence}.txt").write_text("".join(_pose(frame) for frame in range(frames)))
         for name in ("Car", "Pedestrian", "Cyclist"):
             (root / "detections" / "made" / name / f"{sequence}.txt").write_text("")
         labels, tracks = _drive(chance, frames)
         (root / "training" / "label_02" / f"{sequence}.txt").write_text("".join(labels))
         (results / f"{sequence}.txt").write_text("".join(tracks))
     return root
+
+
+def _pose(frame: int) -> str:
+    turn = 0.01 * frame
+    cos, sin = np.cos(turn), np.sin(turn)
+    return f"{cos:.9f} 0 {sin:.9f} {0.01 * frame:.6f} 0 1 0 0 {-sin:.9f} 0 {cos:.9f} {0.5 * frame:.6f}\n"
 
 
 def _drive(chance: np.random.Generator, frames: int) -> tuple[list[str], list[str]]:

@@ -40,9 +40,11 @@ class Recorded:
         return len(self._frames)
 
     def frames(self) -> Iterator[DetectionFrame]:
+        """Iterate over the frames."""
         return iter(self._frames)
 
     def truth(self) -> Truth:
+        """Return the truth."""
         return self._truth
 
 

@@ -1,6 +1,5 @@
 """`optipmb tune`: from detections and labels to a parameter profile."""
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -140,13 +139,11 @@ def _report(refined: "Refined") -> Group:
         figures.add_row(f"without {' '.join(fold.sequences)}: before", *_cells(fold.before[0]))
         figures.add_row(f"without {' '.join(fold.sequences)}: after", *_cells(fold.after[0]))
     evidence = Table(box=None, pad_edge=False)
-    for column in ("changed", "from", "to", "gain", "+-", "gains", "kept"):
+    for column in ("changed", "from", "to", "gain", "+-", "gains"):
         evidence.add_column(column, justify="left" if column == "changed" else "right")
     for one in refined.evidence:
-        error = f"{one.error:.5f}" if math.isfinite(one.error) else "-"
         gains = f"{one.positive} of {one.groups}"
-        cells = (str(one.start), str(one.value), f"{one.gain:.5f}", error, gains, "yes" if one.kept else "no")
-        evidence.add_row(one.path, *cells)
+        evidence.add_row(one.path, str(one.start), str(one.value), f"{one.gain:.5f}", f"{one.error:.5f}", gains)
     return Group(figures, Text(), evidence, Text(_objective(refined)), Text())
 
 

@@ -24,7 +24,8 @@ Where the paper leaves a choice, the choices are those of its published evaluati
   threshold has a MOTA above zero, all tracks are kept.
 
 Two accidents of the published code are not repeated. There a track exactly at a threshold is kept or not as its mean
-score is rounded, and a box that was matched at one threshold cannot be excused at another; either may change a count by one.
+score is rounded, and a box that was matched at one threshold cannot be excused at another. Either may change a count by
+one.
 """
 
 from collections.abc import Iterable, Sequence

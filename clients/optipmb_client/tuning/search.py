@@ -10,6 +10,7 @@ import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -99,10 +100,12 @@ class Search:
 
     def outcomes(self) -> list[Outcome]:
         """Return the trials that are done, in order."""
-        return [
-            Outcome(i, json.loads(trial.user_attrs["values"]), float(trial.value or 0.0))
-            for i, trial in enumerate(self._memory.get_trials(deepcopy=False))
-        ]
+        found = []
+        for number, trial in enumerate(self._memory.get_trials(deepcopy=False)):
+            known = json.loads(trial.user_attrs["values"])
+            values = {one.path: known[one.path] for one in self._space}  # what follows depends on their order
+            found.append(Outcome(number, values, float(trial.value or 0.0)))
+        return found
 
     def best(self) -> Outcome:
         """Return the best trial, the earliest of equals."""
@@ -122,7 +125,7 @@ class Search:
             on_trial: told of each new trial.
 
         """
-        done = self.outcomes()
+        done = self.outcomes()[:trials]  # with more in the file the result is that of so many all the same
         while len(done) < trials:
             number = len(done)
             rng = np.random.Generator(np.random.PCG64([self._seed, number]))
@@ -133,7 +136,7 @@ class Search:
                 values = self._moved(best.values, rng)
             else:
                 values = {}
-            outcome = self._trial(number, values, rng, lambda chosen, best=best: score(chosen, best))
+            outcome = self._trial(number, values, rng, partial(_against, score, best))
             done.append(outcome)
             on_trial(outcome)
         return max(done, key=_rank)
@@ -162,10 +165,16 @@ class Search:
         )
         trial = self._memory.ask(self._distributions)
         chosen = values or {one.path: one.value(trial.params[one.path]) for one in self._space}
-        trial.set_user_attr("values", json.dumps(chosen, sort_keys=True))
+        trial.set_user_attr("values", json.dumps(chosen))
         found = score(chosen)
         self._study.add_trial(self._memory.tell(trial, found))
         return Outcome(number, chosen, found)
+
+
+def _against(
+    score: Callable[[Mapping[str, Value], Outcome | None], float], best: Outcome | None, values: Mapping[str, Value]
+) -> float:
+    return score(values, best)
 
 
 def _rank(outcome: Outcome) -> tuple[float, int]:

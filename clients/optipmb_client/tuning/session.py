@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from optipmb import Parameters
+from optipmb_client.tuning.caution import Jury
 from optipmb_client.tuning.degrade import Degradation, degrade
 from optipmb_client.tuning.estimate import estimate
-from optipmb_client.tuning.evidence import Evidence, prune
+from optipmb_client.tuning.evidence import Evidence, Made, prune, weigh
 from optipmb_client.tuning.figures import Figures
 from optipmb_client.tuning.folds import deal
 from optipmb_client.tuning.material import Clip
@@ -49,8 +50,8 @@ class Plan:
     """Search the values of the paper's table too."""
     penalty: float = 0.0005
     """What a value costs when it is a whole range away from where it began."""
-    evidence: float = 1.0
-    """Standard errors by which a changed value must pay."""
+    caution: float = 1.0
+    """Standard errors that are taken off a gain before it counts."""
     jobs: int = 1
 
 
@@ -122,9 +123,7 @@ class Refined:
                 }
                 for fold in self.folds
             ],
-            "evidence": [
-                {**asdict(one), "error": one.error if math.isfinite(one.error) else None} for one in self.evidence
-            ],
+            "evidence": [asdict(one) for one in self.evidence],
         }
 
 
@@ -174,10 +173,10 @@ def refine(
         for number, group in enumerate(groups):
             title = f"{name} without group {number + 1} of {len(groups)}"
             rest = tuple(i for i in everyone if i not in group)
-            folds.append(work.judge(work.search(title, rest, plan.fold_trials), group, crossed))
-        best = work.search(f"{name} all", everyone, plan.trials)
-        chosen, evidence = prune(bench, base, name, best, plan.evidence, watch)
-        found = with_values(base, name, repaired(chosen, base, name))
+            folds.append(work.judge(work.choose(title, rest, plan.fold_trials).parameters, group, crossed))
+        chosen = work.choose(f"{name} all", everyone, plan.trials)
+        evidence = weigh(chosen.jury, chosen.made, chosen.start, chosen.values, watch)
+        found = chosen.parameters
         before, value_before = work.figures(base, everyone)
         after, value_after = work.figures(found, everyone)
         together = work.together(crossed, everyone) if crossed else ()
@@ -224,8 +223,8 @@ class _Work:
     def name(self) -> str:
         return self.bench.scorer.name
 
-    def search(self, title: str, clips: tuple[int, ...], trials: int) -> dict[str, Value]:
-        """Return the best values of some trials on some sequences, which alone are looked at."""
+    def choose(self, title: str, clips: tuple[int, ...], trials: int) -> "_Choice":
+        """Return what is best on some sequences, which alone are looked at."""
         plain = [self.bench.variants[0][i] for i in clips]
         estimated = estimate(plain, self.name, self.base, self.bench.scorer.rules).values
         seen = {path: value for path, value in estimated.items() if path in _SEEN}
@@ -252,20 +251,25 @@ class _Work:
             best = max(best, outcome.score)
             self.watch.trial(best)
 
-        def tracked(values: Mapping[str, Value]) -> Parameters:
+        def made(values: Mapping[str, Value]) -> Parameters:
             return with_values(base, self.name, repaired(values, base, self.name))
+
+        jury = Jury(self.bench, clips, base)
 
         def score(values: Mapping[str, Value], rival: Outcome | None) -> float:
             cost = penalty(space, values, self.plan.penalty)
             if rival is not None:
-                lead = self._lost(tracked(values), tracked(rival.values), clips)
-                if lead is not None:
-                    return rival.score - lead - cost
-            return self.figures(tracked(values), clips)[1] - cost
+                behind = self._behind(made(values), made(rival.values), clips)
+                if behind is not None:
+                    return rival.score - behind - cost
+            return jury.score(made(values), self.plan.caution) - cost
 
-        return {**seen, **search.run(trials, score, heard).values}
+        found = search.run(trials, score, heard).values
+        start = {one.path: value_of(base, self.name, one.path) for one in space}
+        values = prune(jury, made, start, repaired(found, base, self.name), self.plan.caution, self.watch)
+        return _Choice(jury, made, start, values, made(values))
 
-    def _lost(self, parameters: Parameters, rival: Parameters, clips: tuple[int, ...]) -> float | None:
+    def _behind(self, parameters: Parameters, rival: Parameters, clips: tuple[int, ...]) -> float | None:
         """Return by how much parameters lose to the best so far where that shows early; None where it does not.
 
         A race: first on half of the sequences, then on all, both on the detections as they are. Most trials end here,
@@ -286,11 +290,8 @@ class _Work:
         figures = self.bench.figures(self.bench.measure(parameters, clips))
         return figures, self.bench.value(figures, clips)
 
-    def judge(
-        self, values: Mapping[str, Value], group: tuple[int, ...], crossed: dict[int, list[Measured]]
-    ) -> FoldResult:
-        """Judge values by sequences that did not choose them; keep what tracking those gave in `crossed`."""
-        found = with_values(self.base, self.name, repaired(values, self.base, self.name))
+    def judge(self, found: Parameters, group: tuple[int, ...], crossed: dict[int, list[Measured]]) -> FoldResult:
+        """Judge parameters by sequences that did not choose them; keep what tracking those gave in `crossed`."""
         before, value_before = self.figures(self.base, group)
         after, value_after = self.figures(found, group)
         measured = self.bench.measure(found, group)
@@ -310,9 +311,20 @@ class _Work:
         return self.bench.figures([[parts[i][variant] for i in clips] for variant in range(len(self.bench.variants))])
 
 
+@dataclass(frozen=True)
+class _Choice:
+    """What a search chose."""
+
+    jury: Jury
+    made: Made
+    start: Mapping[str, Value]
+    values: Mapping[str, Value]
+    parameters: Parameters
+
+
 _EARLY, _LATE = 0.004, 0.002
 """By how much a trial may be behind, on half of the sequences and on all, and still be tried on degraded detections."""
 _SEEN = ("heading_sign_reliable",)
 """What is taken from the estimate as it is: it is seen, not searched."""
-_SETTLED = ("metric", "copies", "degradation", "seed", "everything", "penalty")
+_SETTLED = ("metric", "copies", "degradation", "seed", "everything", "penalty", "caution")
 """What of a plan the trials depend on; their number is not in it, so there can be more later."""
