@@ -21,9 +21,6 @@ KITTI_IMAGE = (1242.0, 375.0)
 _NEAR = 0.1
 """Depth in metres in front of which nothing is projected."""
 
-_SHOWN = 0.5
-"""Part of a projected box that must lie in the image for the image to show it."""
-
 _EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]])
 
 
@@ -67,16 +64,20 @@ class Camera:
         depth = homogeneous[..., 2]
         return homogeneous[..., :2] / np.where(depth == 0.0, 1.0, depth)[..., None], depth
 
-    def boxes(self, center: Floats, size: Floats, yaw: Floats) -> tuple[Floats, Bools]:
+    def boxes(self, center: Floats, size: Floats, yaw: Floats, least_shown: float = 0.0) -> tuple[Floats, Bools]:
         """Return the image boxes of 3D boxes given in the sensor frame.
 
         The image box is the smallest that holds the part of the 3D box in front of the camera, clipped to the image.
 
+        Args:
+            center: (N, 3)
+            size: (N, 3)
+            yaw: (N,)
+            least_shown: part of the projected box that must lie in the image for the image to show it.
+
         Returns:
-            (N, 4) x1 y1 x2 y2 in pixels, and (N,) whether the image shows it. What is behind the camera, beside its
-            view, or for more than half beside it gets 0 0 0 0: a box without height. Nobody can annotate what an image
-            does not show, and the KITTI evaluation leaves such boxes out of account as it does boxes that are for more
-            than half in unannotated regions.
+            (N, 4) x1 y1 x2 y2 in pixels, and (N,) whether the image shows it. What it does not show (behind the camera,
+            beside its view) gets 0 0 0 0: a box without height, which the KITTI evaluation leaves out of account.
 
         """
         corners = box_corners(center, size, yaw) @ SENSOR_FROM_CAMERA  # (N, 8, 3), camera frame
@@ -97,7 +98,7 @@ class Camera:
         boxes = np.concatenate([np.clip(least, 0.0, limit), np.clip(most, 0.0, limit)], axis=1)
         with np.errstate(invalid="ignore"):  # what is not seen at all has infinite bounds
             whole = np.prod(most - least, axis=1)
-        seen &= np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) >= _SHOWN * whole
+        seen &= np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) >= least_shown * np.where(seen, whole, 0.0)
         return np.where(seen[:, None], boxes, 0.0), seen
 
 

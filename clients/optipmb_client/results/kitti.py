@@ -2,8 +2,10 @@
 
 A line has 18 fields: frame, id, type, truncated, occluded, alpha, x1, y1, x2, y2, h, w, l, x, y, z, ry, score. Boxes
 are in the rectified camera frame of their own frame (x y z = centre of the bottom), image boxes in pixels, `truncated`
-and `occluded` are -1 (unknown). Every track is written, nothing is thresholded: one that no part of the image shows has
-the image box 0 0 0 0 and its 3D box as it is. Numbers have six decimals, so the same tracks always give the same bytes.
+and `occluded` are -1 (unknown). Every track is written, nothing is thresholded: one that the image shows less
+than half of has the image box 0 0 0 0 and its 3D box as it is. Nobody can annotate what an image does not show, and the
+KITTI evaluation leaves boxes without height out of account, as it does those that are for more than half in unannotated
+regions. Numbers have six decimals, so the same tracks always give the same bytes.
 """
 
 from collections.abc import Sequence
@@ -16,6 +18,9 @@ from optipmb_client.camera import Camera, alpha_of, kitti_from_sensor, sensor_fr
 from optipmb_client.files import AtomicText, DatasetError, numbers, read_rows
 from optipmb_client.geometry import PoseLike, rotation_of, to_sensor
 from optipmb_client.results.rows import ResultTable, TrackRows
+
+LEAST_SHOWN = 0.5
+"""Part of a projected box that must lie in the image for its line to have an image box."""
 
 _FIELDS = 18
 _TYPE = 2
@@ -38,7 +43,7 @@ class KittiResultWriter:
         center, yaw = to_sensor(
             rotation_of(np.asarray(pose.quaternion)), np.asarray(pose.translation), tracks.center, tracks.yaw
         )
-        image, _ = self._camera.boxes(center, tracks.size, yaw)
+        image, _ = self._camera.boxes(center, tracks.size, yaw, least_shown=LEAST_SHOWN)
         bottom, hwl, rotation_y = kitti_from_sensor(center, tracks.size, yaw)
         alpha = alpha_of(bottom, rotation_y)
         values = np.column_stack([alpha, image, hwl, bottom, rotation_y, tracks.score])

@@ -16,6 +16,7 @@ from optipmb_client.errors import UsageError
 from optipmb_client.evaluation import Rules
 from optipmb_client.geometry import Floats, Ints, stack_poses, to_sensor
 from optipmb_client.results import ResultTable
+from optipmb_client.results.kitti import LEAST_SHOWN
 from optipmb_client.results.rows import empty_table
 
 __all__ = ["Clip", "load", "of_class", "prepare_frames", "track_clip"]
@@ -152,7 +153,7 @@ def track_clip(
         image = np.full((len(when), 4), np.nan)
     else:
         local, turned = to_sensor(clip.rotation[when], clip.translation[when], center, yaw)
-        image = clip.camera.boxes(local, size, turned)[0]
+        image = clip.camera.boxes(local, size, turned, LEAST_SHOWN)[0]  # as the result files have it
     return ResultTable(
         labels=parameters.labels,
         frame=when,

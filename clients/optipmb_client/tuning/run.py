@@ -111,7 +111,12 @@ def tune_all(source: Source, parameters: Parameters, plan: Plan, out: Path, watc
     results = {}
     for name in source.classes:
         scorer = scorer_of(source.dataset, name, source.sequences)
-        context = {"dataset": source.dataset, "detections": source.detections, "detected": _sum(source.of_class(name))}
+        context = {
+            "version": version("optipmb"),
+            "dataset": source.dataset,
+            "detections": source.detections,
+            "detected": _sum(source.of_class(name)),
+        }
         results[name] = refine(source.of_class(name), scorer, parameters, plan, out / "trials.db", context, watch)
     _write_json(out / "report.json", {name: one.to_json() for name, one in results.items()})
     scope = "all parameters" if plan.everything else "noise, birth spread, area, forgetting"
