@@ -25,7 +25,14 @@ def open_client(endpoint: str) -> zenoh.Session:
 
 def _open(values: dict[str, object]) -> zenoh.Session:
     config = zenoh.Config()
-    always = {"scouting/multicast/enabled": False, "transport/shared_memory/enabled": False}
+    drop = "transport/link/tx/queue/congestion_control/drop"
+    always = {
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+        # As patient as the product: by default a busy machine drops a large message after a millisecond.
+        f"{drop}/wait_before_drop": 1_000_000,
+        f"{drop}/max_wait_before_drop_fragments": 5_000_000,
+    }
     for key, value in (values | always).items():
         config.insert_json5(key, json.dumps(value))
     return zenoh.open(config)
