@@ -65,6 +65,9 @@ class Queries:
             nowhere = self._problem("", error)
             _guarded(request, lambda: request.refuse(nowhere))
             return
+        if not self._registry.share.has(stream):
+            request.finish()  # another process has the stream, and answers
+            return
         commands: dict[str, tuple[Callable[[Lane, Request], None], bool]] = {
             "state": (self._state, True),
             "reset": (self._reset, False),

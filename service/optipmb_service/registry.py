@@ -18,6 +18,7 @@ import optipmb
 from optipmb_service.lane import Circle, Lane
 from optipmb_service.problems import problem_of
 from optipmb_service.records import SECOND, Life, Policy
+from optipmb_service.share import Share
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,6 +53,7 @@ class Registry:
         pool: the workers.
         arm: has `Lane.wake` called at a monotonic time (ns).
         tracker: makes the trackers of sessions.
+        share: the streams of this process; all of them where it is the only one.
     """
 
     def __init__(
@@ -63,7 +65,9 @@ class Registry:
         pool: Pool,
         arm: Callable[[Lane, int], None],
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
+        share: Share | None = None,
     ) -> None:
+        self.share = share or Share()
         self.profiles = profiles
         self.instance = settings.instance
         self.keys = schemas.Keys(settings.prefix)
@@ -102,6 +106,16 @@ class Registry:
         )
 
     # Messages, from the readers
+
+    def wants(self, key: str) -> bool:
+        """Whether a message on a key is for this process; asked before its payload is touched."""
+        share = self.share
+        if share.count == 1:
+            return True
+        try:
+            return share.has(self._parsed(key))
+        except schemas.MessageError:
+            return share.index == 0  # a key that is none of a stream is reported by one of the processes
 
     def frame(self, packet: Packet) -> None:
         """Hand detections to their stream; never waits."""
@@ -223,18 +237,26 @@ class Registry:
         self._report("shed", stream, f"fewer than {MAX_UNPROVEN} new streams at once", "another one")
 
     def _stream_of(self, packet: Packet) -> str | None:
-        stream = self._streams.get(packet.key)
+        try:
+            return self._parsed(packet.key)
+        except schemas.MessageError as error:
+            with self._lock:
+                self._past_refused += 1
+            self._report("invalid_value", "", error.expected, error.received)
+            return None
+
+    def _parsed(self, key: str) -> str:
+        """Return the stream of a key, remembered.
+
+        Raises:
+            MessageError: it is none.
+        """
+        stream = self._streams.get(key)
         if stream is None:
-            try:
-                stream = self.keys.stream_of(packet.key)
-            except schemas.MessageError as error:
-                with self._lock:
-                    self._past_refused += 1
-                self._report("invalid_value", "", error.expected, error.received)
-                return None
+            stream = self.keys.stream_of(key)
             if len(self._streams) >= MAX_KEYS:
                 self._streams.clear()
-            self._streams[packet.key] = stream
+            self._streams[key] = stream
         return stream
 
     def _report(self, code: str, stream: str, expected: str, received: str) -> None:

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from optipmb_service.lane import Lane
     from optipmb_service.profiles import Profiles
     from optipmb_service.settings import Settings
+    from optipmb_service.share import Share
 
 log = structlog.get_logger("optipmb_service")
 
@@ -56,6 +57,7 @@ class Service:
         profiles: the parameters that can be had.
         arm: has `Lane.wake` called at a monotonic time (ns).
         tracker: makes the trackers of sessions.
+        share: the streams of this process; all of them where it is the only one.
 
     Raises:
         TransportError: the network cannot be used.
@@ -67,6 +69,7 @@ class Service:
         profiles: Profiles,
         arm: Callable[[Lane, int], None],
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
+        share: Share | None = None,
     ) -> None:
         self._settings = settings
         self._started_ns = time.time_ns()
@@ -74,14 +77,14 @@ class Service:
         self._state = "starting"
         self._transport = Transport(settings)
         self._desk = Desk(self._transport.publish_problem, _log_problem)
-        self._pool = Pool(settings.threads)
-        self._registry = Registry(settings, profiles, self._transport, self._desk, self._pool, arm, tracker)
+        self._pool = Pool(settings.thread_count)
+        self._registry = Registry(settings, profiles, self._transport, self._desk, self._pool, arm, tracker, share)
         self._queries = Queries(self._registry, self.status)
 
     def start(self) -> None:
         """Receive, answer, and say so."""
         self._transport.watch()
-        self._transport.subscribe(self._registry.frame, self._registry.cloud)
+        self._transport.subscribe(self._registry.frame, self._registry.cloud, self._registry.wants)
         self._transport.serve(self._queries.about_streams, self._queries.about_service)
         self._state = "ready"
         self._transport.announce()

@@ -142,7 +142,7 @@ class Settings(BaseSettings):
     queue_clouds: int = Field(
         default=16, ge=1, le=1024, description="point clouds kept per stream; the oldest is shed beyond it"
     )
-    workers: int = Field(default=0, ge=0, le=256, description="threads that track; 0: one per processor, at most 8")
+    threads: int = Field(default=0, ge=0, le=256, description="threads that track; 0: one per processor, at most 8")
     max_sessions: int = Field(
         default=1000, ge=1, le=100_000, description="streams tracked at once; further ones are refused"
     )
@@ -170,9 +170,9 @@ class Settings(BaseSettings):
         return (DEFAULT_LISTEN,) if self.is_router else ()
 
     @property
-    def threads(self) -> int:
-        """Number of worker threads."""
-        return self.workers or min(8, os.cpu_count() or 1)
+    def thread_count(self) -> int:
+        """Number of threads that track, of one process."""
+        return self.threads or min(8, os.cpu_count() or 1)
 
     @classmethod
     def settings_customise_sources(

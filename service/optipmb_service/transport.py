@@ -135,8 +135,10 @@ class Transport:
 
     # Receiving
 
-    def subscribe(self, on_frame: Callable[[Packet], None], on_cloud: Callable[[Packet], None]) -> None:
-        """Hand over the detections and point clouds of all streams, each on a thread of its own."""
+    def subscribe(
+        self, on_frame: Callable[[Packet], None], on_cloud: Callable[[Packet], None], wanted: Callable[[str], bool]
+    ) -> None:
+        """Hand over the detections and point clouds on all keys that are wanted, each on a thread of its own."""
         detections = zenoh.ext.declare_advanced_subscriber(
             self._session,
             self._keys.all("detections"),
@@ -144,9 +146,9 @@ class Transport:
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_age=HISTORY_S),
             recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
         )
-        self._read("detections", detections, detections.handler, lambda sample: self._receive(sample, on_frame))
+        self._read("detections", detections, detections.handler, lambda sample: self._receive(sample, on_frame, wanted))
         points = self._session.declare_subscriber(self._keys.all("points"), zenoh.handlers.FifoChannel(CHANNEL // 16))
-        self._read("points", points, points.handler, lambda sample: self._receive(sample, on_cloud))
+        self._read("points", points, points.handler, lambda sample: self._receive(sample, on_cloud, wanted))
 
     def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""
@@ -177,13 +179,14 @@ class Transport:
         thread.start()
         self._readers.append((declared, thread))
 
-    def _receive(self, sample: zenoh.Sample, receive: Callable[[Packet], None]) -> None:
-        if sample.kind != zenoh.SampleKind.PUT:
+    def _receive(self, sample: zenoh.Sample, receive: Callable[[Packet], None], wanted: Callable[[str], bool]) -> None:
+        key = str(sample.key_expr)
+        if sample.kind != zenoh.SampleKind.PUT or not wanted(key):
             return
         wall_ns, now_ns = time.time_ns(), time.monotonic_ns()
         size = len(sample.payload)
         payload = sample.payload.to_bytes() if size <= self._max_bytes else None
-        receive(Packet(str(sample.key_expr), payload, size, str(sample.encoding), wall_ns, now_ns))
+        receive(Packet(key, payload, size, str(sample.encoding), wall_ns, now_ns))
 
     # Sending
 
