@@ -13,8 +13,9 @@
 Pure computation: no files but the profiles, no network, no state outside the density.
 """
 
+from optipmb.columns import columns_of, density_of
 from optipmb.density import Bernoullis, Density, Poissons
-from optipmb.errors import FrameError, OptipmbError, ParameterError
+from optipmb.errors import DensityError, FrameError, OptipmbError, ParameterError
 from optipmb.extract import Tracks
 from optipmb.frame import Frame, PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou, points_in_boxes
@@ -26,6 +27,7 @@ __all__ = [
     "Bernoullis",
     "ClassParameters",
     "Density",
+    "DensityError",
     "Diagnostics",
     "Frame",
     "FrameError",
@@ -40,6 +42,8 @@ __all__ = [
     "Tracker",
     "Tracks",
     "bev_iou",
+    "columns_of",
+    "density_of",
     "load_profile",
     "make_frame",
     "parse_parameters",

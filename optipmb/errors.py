@@ -1,8 +1,9 @@
-"""The errors of the tracker: both are `ValueError`, both name what was wrong by the path of the field.
+"""The errors of the tracker: all are `ValueError`, all name what was wrong by the path of the field.
 
 OptipmbError
 ├── FrameError       a frame's arrays have a wrong shape, dtype or value, or its stamp goes back
-└── ParameterError   a profile cannot be found or read, or a value in it is not allowed
+├── ParameterError   a profile cannot be found or read, or a value in it is not allowed
+└── DensityError     a stored density is none: a column is missing, or has a shape, type or value that none has
 """
 
 from __future__ import annotations
@@ -30,3 +31,7 @@ class FrameError(OptipmbError):
 
 class ParameterError(OptipmbError):
     """A parameter profile was refused."""
+
+
+class DensityError(OptipmbError):
+    """A stored density was refused."""

@@ -29,12 +29,14 @@ class Policy:
         cloud_wait_ns: longest wait of a frame for its cloud.
         cloud_memory_ns: how lately a cloud must have come for a frame that does not say whether it has one.
         clouds: number of clouds kept.
+        recovery_wait_ns: longest time after a restore that frames behind a gap are held for those missing.
     """
 
     gap_limit_ns: int = 5 * SECOND
     cloud_wait_ns: int = SECOND // 10
     cloud_memory_ns: int = 2 * SECOND
     clouds: int = 16
+    recovery_wait_ns: int = 2 * SECOND
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,12 +17,13 @@ import json
 import time
 from bisect import insort
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import optipmb_schemas as schemas
 
 import optipmb
 from optipmb_service import convert
+from optipmb_service.checkpoint import Checkpoint
 from optipmb_service.clouds import Clouds
 from optipmb_service.problems import problem_of
 from optipmb_service.records import SECOND, Begun, Counters, Life, Output, Policy, RefusedError, Steps, Tracked
@@ -96,6 +97,7 @@ class Session:
         self._held: list[_Held] = []
         self._clouds = Clouds(self._policy.clouds)
         self._last: Mark | None = None
+        self._recovery_ns: int | None = None
         life = life or Life()
         self._starts = life.starts
         self._use(parameters)
@@ -214,6 +216,63 @@ class Session:
     def life(self) -> Life:
         """What a later session of the stream has to know."""
         return Life(self._starts, self._cell.density.next_id)
+
+    def snapshot(self) -> Checkpoint:
+        """Return the state between two frames, as references to values that never change: cheap, to be encoded later.
+
+        Frames that are held are not in it: they come again from the publisher's cache.
+        """
+        cell = self._cell
+        return Checkpoint(
+            self.stream,
+            cell.session,
+            self._starts,
+            cell.generation,
+            cell.tracks,
+            self.parameters,
+            cell.density,
+            self._timeline,
+            self._last,
+            replace(self.counters),
+        )
+
+    @classmethod
+    def restore(
+        cls,
+        checkpoint: Checkpoint,
+        now_ns: int,
+        policy: Policy | None = None,
+        *,
+        instance: str = "",
+        tracker: Callable[[optipmb.Parameters], Steps] = optipmb.Tracker,
+        clock: Callable[[], int] = time.perf_counter_ns,
+    ) -> Self:
+        """Return the session that a checkpoint was taken of. It is `recovering` until `recovered` is called.
+
+        Args:
+            checkpoint: its state.
+            now_ns: monotonic time; the waiting for missed frames begins now.
+            policy: waiting and restarting.
+            instance: name of the service, for problems.
+            tracker: makes the tracker.
+            clock: measures how long a step takes, ns.
+        """
+        session = cls(checkpoint.stream, checkpoint.parameters, policy, instance=instance, tracker=tracker, clock=clock)
+        session._starts, session._timeline, session._last = checkpoint.starts, checkpoint.timeline, checkpoint.last
+        session._cell = _Cell(checkpoint.density, checkpoint.session, checkpoint.generation, checkpoint.tracks)
+        session.counters = replace(checkpoint.counters)
+        session._recovery_ns = now_ns + session._policy.recovery_wait_ns
+        return session
+
+    @property
+    def recovering(self) -> bool:
+        """Whether frames behind a gap are held, because those missing may still come from the publisher's cache."""
+        return self._recovery_ns is not None
+
+    def recovered(self, now_ns: int) -> list[Output]:
+        """End the waiting: all that the caches have is here. Returns what was held for it."""
+        self._recovery_ns = None
+        return self._advance(now_ns)
 
     def state(self, *, shed: int = 0, queue: int = 0, closed: bool = False) -> schemas.SessionState:
         """Return the state as the message that answers a query."""
