@@ -4,7 +4,7 @@
 <prefix>/<stream>/q/state | q/reset | q/parameters            queries
 <prefix>/owner/<stream>/<instance>                            liveliness: who tracks this stream
 <prefix>/service/<instance>/alive                             liveliness: which services are there
-<prefix>/service/<instance>/q/status                          query
+<prefix>/service/<instance>/q/status | q/metrics              queries
 """
 
 from collections.abc import Callable
@@ -61,6 +61,10 @@ class Keys:
     def status(self, instance: str) -> str:
         """Return the key of the status query of an instance."""
         return f"{self.prefix}/service/{_instance(instance)}/q/status"
+
+    def metrics(self, instance: str) -> str:
+        """Return the key of the metrics query of an instance."""
+        return f"{self.prefix}/service/{_instance(instance)}/q/metrics"
 
     def all(self, topic: Topic) -> str:
         """Return the key expression of a topic of all streams."""

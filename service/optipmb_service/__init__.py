@@ -6,6 +6,7 @@ From the outside in:
 
     cli, settings, logs     the command
     service                 the control loop: start, signals, timers, end
+    vitals, metrics, figures, http, health    how it is, for those who ask from outside
     transport               Zenoh, behind the protocols of ports
     registry, queries       streams and questions, found and sorted
     lane, inbox             one stream: its queue, its worker's turn

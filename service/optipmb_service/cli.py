@@ -1,4 +1,4 @@
-"""The command `optipmb-service`: run the service (the default), or print the settings in force.
+"""The command `optipmb-service`: run the service (the default), ask how it is, or print the settings in force.
 
 Exit status: 0 after SIGINT or SIGTERM, 1 when the network cannot be used, 2 for a wrong option, path or setting; an
 error is one clear line on stderr.
@@ -16,16 +16,15 @@ import typer
 from typer.main import get_command
 
 import optipmb
-from optipmb_service import __version__, logs
+from optipmb_service import __version__, health, logs
 from optipmb_service.profiles import Profiles
 from optipmb_service.service import leave, run
 from optipmb_service.settings import Loaded, SettingsInvalidError, load
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
 WRONG_USE: Final = 2
-COMMANDS: Final = ("run", "config")
 
 app = typer.Typer(
     add_completion=False,
@@ -48,23 +47,36 @@ Instance = Annotated[str | None, typer.Option(metavar="NAME", help="Name of this
 Profile = Annotated[
     str | None, typer.Option(metavar="NAME|FILE", help="Profile of streams that no pattern in the settings names.")
 ]
+Http = Annotated[str | None, typer.Option(metavar="ADDRESS", help="Serve health and metrics there; as 127.0.0.1:8080.")]
 LogFormat = Annotated[str | None, typer.Option(metavar="console|json", help="Form of the log lines on stderr.")]
 LogLevel = Annotated[str | None, typer.Option(metavar="LEVEL", help="debug, info, warning or error.")]
 
 
 @app.command("run")
-def run_command(
+def run_command(  # noqa: PLR0913 - one argument per option of the command
+    *,
     settings: SettingsFile = None,
     router: Router = None,
     listen: Listen = None,
     connect: Connect = None,
     instance: Instance = None,
     profile: Profile = None,
+    http: Http = None,
     log_format: LogFormat = None,
     log_level: LogLevel = None,
 ) -> None:
     """Run the service until SIGINT or SIGTERM. Prints one line, `ready …`, when it can be used; logs go to stderr."""
-    loaded = _load(settings, _given(router, listen, connect, instance, profile, log_format, log_level))
+    loaded = _load(
+        settings,
+        router=router,
+        listen=listen or None,
+        connect=connect or None,
+        instance=instance,
+        profile=profile,
+        http=http,
+        log_format=log_format,
+        log_level=log_level,
+    )
     try:
         profiles = Profiles.read(loaded.settings.profile, loaded.settings.profiles)
     except optipmb.ParameterError as error:
@@ -76,19 +88,30 @@ def run_command(
 
 @app.command("config")
 def config_command(  # noqa: PLR0913 - one argument per option of the command
+    *,
     settings: SettingsFile = None,
     router: Router = None,
     listen: Listen = None,
     connect: Connect = None,
     instance: Instance = None,
     profile: Profile = None,
+    http: Http = None,
     log_format: LogFormat = None,
     log_level: LogLevel = None,
-    *,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with where each value came from.")] = False,
 ) -> None:
     """Print the settings in force as TOML, each with where it came from, and do nothing else."""
-    loaded = _load(settings, _given(router, listen, connect, instance, profile, log_format, log_level))
+    loaded = _load(
+        settings,
+        router=router,
+        listen=listen or None,
+        connect=connect or None,
+        instance=instance,
+        profile=profile,
+        http=http,
+        log_format=log_format,
+        log_level=log_level,
+    )
     values = loaded.settings.model_dump(mode="json")
     values |= {"router": loaded.settings.is_router, "listen": list(loaded.settings.endpoints)}
     if as_json:
@@ -101,6 +124,24 @@ def config_command(  # noqa: PLR0913 - one argument per option of the command
         typer.echo(f"\n[{name}]  # {loaded.sources[name]}")
         for key, value in values[name].items():
             typer.echo(f"{_toml(key) if name == 'profiles' else key} = {_toml(value)}")
+
+
+@app.command("health")
+def health_command(
+    settings: SettingsFile = None,
+    http: Http = None,
+    *,
+    ready: Annotated[
+        bool, typer.Option("--ready", help="Ask whether it can be used, not whether it is alive.")
+    ] = False,
+) -> None:
+    """Ask a running service how it is, at the `http` address of the settings; status 0 when well, else 1."""
+    address = _load(settings, http=http).settings.http
+    if not address:
+        _wrong("setting http: there is no address to ask at")
+    well, text = health.ask(address, ready=ready)
+    typer.echo(text)
+    raise typer.Exit(0 if well else 1)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -122,28 +163,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sys.exit(status if isinstance(status, int) else 0)
 
 
-def _given(
-    router: bool | None,  # noqa: FBT001 - an option that may be absent, passed on as it came
-    listen: list[str] | None,
-    connect: list[str] | None,
-    instance: str | None,
-    profile: str | None,
-    log_format: str | None,
-    log_level: str | None,
-) -> Mapping[str, Any]:
-    """Return the options as settings; None: not given."""
-    return {
-        "router": router,
-        "listen": listen or None,
-        "connect": connect or None,
-        "instance": instance,
-        "profile": profile,
-        "log_format": log_format,
-        "log_level": log_level,
-    }
-
-
-def _load(file: Path | None, options: Mapping[str, Any]) -> Loaded:
+def _load(file: Path | None, **options: Any) -> Loaded:
+    """Return the settings; an option that is None was not given."""
     try:
         return load(file, options)
     except SettingsInvalidError as error:

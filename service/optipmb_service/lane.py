@@ -18,13 +18,14 @@ from optipmb_service.inbox import Inbox
 from optipmb_service.meter import Meter
 from optipmb_service.ports import Packet, TransportError
 from optipmb_service.problems import problem_of
-from optipmb_service.records import Begun, Life, Output, Policy, Tracked
+from optipmb_service.records import SECOND, Begun, Life, Output, Policy, Tracked
 from optipmb_service.session import Session
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     import optipmb
+    from optipmb_service.metrics import Metrics
     from optipmb_service.ports import Claim, Outlet
     from optipmb_service.problems import Desk
 
@@ -54,6 +55,7 @@ class Circle:
         discard: told when a lane without a session has nothing left to do.
         submit: sends a worker to a lane.
         arm: has `Lane.wake` called at a monotonic time (ns).
+        metrics: counts what is published.
         tracker: makes trackers.
     """
 
@@ -70,6 +72,7 @@ class Circle:
     discard: Callable[[Lane], None]
     submit: Callable[[Lane], None]
     arm: Callable[[Lane, int], None]
+    metrics: Metrics
     tracker: Callable[[optipmb.Parameters], Any]
 
 
@@ -102,6 +105,7 @@ class Lane:
         self._claim: Claim | None = None
         self._armed_ns: int | None = None
         self._shed_told = 0
+        self._ids: frozenset[int] = frozenset()
 
     def wake(self) -> None:
         """Send a worker though nothing came: frames have waited long enough."""
@@ -238,7 +242,19 @@ class Lane:
         except TransportError as error:
             log.warning("publish_failed", stream=self.stream, error=str(error))
             return
-        self.meter.published(time.monotonic_ns() - ticket.now_ns)
+        latency_ns = time.monotonic_ns() - ticket.now_ns
+        self.meter.published(latency_ns)
+        self._circle.metrics.published(
+            latency_s=latency_ns / SECOND,
+            queue_s=waited_ns / SECOND,
+            decode_s=ticket.decode_ns / SECOND,
+            step_s=tracked.step_ns / SECOND,
+        )
+        self._count_tracks(frozenset(tracked.tracks.id.tolist()))
+
+    def _count_tracks(self, ids: frozenset[int]) -> None:
+        self._circle.metrics.tracks(started=len(ids - self._ids), ended=len(self._ids - ids))
+        self._ids = ids
 
     def _report(self, code: str, path: str, expected: str, received: str, *, what: str = "", count: int = 1) -> None:
         message = f"{what or 'Stream'}: {path or 'message'}: expected {expected}, received {received}."
@@ -287,6 +303,7 @@ class Lane:
             return
         self._deliver(session.flush())
         self.session, self._claim, self._armed_ns = None, None, None
+        self._count_tracks(frozenset())
         self._circle.release(session)
         if claim is not None:
             claim.release()

@@ -71,6 +71,9 @@ class Request(Protocol):
     def answer(self, key: str, message: schemas.Message) -> None:
         """Reply."""
 
+    def answer_text(self, key: str, text: bytes, encoding: str) -> None:
+        """Reply with text that is no message."""
+
     def refuse(self, problem: schemas.Problem) -> None:
         """Reply with an error."""
 
@@ -80,3 +83,7 @@ class Request(Protocol):
 
 class TransportError(Exception):
     """The network cannot be used; the text is one clear line."""
+
+
+class HttpError(Exception):
+    """The address of the HTTP endpoint cannot be listened on; the text is one clear line."""

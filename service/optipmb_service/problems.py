@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -138,7 +138,7 @@ class Desk:
         self._newest: deque[schemas.Problem] = deque(maxlen=NEWEST)
         self._published = _Budget(PUBLISHED_PER_SECOND)
         self._logged = _Budget(LOGGED_PER_SECOND)
-        self.total = 0
+        self._counts: Counter[str] = Counter()
 
     def report(self, problem: schemas.Problem, now_ns: int) -> None:
         """Tell of a problem now or, when its kind was told of just before, in the next summary."""
@@ -146,7 +146,7 @@ class Desk:
         detail = problem.received if problem.code == "unknown_class" else re.sub(r"\[\d+\]", "[]", problem.path)
         key = (problem.stream, problem.code, detail)
         with self._lock:
-            self.total += problem.count
+            self._counts[problem.code] += problem.count
             kind = self._kinds.get(key)
             if kind is None:
                 kind = _Kind(published_ns=now_ns - PUBLISH_EVERY_NS, logged_ns=now_ns - LOG_EVERY_NS)
@@ -175,6 +175,11 @@ class Desk:
         """Return the newest problems, the oldest first."""
         with self._lock:
             return tuple(self._newest)
+
+    def counts(self) -> dict[str, int]:
+        """Return how many problems there were since the start, by code."""
+        with self._lock:
+            return dict(self._counts)
 
     def _tell(self, kind: _Kind, now_ns: int) -> _Told | None:
         """Take what may be told of a kind now; called with the lock."""

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
+TEXT = "text/plain;version=0.0.4"
+"""Zenoh encoding of the metrics."""
+
 NO_SESSION = "0" * 32
 """Session id in the state of a stream that has none."""
 
@@ -40,17 +43,27 @@ class Queries:
     Args:
         registry: the streams.
         status: makes the status of the service.
+        metrics: makes its metrics, in Prometheus' text format.
     """
 
-    def __init__(self, registry: Registry, status: Callable[[], schemas.ServiceStatus]) -> None:
+    def __init__(
+        self, registry: Registry, status: Callable[[], schemas.ServiceStatus], metrics: Callable[[], bytes]
+    ) -> None:
         self._registry = registry
         self._status = status
+        self._metrics = metrics
         self._keys = registry.keys
 
     def about_service(self, request: Request) -> None:
-        """Answer with the status of the service."""
-        key = self._keys.status(self._registry.instance)
-        _guarded(request, lambda: request.answer(key, self._status()))
+        """Answer with the status of the service, its metrics, or both when the key has a `*`."""
+        instance = self._registry.instance
+        _guarded(request, lambda: self._report(request, self._keys.status(instance), self._keys.metrics(instance)))
+
+    def _report(self, request: Request, status: str, metrics: str) -> None:
+        if request.matches(status):
+            request.answer(status, self._status())
+        if request.matches(metrics):
+            request.answer_text(metrics, self._metrics(), TEXT)
 
     def about_streams(self, request: Request) -> None:
         """Answer what concerns sessions, here or on the worker of the stream."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 
 from optipmb_service.logs import EVENTS
+from optipmb_service.metrics import METRICS, NAMESPACE
 from optipmb_service.problems import CODES
 from optipmb_service.settings import LimitSettings, Settings
 
@@ -26,7 +27,7 @@ _BOUNDS: Final = {"ge": "≥", "gt": ">", "le": "≤"}
 
 def page(text: str) -> str:
     """Return a page with its tables made anew."""
-    tables = {"settings": settings(), "problems": problems(), "events": events()}
+    tables = {"settings": settings(), "problems": problems(), "events": events(), "metrics": metrics()}
     return _TABLE.sub(lambda match: f"{match[1]}{tables[match[2]]}{match[3]}", text)
 
 
@@ -45,6 +46,15 @@ def problems() -> str:
 def events() -> str:
     """Return the table of the log events."""
     return _table(("event", "meaning"), [(f"`{event}`", text) for event, text in EVENTS.items()])
+
+
+def metrics() -> str:
+    """Return the table of the metrics."""
+    rows = [
+        (f"`{NAMESPACE}{name}`", metric.kind, ", ".join(f"`{label}`" for label in metric.labels), metric.meaning)
+        for name, metric in METRICS.items()
+    ]
+    return _table(("metric", "kind", "labels", "meaning"), rows)
 
 
 def _setting(name: str, field: FieldInfo) -> tuple[str, str, str, str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
@@ -17,13 +18,14 @@ import structlog
 import optipmb
 from optipmb_service.lane import Circle, Lane
 from optipmb_service.problems import problem_of
-from optipmb_service.records import SECOND, Life, Policy
+from optipmb_service.records import SECOND, Counters, Life, Policy
 from optipmb_service.share import Share
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.inbox import Pool
+    from optipmb_service.metrics import Metrics
     from optipmb_service.ports import Outlet, Packet
     from optipmb_service.problems import Desk
     from optipmb_service.profiles import Profiles
@@ -42,6 +44,26 @@ MAX_KEYS: Final = 8192
 """Keys whose stream is remembered."""
 
 
+@dataclass(slots=True)
+class Totals:
+    """What happened to all messages since the start."""
+
+    counters: Counters = field(default_factory=Counters)
+    shed_frames: int = 0
+    shed_clouds: int = 0
+
+    def add(self, counters: Counters) -> None:
+        """Add what happened in a session."""
+        for one in fields(Counters):
+            setattr(self.counters, one.name, getattr(self.counters, one.name) + getattr(counters, one.name))
+
+    def add_lane(self, lane: Lane) -> None:
+        """Add what happened before its session, and in its queue."""
+        self.counters.refused += lane.refused
+        self.shed_frames += lane.inbox.shed_frames
+        self.shed_clouds += lane.inbox.shed_clouds
+
+
 class Registry:
     """The streams of one service.
 
@@ -52,11 +74,12 @@ class Registry:
         desk: where problems go.
         pool: the workers.
         arm: has `Lane.wake` called at a monotonic time (ns).
+        metrics: counts what comes and goes.
         tracker: makes the trackers of sessions.
         share: the streams of this process; all of them where it is the only one.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the parts that it brings together
         self,
         settings: Settings,
         profiles: Profiles,
@@ -64,6 +87,8 @@ class Registry:
         desk: Desk,
         pool: Pool,
         arm: Callable[[Lane, int], None],
+        *,
+        metrics: Metrics,
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
         share: Share | None = None,
     ) -> None:
@@ -81,8 +106,8 @@ class Registry:
         self._sessions = 0
         self._lives: OrderedDict[str, Life] = OrderedDict()
         self._streams: dict[str, str] = {}
-        self._past_frames = 0
-        self._past_refused = 0
+        self._past = Totals()
+        self._metrics = metrics
         self._circle = Circle(
             instance=settings.instance,
             limits=self.limits,
@@ -102,6 +127,7 @@ class Registry:
             discard=self._discard,
             submit=pool.submit,
             arm=arm,
+            metrics=metrics,
             tracker=tracker,
         )
 
@@ -119,11 +145,13 @@ class Registry:
 
     def frame(self, packet: Packet) -> None:
         """Hand detections to their stream; never waits."""
+        self._metrics.received("detections", packet.size)
         if (stream := self._stream_of(packet)) is not None:
             self._offer(stream, lambda lane: lane.inbox.offer_frame(packet))
 
     def cloud(self, packet: Packet) -> None:
         """Hand a point cloud to its stream; never waits."""
+        self._metrics.received("points", packet.size)
         if (stream := self._stream_of(packet)) is not None:
             self._offer(stream, lambda lane: lane.inbox.offer_cloud(packet))
 
@@ -145,16 +173,16 @@ class Registry:
             lane = self._lanes.get(stream)
         return lane if lane is not None and lane.session is not None else None
 
-    def totals(self) -> tuple[int, int]:
-        """Return the frames tracked and the messages refused since the start."""
+    def totals(self) -> Totals:
+        """Return what happened to all messages since the start."""
         with self._lock:
-            frames, refused, lanes = self._past_frames, self._past_refused, list(self._lanes.values())
+            totals = Totals(replace(self._past.counters), self._past.shed_frames, self._past.shed_clouds)
+            lanes = list(self._lanes.values())
         for lane in lanes:
-            refused += lane.refused
+            totals.add_lane(lane)
             if (session := lane.session) is not None:
-                frames += session.counters.frames
-                refused += session.counters.refused
-        return frames, refused
+                totals.add(session.counters)
+        return totals
 
     @property
     def busy(self) -> bool:
@@ -213,7 +241,7 @@ class Registry:
         with self._lock:
             if self._lanes.get(lane.stream) is lane:
                 del self._lanes[lane.stream]
-                self._past_refused += lane.refused
+                self._past.add_lane(lane)
 
     def _admit(self, stream: str) -> Life | None:
         with self._lock:
@@ -225,15 +253,14 @@ class Registry:
     def _release(self, session: Session) -> None:
         with self._lock:
             self._sessions -= 1
-            self._past_frames += session.counters.frames
-            self._past_refused += session.counters.refused
+            self._past.add(session.counters)
             self._lives[session.stream] = session.life
             if len(self._lives) > MAX_LIVES:
                 self._lives.popitem(last=False)
 
     def _refuse(self, stream: str) -> None:
         with self._lock:
-            self._past_refused += 1
+            self._past.counters.refused += 1
         self._report("shed", stream, f"fewer than {MAX_UNPROVEN} new streams at once", "another one")
 
     def _stream_of(self, packet: Packet) -> str | None:
@@ -241,7 +268,7 @@ class Registry:
             return self._parsed(packet.key)
         except schemas.MessageError as error:
             with self._lock:
-                self._past_refused += 1
+                self._past.counters.refused += 1
             self._report("invalid_value", "", error.expected, error.received)
             return None
 

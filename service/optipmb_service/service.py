@@ -24,18 +24,21 @@ import optipmb_schemas as schemas
 import structlog
 
 import optipmb
-from optipmb_service import __version__
+from optipmb_service import __version__, figures
 from optipmb_service.inbox import Pool
-from optipmb_service.ports import TransportError
+from optipmb_service.metrics import Metrics
+from optipmb_service.ports import HttpError, TransportError
 from optipmb_service.problems import Desk
 from optipmb_service.queries import Queries
 from optipmb_service.registry import Registry
 from optipmb_service.transport import Transport
+from optipmb_service.vitals import BEAT_S, Vitals
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from optipmb_service.lane import Lane
+    from optipmb_service.metrics import Value
     from optipmb_service.profiles import Profiles
     from optipmb_service.settings import Settings
     from optipmb_service.share import Share
@@ -58,6 +61,7 @@ class Service:
         arm: has `Lane.wake` called at a monotonic time (ns).
         tracker: makes the trackers of sessions.
         share: the streams of this process; all of them where it is the only one.
+        metrics: what counts; its own by default.
 
     Raises:
         TransportError: the network cannot be used.
@@ -70,23 +74,37 @@ class Service:
         arm: Callable[[Lane, int], None],
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
         share: Share | None = None,
+        metrics: Metrics | None = None,
     ) -> None:
         self._settings = settings
         self._started_ns = time.time_ns()
         self._began_ns = time.monotonic_ns()
-        self._state = "starting"
+        self.state = "starting"
+        """As in the status."""
+        self._metrics = metrics or Metrics()
         self._transport = Transport(settings)
         self._desk = Desk(self._transport.publish_problem, _log_problem)
         self._pool = Pool(settings.thread_count)
-        self._registry = Registry(settings, profiles, self._transport, self._desk, self._pool, arm, tracker, share)
-        self._queries = Queries(self._registry, self.status)
+        self._registry = Registry(
+            settings,
+            profiles,
+            self._transport,
+            self._desk,
+            self._pool,
+            arm,
+            metrics=self._metrics,
+            tracker=tracker,
+            share=share,
+        )
+        self._metrics.add(self._figures)
+        self._queries = Queries(self._registry, self.status, self._metrics.text)
 
     def start(self) -> None:
         """Receive, answer, and say so."""
         self._transport.watch()
         self._transport.subscribe(self._registry.frame, self._registry.cloud, self._registry.wants)
         self._transport.serve(self._queries.about_streams, self._queries.about_service)
-        self._state = "ready"
+        self.state = "ready"
         self._transport.announce()
 
     def housekeeping(self) -> None:
@@ -97,7 +115,7 @@ class Service:
 
     def stop(self) -> bool:
         """Track what was received, within the grace, and close; False when a step would not end."""
-        self._state = "stopping"
+        self.state = "stopping"
         ends = time.monotonic() + self._settings.grace_s
         self._transport.stop(JOIN_S)
         self._registry.finish()
@@ -111,19 +129,32 @@ class Service:
     def status(self) -> schemas.ServiceStatus:
         """Return the answer to `q/status`."""
         now_ns = time.monotonic_ns()
-        frames, refused = self._registry.totals()
-        summaries = (lane.summary(now_ns) for lane in self._registry.lanes())
+        counters = self._registry.totals().counters
         return schemas.ServiceStatus(
             instance=self._settings.instance,
             version=__version__,
             started_ns=self._started_ns,
             uptime_s=(now_ns - self._began_ns) / 1e9,
-            state=self._state,
-            sessions=tuple(summary for summary in summaries if summary is not None),
-            frames=frames,
-            refused=refused,
+            state=self.state,
+            sessions=self._summaries(now_ns),
+            frames=counters.frames,
+            refused=counters.refused,
             problems=self._desk.newest(),
         )
+
+    def _summaries(self, now_ns: int) -> tuple[schemas.SessionSummary, ...]:
+        summaries = (lane.summary(now_ns) for lane in self._registry.lanes())
+        return tuple(summary for summary in summaries if summary is not None)
+
+    def _figures(self) -> Iterator[Value]:
+        """Read what `metrics` does not count itself."""
+        sessions = self._summaries(time.monotonic_ns())
+        densities = [session.density for lane in self._registry.lanes() if (session := lane.session) is not None]
+        yield from figures.of_problems(self._desk.counts())
+        yield from figures.of_totals(self._registry.totals())
+        yield from figures.of_sessions(sessions)
+        yield from figures.of_densities(densities)
+        yield from figures.of_streams(sessions, self._settings.http_streams)
 
 
 async def run(settings: Settings, profiles: Profiles) -> int:
@@ -147,25 +178,44 @@ async def run(settings: Settings, profiles: Profiles) -> int:
         loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, lane.wake)
 
     log.info("starting", instance=settings.instance, version=__version__, profiles=profiles.names)
+    vitals = Vitals(settings.instance)
+    try:
+        with _http(settings, vitals):
+            beating = loop.create_task(_beat(vitals))
+            try:
+                return await _serve(settings, profiles, asked, arm, vitals)
+            finally:
+                beating.cancel()
+    except (TransportError, HttpError) as error:
+        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+        return 1
+
+
+async def _serve(
+    settings: Settings, profiles: Profiles, asked: asyncio.Event, arm: Callable[[Lane, int], None], vitals: Vitals
+) -> int:
+    """Run the service until the end is asked for.
+
+    Raises:
+        TransportError: the network cannot be used.
+    """
     await _unless(asked, optipmb.warm_up)
     if asked.is_set():
         return 0
     if not settings.is_router:
         log.info("connecting", endpoints=settings.connect)
-    try:
-        service = await _unless(asked, lambda: Service(settings, profiles, arm))
-    except TransportError as error:
-        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
-        return 1
+    service = await _unless(asked, lambda: Service(settings, profiles, arm, metrics=vitals.metrics))
     if service is None:
         return 0
     service.start()
+    vitals.serve(service)
     endpoints = ",".join((*settings.endpoints, *settings.connect))
     print(f"ready instance={settings.instance} endpoints={endpoints}", flush=True)  # noqa: T201 - what starters wait for
     log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
     while not asked.is_set():
         await _passed(asked, HOUSEKEEPING_S)
         service.housekeeping()
+    vitals.ends()
     ended = await asyncio.to_thread(service.stop)
     log.info("stopped", drained=ended)
     return 0
@@ -178,6 +228,32 @@ def leave(status: int) -> None:
     if any(thread.daemon and thread.is_alive() for thread in threading.enumerate()):
         os._exit(status)
     sys.exit(status)
+
+
+async def _beat(vitals: Vitals) -> None:
+    while True:
+        vitals.beat()
+        await asyncio.sleep(BEAT_S)
+
+
+@contextlib.contextmanager
+def _http(settings: Settings, vitals: Vitals) -> Iterator[None]:
+    """Answer over HTTP, where that is asked for.
+
+    Raises:
+        HttpError: the address cannot be listened on.
+    """
+    if not settings.http:
+        yield
+        return
+    from optipmb_service.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
+
+    server = Server(application(vitals), settings.http)
+    log.info("http", address=server.address)
+    try:
+        yield
+    finally:
+        server.close()
 
 
 async def _passed(event: asyncio.Event, seconds: float) -> None:

@@ -52,6 +52,12 @@ def _endpoint(value: str) -> str:
     return value
 
 
+def _address(value: str) -> str:
+    if value and not re.fullmatch(r"([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.%]+\]):\d{1,5}", value):
+        raise ValueError(f"an address looks like 127.0.0.1:8080, received {value!r}")
+    return value
+
+
 def _prefix(value: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*", value):
         raise ValueError(f"chunks of [A-Za-z0-9_.-] separated by '/', received {value!r}")
@@ -151,6 +157,13 @@ class Settings(BaseSettings):
     )
     stale_s: float = Field(default=2.0, gt=0, description="a stream without a frame for this long is logged as stale")
     grace_s: float = Field(default=1.0, ge=0, le=60, description="at the end, time for the frames already received")
+    http: Annotated[str, AfterValidator(_address)] = Field(
+        default="",
+        description="address of `/healthz`, `/readyz` and `/metrics`, as `127.0.0.1:8080`; default: no HTTP",
+    )
+    http_streams: int = Field(
+        default=100, ge=0, le=10_000, description="streams that have series of their own in the metrics, by name"
+    )
     log_format: Literal["console", "json"] = Field(default="console", description="form of the log lines on stderr")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="least level that is logged"

@@ -154,7 +154,7 @@ class Transport:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""
         for key, answer in (
             (f"{self._prefix}/*/*/*/q/*", about_streams),
-            (self._keys.status(self._instance), about_service),
+            (f"{self._prefix}/service/{self._instance}/q/*", about_service),
         ):
             queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(CHANNEL // 16))
             self._read("queries", queryable, queryable.handler, _answering(answer))
@@ -309,6 +309,17 @@ class Question:
         """
         try:
             self._query.reply(key, schemas.encode(message), encoding=schemas.encoding_of(message))
+        except zenoh.ZError as error:
+            raise TransportError(_line(error)) from error
+
+    def answer_text(self, key: str, text: bytes, encoding: str) -> None:
+        """Reply with text that is no message.
+
+        Raises:
+            TransportError: the asker or the session is gone.
+        """
+        try:
+            self._query.reply(key, text, encoding=encoding)
         except zenoh.ZError as error:
             raise TransportError(_line(error)) from error
 

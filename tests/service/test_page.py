@@ -15,7 +15,7 @@ from optipmb_service.reference import main, page
 from optipmb_service.settings import load
 
 FILE = Path(__file__).parents[2] / "docs" / "operation.md"
-SOURCES = sorted(Path(optipmb_service.__file__).parent.glob("*.py"))
+SOURCES = sorted(Path(optipmb_service.__file__).parent.rglob("*.py"))
 LEVELS = {"debug", "info", "warning", "error", "exception"}
 
 

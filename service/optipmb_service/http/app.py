@@ -1,0 +1,81 @@
+"""The HTTP application: three questions that orchestrators and Prometheus ask, and room for more routes.
+
+It knows nothing of the service but what `Source` says, so a test runs it with a source of its own.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+from starlette.applications import Starlette
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from optipmb_service.metrics import CONTENT_TYPE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import optipmb_schemas as schemas
+    from starlette.requests import Request
+    from starlette.routing import BaseRoute
+
+UNAVAILABLE = 503
+
+
+class Source(Protocol):
+    """What the application tells of; every method may be called by any thread and answers at once."""
+
+    def alive(self) -> bool:
+        """Tell whether the control loop turns."""
+
+    def beat_age_s(self) -> float:
+        """Return the seconds since it last did."""
+
+    def ready(self) -> bool:
+        """Tell whether the service can be used."""
+
+    def state(self) -> str:
+        """Return the state of the process."""
+
+    def status(self) -> schemas.ServiceStatus | None:
+        """Return the service's own report; None while it starts."""
+
+    def text(self) -> bytes:
+        """Return the metrics in Prometheus' text format."""
+
+
+def application(source: Source, routes: Sequence[BaseRoute] = ()) -> Starlette:
+    """Return the application.
+
+    Args:
+        source: what it tells of.
+        routes: served besides its own; its own come first.
+    """
+    own = [
+        Route("/healthz", _answer(lambda: _health(source))),
+        Route("/readyz", _answer(lambda: _readiness(source))),
+        Route("/metrics", _answer(lambda: Response(source.text(), media_type=CONTENT_TYPE))),
+    ]
+    return Starlette(routes=[*own, *routes])
+
+
+def _health(source: Source) -> Response:
+    alive = source.alive()
+    body = {"alive": alive, "beat_age_s": round(source.beat_age_s(), 3)}
+    return JSONResponse(body, status_code=200 if alive else UNAVAILABLE)
+
+
+def _readiness(source: Source) -> Response:
+    ready = source.ready()
+    return JSONResponse({"ready": ready, "state": source.state()}, status_code=200 if ready else UNAVAILABLE)
+
+
+def _answer(make: Callable[[], Response]) -> Callable[[Request], Response]:
+    # No coroutine: Starlette runs it on a thread, so that making the metrics of many streams delays no other answer.
+    def endpoint(_request: Request) -> Response:
+        response = make()
+        response.headers["cache-control"] = "no-store"
+        return response
+
+    return endpoint
