@@ -19,12 +19,13 @@ from optipmb.errors import DensityError, FrameError, OptipmbError, ParameterErro
 from optipmb.extract import Tracks
 from optipmb.frame import Frame, PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou, points_in_boxes
-from optipmb.parameters import ClassParameters, Parameters, load_profile, parse_parameters, profiles
+from optipmb.parameters import Calibration, ClassParameters, Parameters, load_profile, parse_parameters, profiles
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
 from optipmb.warm import warm_up
 
 __all__ = [
     "Bernoullis",
+    "Calibration",
     "ClassParameters",
     "Density",
     "DensityError",

@@ -160,6 +160,7 @@ def new_objects(
         born_ns=np.full(count, stamp_ns, np.int64),
         seen_ns=np.full(count, stamp_ns, np.int64),
         score=np.zeros(count),
+        evidence=np.zeros(count),
         extracted=np.zeros(count, np.bool_),
     )
     return objects, rows, repaired

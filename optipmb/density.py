@@ -67,6 +67,7 @@ class Bernoullis(_Rows):
         born_ns: (N,) int64 stamp of the first detection.
         seen_ns: (N,) int64 stamp of the last detection; x_cnt and x_len are its and born_ns's distance to now.
         score: (N,) confidence score x_s.
+        evidence: (N,) mean log odds of the latest detections (`optipmb.calibration`).
         extracted: (N,) bool, whether the track was ever extracted (t in T).
     """
 
@@ -79,6 +80,7 @@ class Bernoullis(_Rows):
     born_ns: NDArray[np.int64]
     seen_ns: NDArray[np.int64]
     score: NDArray[np.float64]
+    evidence: NDArray[np.float64]
     extracted: NDArray[np.bool_]
 
     def __len__(self) -> int:
@@ -97,6 +99,7 @@ class Bernoullis(_Rows):
             born_ns=np.zeros(0, np.int64),
             seen_ns=np.zeros(0, np.int64),
             score=np.zeros(0),
+            evidence=np.zeros(0),
             extracted=np.zeros(0, np.bool_),
         )
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from optipmb.calibration import calibrated
 from optipmb.density import OMEGA, PHI, A, V, whole_periods
 
 if TYPE_CHECKING:
@@ -31,9 +32,9 @@ class Tracks:
         velocity: (N, 2) over ground, m/s.
         yaw_rate: (N,) rad/s.
         acceleration: (N,) along the heading, m/s^2.
-        existence: (N,) existence probability r.
-        score: (N,) confidence score x_s; zero while missed.
-        covariance: (N, 6, 6) of [x, y, v, phi, omega, a].
+        existence: (N,) existence probability: calibrated (`optipmb.calibration`), or r without a calibration.
+        score: (N,) confidence score x_s, zero while missed; or the evidence, where the profile asks for it.
+        covariance: (N, 6, 6) of [x, y, v, phi, omega, a], with the lasting error of the detector.
         age: (N,) s since the first detection.
         time_since_detection: (N,) s since the last one.
         detection: (N,) int64, index of this frame's detection in the caller's arrays, -1 while missed.
@@ -79,9 +80,10 @@ def seconds(nanoseconds: NDArray[np.int64]) -> Array:
     return np.asarray(nanoseconds * 1e-9, dtype=np.float64)
 
 
-def tracks_of(bernoulli: Bernoullis, detection: NDArray[np.int64], stamp_ns: int) -> Tracks:
+def tracks_of(bernoulli: Bernoullis, detection: NDArray[np.int64], stamp_ns: int, table: ClassTable) -> Tracks:
     """Read the tracks off the extracted Bernoullis; `detection` (N,) is what each was associated with."""
     mean = bernoulli.mean
+    existence, score, covariance = calibrated(bernoulli, table)
     v, phi = mean[:, V], mean[:, PHI]
     return Tracks(
         id=bernoulli.id,
@@ -92,9 +94,9 @@ def tracks_of(bernoulli: Bernoullis, detection: NDArray[np.int64], stamp_ns: int
         velocity=np.column_stack((v * np.cos(phi), v * np.sin(phi))),
         yaw_rate=mean[:, OMEGA].copy(),
         acceleration=mean[:, A].copy(),
-        existence=bernoulli.existence,
-        score=bernoulli.score,
-        covariance=bernoulli.covariance,
+        existence=existence,
+        score=score,
+        covariance=covariance,
         age=seconds(stamp_ns - bernoulli.born_ns),
         time_since_detection=seconds(stamp_ns - bernoulli.seen_ns),
         detection=detection,

@@ -1,4 +1,4 @@
-"""The light-weight filter of the non-motion states (Section IV.E): box size, height, counters and confidence."""
+"""The light-weight filter of the non-motion states (Section IV.E): box size, height, counters, confidence, evidence."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from optipmb.calibration import weighed_evidence
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -16,7 +18,12 @@ if TYPE_CHECKING:
 
 
 def light_weight_filter(
-    bernoulli: Bernoullis, measurement: NDArray[np.int64], measurements: Measurements, stamp_ns: int, table: ClassTable
+    bernoulli: Bernoullis,
+    measurement: NDArray[np.int64],
+    measurements: Measurements,
+    stamp_ns: int,
+    before_ns: int,
+    table: ClassTable,
 ) -> Bernoullis:
     """Update the non-motion states of all objects, new and old.
 
@@ -30,6 +37,8 @@ def light_weight_filter(
         measurement: (N,) index of the measurement of each, negative where missed.
         measurements: Z_k.
         stamp_ns: stamp of the frame.
+        before_ns: stamp of the frame before. The evidence of a frame weighs by the time since then, that of a first
+            detection by one nominal period.
         table: parameters as columns.
     """
     seen = measurement >= 0
@@ -39,9 +48,11 @@ def light_weight_filter(
     auxiliary[seen] = (1.0 - z_s[:, None]) * auxiliary[seen] + z_s[:, None] * measurements.auxiliary[m]
     x_len = 1.0 + (stamp_ns - bernoulli.born_ns[seen]) * 1e-9 / table.period
     score[seen] = (1.0 - np.exp(-x_len)) * z_s
+    periods = np.where(bernoulli.born_ns == stamp_ns, 1.0, (stamp_ns - before_ns) * 1e-9 / table.period)
     return replace(
         bernoulli,
         auxiliary=auxiliary,
         score=score,
+        evidence=weighed_evidence(bernoulli, measurement, measurements, periods, table),
         seen_ns=np.where(seen, stamp_ns, bernoulli.seen_ns).astype(np.int64),
     )

@@ -62,6 +62,40 @@ class BirthSpread(_Table):
     acceleration: Positive = Field(description="of a, m/s^2")
 
 
+class Calibration(_Table):
+    """How the tracks of a class turned out on training data, by their evidence (`optipmb.calibration`).
+
+    The last four fields are columns of one table, a row for each knot; between the knots the curves are straight, and
+    beyond the first and the last they are level.
+    """
+
+    memory: OpenProbability = Field(description="lambda: weight that the evidence keeps over one nominal period")
+    missed: NonNegative = Field(description="l_miss: log odds against a track that a missed detection counts for")
+    score_of_evidence: bool = Field(
+        default=False, description="true: the score is the evidence, brought to [0, 1]; false: x_s of the paper"
+    )
+    evidence: Annotated[tuple[float, ...], Field(min_length=1, max_length=32)] = Field(
+        description="mean log odds of the latest detections, ascending"
+    )
+    existence: tuple[Probability, ...] = Field(description="share of such tracks that are of an object, not descending")
+    along: tuple[NonNegative, ...] = Field(
+        description="lasting error of their position along the heading, standard deviation, m"
+    )
+    across: tuple[NonNegative, ...] = Field(description="across the heading, m")
+
+    @model_validator(mode="after")
+    def _columns(self) -> Calibration:
+        rows = len(self.evidence)
+        for name in ("existence", "along", "across"):
+            if (count := len(getattr(self, name))) != rows:
+                raise ValueError(f"as many values of {name} as of evidence, {rows}, received {count}")
+        if any(later <= before for before, later in zip(self.evidence, self.evidence[1:], strict=False)):
+            raise ValueError(f"ascending evidence, received {list(self.evidence)}")
+        if any(later < before for before, later in zip(self.existence, self.existence[1:], strict=False)):
+            raise ValueError(f"existence that does not descend, received {list(self.existence)}")
+        return self
+
+
 class ClassParameters(_Table):
     """Everything the tracker knows of one object class; the paper's symbol stands first in each description."""
 
@@ -111,6 +145,9 @@ class ClassParameters(_Table):
     process_noise: ProcessNoise = Field(description="Q")
     measurement_noise: MeasurementNoise = Field(description="R")
     birth: BirthSpread = Field(description="P^0")
+    calibration: Calibration | None = Field(
+        default=None, description="what tracks say of themselves; without it existence is r and the covariance is P"
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> ClassParameters:

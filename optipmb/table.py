@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from optipmb.parameters import ClassParameters, Parameters
+    from optipmb.parameters import Calibration, ClassParameters, Parameters
 
     Array = NDArray[np.float64]
 
@@ -30,6 +30,11 @@ class ClassTable:
         noise_heading: (C,) of z_phi.
         birth_known: (C, 6) standard deviations of P^0 when the detection brings a velocity.
         birth_unknown: (C, 6) when it does not.
+        memory: (C,) lambda; one without a calibration, and so the evidence stays zero.
+        missed_evidence: (C,) l_miss.
+        score_of_evidence: (C,) whether the score is the evidence.
+        knots: (C,) number of knots of the calibration, zero without one.
+        knot_evidence: (C, K) and the other columns at the knots, zero from `knots` on.
     """
 
     period: float
@@ -58,6 +63,14 @@ class ClassTable:
     noise_heading: Array
     birth_known: Array
     birth_unknown: Array
+    memory: Array
+    missed_evidence: Array
+    score_of_evidence: NDArray[np.bool_]
+    knots: NDArray[np.int64]
+    knot_evidence: Array
+    knot_existence: Array
+    knot_along: Array
+    knot_across: Array
 
     @classmethod
     def of(cls, parameters: Parameters) -> ClassTable:
@@ -84,6 +97,16 @@ class ClassTable:
                     for p in rows
                 ]
             )
+
+        calibrations = [row.calibration for row in rows]
+        knots = [len(one.evidence) if one else 0 for one in calibrations]
+
+        def curve(value: Callable[[Calibration], tuple[float, ...]]) -> Array:
+            values = np.zeros((len(rows), max(knots)))
+            for row, one in enumerate(calibrations):
+                if one is not None:
+                    values[row, : knots[row]] = value(one)
+            return values
 
         noise = [p.process_noise for p in rows]
         return cls(
@@ -115,4 +138,12 @@ class ClassTable:
             noise_heading=column(lambda p: p.measurement_noise.heading),
             birth_known=spread(lambda p: p.birth.speed),
             birth_unknown=spread(lambda p: p.birth.unknown_speed),
+            memory=np.array([one.memory if one else 1.0 for one in calibrations]),
+            missed_evidence=np.array([one.missed if one else 0.0 for one in calibrations]),
+            score_of_evidence=np.array([one is not None and one.score_of_evidence for one in calibrations], np.bool_),
+            knots=np.array(knots, np.int64),
+            knot_evidence=curve(lambda one: one.evidence),
+            knot_existence=curve(lambda one: one.existence),
+            knot_along=curve(lambda one: one.along),
+            knot_across=curve(lambda one: one.across),
         )

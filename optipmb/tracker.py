@@ -94,7 +94,7 @@ class Tracker:
             │ associate          Hungarian algorithm on clusters
             │ update             UKF for the pairs of the best global hypothesis
             │ light-weight filter, prune
-            ▼ extract            eta_ext1, eta_ext2, eta_cnt
+            ▼ extract, calibrate eta_ext1, eta_ext2, eta_cnt
         lambda_u, {(r, p)} at k, tracks
 
     Attributes:
@@ -155,7 +155,7 @@ class Tracker:
         ids = predicted.next_id + np.arange(len(new))
         objects = old.join(replace(new, id=ids))
         measurement = np.concatenate((assigned, new_measurement))
-        objects = light_weight_filter(objects, measurement, measurements, now, table)
+        objects = light_weight_filter(objects, measurement, measurements, now, density.stamp_ns, table)
         alive = surviving_objects(objects, now, table)
         objects, measurement = objects.take(alive), measurement[alive]
 
@@ -166,7 +166,7 @@ class Tracker:
         extracted = extraction(objects, now, table, two_thresholds=modules.ote)
         objects = replace(objects, extracted=objects.extracted | extracted)
         source = np.append(measurements.source, -1)[measurement]
-        tracks = tracks_of(objects.take(extracted), source[extracted], now)
+        tracks = tracks_of(objects.take(extracted), source[extracted], now, table)
 
         posterior = Density(stamp_ns=now, next_id=predicted.next_id + len(new), bernoulli=objects, poisson=undetected)
         diagnostics = Diagnostics(

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from optipmb import Density, Tracks
 
 TOLERANCE = 1e-9
-BERNOULLI = ["mean", "covariance", "existence", "label", "auxiliary", "id", "born_ns", "seen_ns", "score", "extracted"]
+BERNOULLI = ["mean", "covariance", "existence", "label", "auxiliary", "id", "born_ns", "seen_ns", "score", "evidence"]
+BERNOULLI += ["extracted"]
 POISSON = ["mean", "covariance", "weight", "label", "auxiliary", "born_ns"]
 TRACKS = ["id", "label", "center", "size", "yaw", "velocity", "yaw_rate", "acceleration", "existence", "score"]
 TRACKS += ["covariance", "age", "time_since_detection", "detection"]

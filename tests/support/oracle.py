@@ -16,7 +16,9 @@ from oracle_formulas import (
     Array,
     Measurement,
     birth,
+    calibrate,
     count_inside,
+    follow_evidence,
     iou,
     log_likelihood,
     moment_match,
@@ -39,6 +41,7 @@ class Bernoulli:
     born_ns: int
     seen_ns: int
     score: float
+    evidence: float = 0.0
     id: int = 0
     extracted: bool = False
     detection: int = -1
@@ -91,6 +94,7 @@ class Oracle:
     def step(self, frame: Any) -> OracleTracks:
         """One frame: predict, preprocess, update, associate, prune, light-weight filter, extract."""
         now = int(frame.stamp_ns)
+        since = (now - self.stamp_ns) * 1e-9 / self.nominal  # periods since the last frame
         if self.stamp_ns >= 0:
             self._predict(now)
         self.stamp_ns = now
@@ -111,7 +115,7 @@ class Oracle:
         new = [self._first_detection(z, gates[m], p_du, p_a[m]) for m, z in enumerate(measurements)]
         chosen = self._associate(measurements, p_d, new)
         newborn = self._newborn_poisson(measurements, new, p_a, now)
-        self._update_bernoulli(measurements, chosen, p_d, now)
+        self._update_bernoulli(measurements, chosen, p_d, now, since)
         self._append_new(measurements, new, set(chosen.values()), now)
         self._update_poisson(p_du, {j for gate in gates for j in gate}, newborn, now)
         return self._extract(now)
@@ -216,7 +220,9 @@ class Oracle:
         rows, columns = linear_sum_assignment(W)
         return {int(i): int(m) for m, i in zip(rows, columns, strict=True) if i < n}
 
-    def _update_bernoulli(self, zs: list[Measurement], chosen: dict[int, int], p_d: list[float], now: int) -> None:
+    def _update_bernoulli(
+        self, zs: list[Measurement], chosen: dict[int, int], p_d: list[float], now: int, since: float
+    ) -> None:
         """Eqs. (UKF Update), (Misdetect Hypothesis Update) for the hypotheses chosen; light-weight filter; pruning."""
         survivors = []
         for i, b in enumerate(self.bernoulli):
@@ -228,11 +234,13 @@ class Oracle:
                 b.auxiliary = (1 - z.score) * b.auxiliary + z.score * z.auxiliary
                 length = 1 + (now - b.born_ns) * 1e-9 / self.nominal
                 b.score = (1 - math.exp(-length)) * z.score  # eq. (Confidence Score)
+                b.evidence = follow_evidence(c, b.evidence, 1.0 if b.born_ns == now else since, z.score)
                 b.seen_ns, b.detection = now, z.source
             else:
                 r = b.existence
                 b.existence = r * (1 - p_d[i]) / (1 - r + r * (1 - p_d[i]))
                 b.score, b.detection = 0.0, -1
+                b.evidence = follow_evidence(c, b.evidence, 1.0 if b.born_ns == now else since, None)
             if b.existence >= c.min_existence and periods(b.seen_ns, now, self.nominal) <= c.max_misses:
                 survivors.append(b)
         self.bernoulli = survivors
@@ -243,8 +251,9 @@ class Oracle:
             if m in used or h.mean is None or h.covariance is None or h.r < self.classes[z.label].min_existence:
                 continue
             score = (1 - math.exp(-1.0)) * z.score
-            b = Bernoulli(h.mean, h.covariance, h.r, z.label, z.auxiliary.copy(), now, now, score, self.next_id)
-            b.detection = z.source
+            b = Bernoulli(h.mean, h.covariance, h.r, z.label, z.auxiliary.copy(), now, now, score)
+            b.evidence = follow_evidence(self.classes[z.label], 0.0, 1.0, z.score)
+            b.id, b.detection = self.next_id, z.source
             self.bernoulli.append(b)
             self.next_id += 1
 
@@ -284,11 +293,12 @@ class Oracle:
             if not taken:
                 continue
             x, y, v, phi, omega, a = b.mean
+            existence, score, covariance = calibrate(c, b)
             rows.append(
                 {
                     "id": b.id, "label": b.label, "center": [x, y, b.auxiliary[3]], "size": b.auxiliary[:3], "yaw": phi,
                     "velocity": [v * math.cos(phi), v * math.sin(phi)], "yaw_rate": omega, "acceleration": a,
-                    "existence": b.existence, "score": b.score, "covariance": b.covariance,
+                    "existence": existence, "score": score, "covariance": covariance,
                     "age": (now - b.born_ns) * 1e-9, "time_since_detection": (now - b.seen_ns) * 1e-9,
                     "detection": b.detection,
                 }

@@ -191,3 +191,29 @@ def birth(z: Measurement, c: Any) -> tuple[Array, Array]:
     b = c.birth
     deviations = [b.position, b.position, spread, b.heading, b.turn_rate, b.acceleration]
     return np.array([*z.xy, v, wrap(phi), 0.0, 0.0]), np.diag(np.square(deviations))
+
+
+def follow_evidence(c: Any, evidence: float, since: float, score: float | None) -> float:
+    """Mean log odds of the latest detections with fading weights; `score` is None where the object was missed."""
+    if c.calibration is None:
+        return 0.0
+    if score is None:
+        odds = -c.calibration.missed
+    else:
+        odds = 7.0 if score == 1.0 else max(-7.0, min(7.0, math.log(score / (1.0 - score))))
+    kept = c.calibration.memory**since
+    return float(kept * evidence + (1.0 - kept) * odds)
+
+
+def calibrate(c: Any, b: Any) -> tuple[float, float, Array]:
+    """Existence, score and covariance of a track as they are told: curves over the evidence, level at their ends."""
+    if c.calibration is None:
+        return b.existence, b.score, b.covariance
+    known = c.calibration
+    existence, along, across = (
+        float(np.interp(b.evidence, known.evidence, column)) for column in (known.existence, known.along, known.across)
+    )
+    turn = np.array([[math.cos(b.mean[3]), -math.sin(b.mean[3])], [math.sin(b.mean[3]), math.cos(b.mean[3])]])
+    covariance = b.covariance.copy()
+    covariance[:2, :2] += turn @ np.diag([along**2, across**2]) @ turn.T
+    return existence, (b.evidence + 7.0) / 14.0 if known.score_of_evidence else b.score, covariance

@@ -241,7 +241,9 @@ def frame_of(parameters: Parameters, given: SceneFrame) -> Frame:
     return frame
 
 
-def random_parameters(seed: int, labels: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist")) -> dict[str, Any]:
+def random_parameters(
+    seed: int, labels: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), *, calibrated: bool = False
+) -> dict[str, Any]:
     """A random, valid profile as the nested dictionaries that `parse_parameters` reads."""
     rng = np.random.default_rng(seed)
 
@@ -271,7 +273,24 @@ def random_parameters(seed: int, labels: tuple[str, ...] = ("Car", "Pedestrian",
             },
         }  # fmt: skip
 
-    return {"name": f"random-{seed}", "nominal_period": 0.1, "classes": {label: one_class() for label in labels}}
+    classes = {label: one_class() for label in labels}
+    if calibrated:
+        for values in classes.values():
+            values["calibration"] = _calibration(rng)
+    return {"name": f"random-{seed}", "nominal_period": 0.1, "classes": classes}
+
+
+def _calibration(rng: np.random.Generator) -> dict[str, Any]:
+    knots = int(rng.integers(1, 6))
+    return {
+        "memory": rng.uniform(0.1, 0.95),
+        "missed": rng.uniform(0, 4),
+        "score_of_evidence": bool(rng.random() < 0.5),
+        "evidence": (np.cumsum(rng.uniform(0.1, 2, knots)) - 3).tolist(),
+        "existence": np.sort(rng.uniform(0, 1, knots)).tolist(),
+        "along": rng.uniform(0, 1, knots).tolist(),
+        "across": rng.uniform(0, 1, knots).tolist(),
+    }
 
 
 def boxes(  # noqa: PLR0913 - a detection has this many columns

@@ -60,8 +60,8 @@ def test_long_scenes_equal_algorithm_1(profile: str) -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_random_parameters_equal_algorithm_1(seed: int) -> None:
-    """The agreement does not hang on the values of the two profiles."""
-    parameters = parse_parameters(random_parameters(seed))
+    """The agreement does not hang on the values of the two profiles; two in three of these have a calibration."""
+    parameters = parse_parameters(random_parameters(seed, calibrated=seed % 3 > 0))
     rng = np.random.default_rng(seed)
     options = Options(
         frames=30,

@@ -1,0 +1,112 @@
+"""What tracks say of themselves: existence and covariance by a calibration, in cases whose answers are known."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import boxes
+
+import optipmb
+
+PAPER = optipmb.load_profile("kitti-paper")
+
+
+def with_calibration(**changes: Any) -> optipmb.Parameters:
+    """The paper's profile with a calibration of cars: two knots, at log odds of minus and plus three."""
+    calibration = {
+        "memory": 0.5,
+        "missed": 2.0,
+        "evidence": [-3.0, 3.0],
+        "existence": [0.1, 0.9],
+        "along": [0.6, 0.2],
+        "across": [0.3, 0.1],
+    }
+    document = PAPER.model_dump()
+    document["classes"]["Car"]["calibration"] = calibration | changes
+    return optipmb.parse_parameters(document)
+
+
+def follow(parameters: optipmb.Parameters, scores: list[float | None], period: float = 0.1) -> list[optipmb.Tracks]:
+    """Tracks of a standing car that heads up and left, detected with these scores; None where it is missed."""
+    tracker = optipmb.Tracker(parameters)
+    density, found = tracker.initial(), []
+    for k, score in enumerate(scores):
+        xy = [(5.0, 1.0)] if score else []
+        result = tracker.step(density, boxes(parameters, k * period, xy, yaw=0.75 * math.pi, score=score or 1.0))
+        density = result.density
+        found.append(result.tracks)
+    return found
+
+
+def odds(score: float) -> float:
+    """Logarithm of score to one minus score."""
+    return math.log(score / (1.0 - score))
+
+
+def test_existence_follows_the_mean_log_odds_of_the_latest_detections() -> None:
+    """By hand: evidence fades by half in a period, a miss counts as -2, the curve is a straight line."""
+    tracks = follow(with_calibration(), [0.8, 0.9, None])
+    first = 0.5 * odds(0.8)
+    second = 0.5 * first + 0.5 * odds(0.9)
+    third = 0.5 * second - 0.5 * 2.0
+    told = [float(one.existence[0]) for one in tracks]
+    assert told == pytest.approx([0.5 + 0.8 * evidence / 6.0 for evidence in (first, second, third)])
+
+
+def test_evidence_counts_time_and_not_frames() -> None:
+    """At half the frame rate a detection weighs as much as two with the same score."""
+    fast = follow(with_calibration(), [0.8, 0.95, 0.95, 0.6, 0.6])
+    slow = follow(with_calibration(), [0.8, 0.95, 0.6], period=0.2)
+    assert [float(one.existence[0]) for one in fast[::2]] == pytest.approx([float(one.existence[0]) for one in slow])
+
+
+def test_beyond_the_knots_the_curves_are_level() -> None:
+    """The surest and the least sure tracks have the probabilities of the outer knots, and nothing is above one."""
+    tracks = follow(with_calibration(), [1.0] * 6 + [None] * 3)
+    assert tracks[4].existence[0] == 0.9
+    least = follow(with_calibration(evidence=[2.0, 3.0]), [0.7] * 2)
+    assert least[1].existence[0] == 0.1
+
+
+def test_the_lasting_error_lies_along_and_across_the_heading() -> None:
+    """The position's covariance is the filter's and, turned with the heading, the lasting error; the rest is as is."""
+    plain, told = follow(PAPER, [1.0] * 6)[-1], follow(with_calibration(), [1.0] * 6)[-1]
+    added = told.covariance[0] - plain.covariance[0]
+    ahead = np.array([math.cos(plain.yaw[0]), math.sin(plain.yaw[0])])
+    left = np.array([-ahead[1], ahead[0]])
+    wanted = 0.2**2 * np.outer(ahead, ahead) + 0.1**2 * np.outer(left, left)
+    np.testing.assert_allclose(added[:2, :2], wanted, atol=1e-15)
+    assert not added[2:].any()
+    assert not added[:, 2:].any()
+
+
+def test_a_calibration_leaves_the_recursion_alone() -> None:
+    """Positions, ids, scores and what is extracted are those without it; only the scores when they are asked for."""
+    scores = [0.4, 0.9, None, 0.8, None, None, 0.7]
+    plain, told = follow(PAPER, scores), follow(with_calibration(), scores)
+    for one, other in zip(plain, told, strict=True):
+        for name in ("id", "center", "size", "yaw", "velocity", "score", "detection"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    ranked = follow(with_calibration(score_of_evidence=True), scores)
+    values = [float(one.score[0]) for one in ranked if len(one)]
+    assert all(0.0 <= value <= 1.0 for value in values)
+    assert values != [float(one.score[0]) for one in plain if len(one)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"existence": [0.9, 0.1]}, "does not descend"),
+        ({"evidence": [3.0, -3.0]}, "ascending evidence"),
+        ({"along": [0.1]}, "as many values of along"),
+        ({"memory": 1.0}, "less than 1"),
+    ],
+)
+def test_a_calibration_that_cannot_be_is_refused(changes: dict[str, Any], text: str) -> None:
+    """The error names the field and says what is expected."""
+    with pytest.raises(optipmb.ParameterError, match=text) as caught:
+        with_calibration(**changes)
+    assert caught.value.path.startswith("classes.Car.calibration")
