@@ -15,7 +15,9 @@ from optipmb_client.commands.ablate import ablate
 from optipmb_client.commands.demo import demo
 from optipmb_client.commands.evaluate import evaluate
 from optipmb_client.commands.options import MANY
+from optipmb_client.commands.play import play
 from optipmb_client.commands.plot import plot
+from optipmb_client.commands.record import record
 from optipmb_client.commands.replay import replay
 from optipmb_client.commands.status import status
 from optipmb_client.commands.track import track
@@ -36,7 +38,7 @@ _OptionError: Any = typer.BadParameter.__base__
 app = typer.Typer(
     name="optipmb", help="Track objects in 3D: offline, or through a tracking service.", add_completion=False
 )
-for command in (demo, track, replay, evaluate, tune, ablate, plot, status):
+for command in (demo, track, replay, record, play, evaluate, tune, ablate, plot, status):
     app.command()(command)
 
 

@@ -1,9 +1,7 @@
 """Pictures of a sequence from above, as PNG files.
 
-Conventions: world frame, metres, x to the right and y up. Colours belong to track ids and are from a set that most
-people with a colour vision deficiency can tell apart (Okabe and Ito, 2008); after seven tracks they come round again,
-so every track also carries its id. matplotlib is an extra of the installation and is imported when the first picture is
-drawn.
+Conventions: world frame, metres, x to the right and y up. Colours belong to track ids, which are written beside the
+tracks too. matplotlib is an extra of the installation and is imported when the first picture is drawn.
 """
 
 from collections.abc import Sequence
@@ -12,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from optipmb_client.colours import colour_of
 from optipmb_client.datasets import DataSequence, Truth
 from optipmb_client.errors import ClientError
 from optipmb_client.evaluation import ClearResult
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F")
 _INK = "#222222"
 _TRUTH = "#B5B5B5"
 _MARGIN = 6.0
@@ -107,7 +105,7 @@ def _draw_paths(axes: "Axes", tracks: ResultTable, last_frame: int) -> None:
     label, box_label = "track (colour and number: its id)", "last box, a line to its front"
     for rows in _rows_by_id(tracks.id):
         identity = int(tracks.id[rows[0]])
-        colour = _COLOURS[identity % len(_COLOURS)]
+        colour = colour_of(identity)
         axes.plot(*_broken(tracks.frame[rows], tracks.center[rows]), color=colour, linewidth=1.2, label=label, zorder=4)
         end = rows[-1:]
         corners = box_corners(tracks.center[end], tracks.size[end], tracks.yaw[end])[0, :4, :2]

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-__all__ = ["FrameProgress"]
+__all__ = ["FrameProgress", "StatusLine"]
 
 PLAIN_PERIOD_S = 10.0
 
@@ -83,6 +83,35 @@ class FrameProgress:
         self._begun = self._shown = time.monotonic()
         if self._bar is not None:
             self._bar.start()
+
+
+class StatusLine:
+    """One line about work that has no known end; on a terminal it is written over, elsewhere told every ten seconds."""
+
+    def __init__(self, *, terminal: bool | None = None) -> None:
+        self._shown = time.monotonic()
+        self._status = (
+            Console(stderr=True).status("") if (sys.stderr.isatty() if terminal is None else terminal) else None
+        )
+
+    def __enter__(self) -> Self:
+        if self._status is not None:
+            self._status.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._status is not None:
+            self._status.stop()
+
+    def show(self, text: str) -> None:
+        """Show how things stand."""
+        if self._status is not None:
+            self._status.update(text)
+        elif time.monotonic() - self._shown >= PLAIN_PERIOD_S:
+            self._shown = time.monotonic()
+            print(text, file=sys.stderr, flush=True)  # noqa: T201  this is the display
 
 
 class _RateColumn(ProgressColumn):

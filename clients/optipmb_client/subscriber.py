@@ -15,7 +15,7 @@ from optipmb_schemas import PREFIX, Keys, MessageError, Problem, Topic, Tracks, 
 
 from optipmb_client.transport import Arrival, Connection, Inbox
 
-__all__ = ["Received", "Statistics", "Subscriber"]
+__all__ = ["Received", "Statistics", "Subscriber", "key_expression"]
 
 REMEMBERED = 65_536  # frames whose repetition is recognised
 
@@ -80,7 +80,7 @@ class Subscriber:
         prefix: str = PREFIX,
     ) -> None:
         keys = Keys(prefix)
-        tracks, problems = _expression(keys, pattern, "tracks"), _expression(keys, pattern, "problems")
+        tracks, problems = key_expression(keys, pattern, "tracks"), key_expression(keys, pattern, "problems")
         self.timeout = timeout
         self._on_problem = on_problem
         self._seen = _Seen(REMEMBERED)
@@ -175,7 +175,7 @@ class _Seen:
         return False
 
 
-def _expression(keys: Keys, pattern: str, topic: Topic) -> str:
+def key_expression(keys: Keys, pattern: str, topic: Topic) -> str:
     """Return the key expression of a topic of the streams that match a pattern with `*` in the place of names."""
     keys.detections("/".join("any" if part == "*" else part for part in pattern.split("/")))  # checks the other names
     return f"{keys.prefix}/{pattern}/{topic}"

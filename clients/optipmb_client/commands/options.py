@@ -1,8 +1,10 @@
 """Options that several commands share, and how they print."""
 
+import contextlib
 import dataclasses
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +12,7 @@ import typer
 from rich.console import Console, RenderableType
 
 from optipmb_client.datasets import DATASETS, DataSequence, Dataset, open_dataset
-from optipmb_client.errors import UsageError
+from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.transport import DEFAULT_ENDPOINT
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "Root",
     "Sequences",
     "Tracks",
+    "mcap_needed",
     "open_sequences",
     "print_json",
     "print_table",
@@ -36,7 +39,7 @@ __all__ = [
 ]
 
 WIDE = 200
-MANY = ("--sequences", "--classes", "--class")  # options that take several values after one flag
+MANY = ("--sequences", "--classes", "--class", "--streams")  # options that take several values after one flag
 
 DatasetName = Annotated[str, typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.")]
 Root = Annotated[Path | None, typer.Option("--root", help="Folder of the dataset; generated scenes need none.")]
@@ -95,6 +98,15 @@ def _option(text: str) -> tuple[str, float]:
     except ValueError:
         raise UsageError(f"--option: expected NAME=NUMBER, received {text!r}") from None
     return name, int(number) if number.is_integer() else number
+
+
+@contextlib.contextmanager
+def mcap_needed() -> Iterator[None]:
+    """Say what to install where the packages for recordings are not."""
+    try:
+        yield
+    except ImportError as error:
+        raise ClientError("recordings need mcap, which is not installed: pip install 'optipmb[record]'") from error
 
 
 def print_table(table: RenderableType) -> None:

@@ -58,7 +58,7 @@ def replay(  # noqa: PLR0913  these are the command's options
 
     The profile is one that the service knows. Ends with status 1 when tracks of some frames did not come back.
     """
-    pace = Pace(_speed(speed), window, patience, wait)
+    pace = Pace(speed_of(speed), window, patience, wait)
     opened, chosen = open_sequences(dataset, root, detections, sequences, option)
     name = profile or opened.profile
     with (
@@ -114,7 +114,8 @@ def complain(results: list[ReplayedSequence]) -> None:
         raise typer.Exit(1)
 
 
-def _speed(text: str) -> float | None:
+def speed_of(text: str) -> float | None:
+    """Return the multiple of the recorded rate that an option asks for; None for `max`."""
     if text == "max":
         return None
     try:

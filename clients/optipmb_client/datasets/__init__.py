@@ -29,7 +29,7 @@ __all__ = [
     "open_dataset",
 ]
 
-DATASETS = ("kitti", "nuscenes", "scene")
+DATASETS = ("kitti", "nuscenes", "scene", "mcap")
 
 
 def open_dataset(
@@ -39,9 +39,10 @@ def open_dataset(
 
     Args:
         name: one of `DATASETS`.
-        root: the folder of a dataset on disk; a generated one takes none.
+        root: the folder of a dataset on disk, the file of a recording; a generated one takes none.
         detections: the detector whose results are used: its name, its folder or file, or None when there is just one.
-        options: of the dataset. kitti: `clouds`; nuscenes: `clouds`, `z_bottom`; scene: the fields of `SceneOptions`.
+        options: of the dataset. kitti: `clouds`; nuscenes: `clouds`, `z_bottom`; scene: the fields of `SceneOptions`;
+            mcap: none.
 
     Raises:
         DatasetError: the name, the root, the detector or an option is not known.
@@ -58,6 +59,13 @@ def open_dataset(
         _known(options, {"clouds", "z_bottom"})
         z_bottom = bool(options["z_bottom"]) if "z_bottom" in options else None
         return NuScenesDataset(Path(root), detections, clouds=bool(options.get("clouds", True)), z_bottom=z_bottom)
+    if name == "mcap":
+        from optipmb_client.datasets.mcap import RecordedDataset  # noqa: PLC0415 - needs packages of an extra
+
+        if root is None or detections is not None:
+            raise DatasetError("--root", "the file of the recording, and no --detections", str(detections or "nothing"))
+        _known(options, set())
+        return RecordedDataset(Path(root))
     if name == "scene":
         if root is not None or detections is not None:
             raise DatasetError("--root and --detections", "nothing, for scenes are generated", str(root or detections))

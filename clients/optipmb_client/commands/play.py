@@ -1,0 +1,134 @@
+"""`optipmb play`: a recording into a service."""
+
+import secrets
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from optipmb_schemas import PREFIX
+
+from optipmb_client.commands.options import (
+    AsJson,
+    Config,
+    Connect,
+    Full,
+    Prefix,
+    mcap_needed,
+    print_json,
+    say,
+)
+from optipmb_client.commands.replay import speed_of
+from optipmb_client.datasets import open_dataset
+from optipmb_client.progress import FrameProgress
+from optipmb_client.recording import write_results
+from optipmb_client.replay import Pace
+from optipmb_client.transport import Connection
+
+if TYPE_CHECKING:
+    from optipmb_client.mcap_files.play import PlayedStream
+
+
+def play(  # noqa: PLR0913  these are the command's options
+    file: Annotated[Path, typer.Argument(help="The MCAP file, as `optipmb record` writes it.", show_default=False)],
+    *,
+    streams: Annotated[
+        list[str] | None, typer.Option("--streams", metavar="NAME...", help="Only these streams.", show_default=False)
+    ] = None,
+    as_recorded: Annotated[
+        bool,
+        typer.Option(
+            "--as-recorded", help="Play under the recorded names: only into a service that does nothing else."
+        ),
+    ] = False,
+    profile: Annotated[
+        str | None, typer.Option("--profile", help="Parameter profile; default: what was in force.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for result files of the tracks.")] = None,
+    full: Full = False,
+    connect: Connect = None,
+    config: Config = None,
+    speed: Annotated[
+        str, typer.Option(help="1: as recorded, 10: ten times as fast, max: as fast as tracks come back.")
+    ] = "max",
+    window: Annotated[int, typer.Option(min=1, help="Frames under way at most, with --speed max.")] = 8,
+    wait: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a service at the start.")] = 10.0,
+    patience: Annotated[float, typer.Option(min=1.0, help="End when no tracks come for so many seconds.")] = 30.0,
+    prefix: Prefix = PREFIX,
+    as_json: AsJson = False,
+) -> None:
+    """Play a recording into a running service and compare the tracks with the recorded ones, byte for byte.
+
+    Streams get names of their own (`play-<6 hex>-...`) unless they are to be played as recorded. The comparison leaves
+    out the names of stream and session, and `delivery`. Ends with status 1 when tracks do not come back, or come back
+    different.
+    """
+    with mcap_needed():
+        from optipmb_client.mcap_files.play import choose  # noqa: PLC0415  as above
+        from optipmb_client.mcap_files.play import play as play_streams  # noqa: PLC0415  as above
+        from optipmb_client.mcap_files.reading import RecordingFile  # noqa: PLC0415  packages of an extra
+    pace = Pace(speed_of(speed), window, patience, wait)
+    recording = RecordingFile(file)
+    plans = choose(recording, streams or ())
+    if recording.cut:
+        typer.echo(f"optipmb: {file} was cut off; everything up to the cut is played", err=True)
+    with (
+        Connection(connect, config=config, timeout=wait) as connection,
+        FrameProgress("playing", sum(len(one.frames) for one in plans.values())) as progress,
+    ):
+        results = play_streams(
+            connection,
+            recording,
+            plans,
+            pace=pace,
+            site=None if as_recorded else f"play-{secrets.token_hex(3)}",
+            profile=profile,
+            prefix=prefix,
+            on_frame=progress.advance,
+        )
+    if out is not None:
+        dataset = open_dataset("mcap", file)
+        for result in results:
+            (sequence,) = dataset.sequences([result.name])
+            indexed = {
+                index: result.tracks[frame]
+                for index, frame in enumerate(plans[result.name].frames)
+                if frame in result.tracks
+            }
+            write_results(dataset, sequence, out, indexed, full=full)
+    if as_json:
+        print_json({"command": "play", "cut": recording.cut, "out": out, "streams": [_summary(one) for one in results]})
+    else:
+        for result in results:
+            say(_line(result))
+    _complain(results)
+
+
+def _complain(results: "list[PlayedStream]") -> None:
+    wrong = False
+    for result in results:
+        if result.clouds_lost:
+            typer.echo(f"optipmb: {result.name}: {result.clouds_lost} clouds are missing in the recording", err=True)
+        if result.first_difference is not None:
+            differ = f"{result.recorded - result.equal} of {result.recorded} frames differ from the recorded ones"
+            typer.echo(f"optipmb: {result.name}: {differ}, the first is number {result.first_difference}", err=True)
+        if not result.recorded and result.returned < result.frames:
+            missing = f"{result.frames - result.returned} of {result.frames} frames have no tracks"
+            typer.echo(f"optipmb: {result.name}: {missing}", err=True)
+        wrong |= result.first_difference is not None or (not result.recorded and result.returned < result.frames)
+    if wrong:
+        raise typer.Exit(1)
+
+
+def _line(result: "PlayedStream") -> str:
+    text = f"{result.name} as {result.stream}: {result.returned} of {result.frames} frames returned"
+    if result.recorded:
+        text += f", {result.equal} of {result.recorded} equal to the recorded tracks"
+    if result.latency is not None:
+        text += f", latency p50 {result.latency.p50_ms:.1f} ms p99 {result.latency.p99_ms:.1f} ms"
+    return text
+
+
+def _summary(result: "PlayedStream") -> dict[str, Any]:
+    problems = [{"code": problem.code, "message": problem.message} for problem in result.newest_problems]
+    left_out = {"tracks", "newest_problems"}
+    return {name: value for name, value in vars(result).items() if name not in left_out} | {"newest_problems": problems}

@@ -1,0 +1,145 @@
+"""Recordings as a dataset: each stream is a sequence, named by its stream with dots, `garage.robot-1.lidar`.
+
+What is tracked are the frames that the service would track from the recording: each once, with the clouds that took
+part. Frames must be in the order of their stamps here; a recording in which they are not needs a service that is there
+when they come late (`optipmb play`). There is no truth.
+"""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from optipmb_schemas import Detections, Points, decode
+
+from optipmb_client.camera import synthetic_camera
+from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFrame, Truth
+from optipmb_client.errors import ClientError
+from optipmb_client.files import DatasetError
+from optipmb_client.geometry import Pose
+from optipmb_client.results import KittiResultWriter, ResultWriter
+
+try:
+    from optipmb_client.mcap_files.plan import StreamPlan, plan, steps
+    from optipmb_client.mcap_files.reading import Recorded, RecordingFile
+except ImportError as error:
+    raise ClientError("recordings need mcap, which is not installed: pip install 'optipmb[record]'") from error
+
+_HERE = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+class RecordedSequence:
+    """One stream of a recording."""
+
+    has_clouds: bool
+
+    def __init__(self, recording: RecordingFile, plan_: StreamPlan) -> None:
+        self.name = plan_.stream.replace("/", ".")
+        self.has_clouds = bool(plan_.with_cloud)
+        self._recording = recording
+        self._plan = plan_
+        stamps = list(plan_.frames.values())
+        for number, (before, after) in enumerate(itertools.pairwise(stamps), start=1):
+            if after < before:
+                raise DatasetError(
+                    recording.path,
+                    f"frames of {plan_.stream} in the order of their stamps (optipmb play takes any order)",
+                    f"frame {number} that is {(before - after) / 1e9:.3f} s before the one ahead of it",
+                )
+
+    def __len__(self) -> int:
+        return len(self._plan.frames)
+
+    @cached_property
+    def poses(self) -> Sequence[Pose]:
+        """World from sensor of each frame; the identity where boxes are in the world frame."""
+        return [_pose(message) for message, _ in self._messages(clouds=False)]
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """Class names of all frames."""
+        return tuple(dict.fromkeys(name for message, _ in self._messages(clouds=False) for name in message.labels))
+
+    def frames(self) -> Iterator[DetectionFrame]:
+        """Yield every frame in order."""
+        for index, (message, cloud) in enumerate(self._messages(clouds=True)):
+            row_of = np.array([self.labels.index(name) for name in message.labels], dtype=np.int64)
+            yield DetectionFrame(
+                index=index,
+                stamp_ns=message.stamp_ns,
+                pose=_pose(message),
+                labels=self.labels,
+                label=row_of[message.label],
+                center=message.center,
+                size=message.size,
+                yaw=message.yaw,
+                score=message.score,
+                velocity=message.velocity,
+                cloud=None if cloud is None else _cloud(cloud),
+            )
+
+    def truth(self) -> Truth | None:
+        """Return None: nobody annotated it."""
+        return None
+
+    def _messages(self, *, clouds: bool) -> Iterator[tuple[Detections, Recorded | None]]:
+        messages = self._recording if clouds else (one for one in self._recording if one.topic != "points")
+        plans = {self._plan.stream: self._plan if clouds else StreamPlan(self._plan.stream)}
+        for step in steps(messages, plans):
+            if step.frame is not None:
+                yield decode(step.detections.payload, Detections, encoding=step.detections.encoding), step.cloud
+
+
+class RecordedDataset:
+    """The streams of one recording.
+
+    Args:
+        path: The MCAP file.
+
+    Raises:
+        DatasetError: It cannot be read.
+    """
+
+    name = "mcap"
+
+    def __init__(self, path: Path) -> None:
+        self._recording = RecordingFile(path)
+        self._plans = {stream.replace("/", "."): one for stream, one in plan(self._recording).items()}
+        if not self._plans:
+            raise DatasetError(path, "a recording with detections", "one without")
+
+    @property
+    def profile(self) -> str:
+        """The profile that was in force when it was recorded, of the first stream that tells."""
+        for one in self._plans.values():
+            names = [one.parameters.profile] if one.parameters else []
+            names += [tracks.profile for tracks in one.tracks.values()]
+            if names and names[0] is not None:
+                return names[0]
+        raise DatasetError("--profile", "a profile, for the recording does not say which was in force", "none")
+
+    def sequences(self, names: Sequence[str]) -> Sequence[DataSequence]:
+        """Return the streams of these names, with dots or slashes, or `all`."""
+        chosen: dict[str, DataSequence] = {}
+        for name in names:
+            for dotted in self._plans if name == "all" else (name.replace("/", "."),):
+                if dotted not in self._plans:
+                    raise DatasetError("--sequences", f"streams of the recording: {', '.join(self._plans)}", name)
+                chosen[dotted] = RecordedSequence(self._recording, self._plans[dotted])
+        return list(chosen.values())
+
+    def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
+        """Return a writer of `out/NAME.txt` in the format of KITTI, for a camera in the sensor's place."""
+        return KittiResultWriter(out / f"{sequence.name}.txt", synthetic_camera())
+
+
+def _pose(message: Detections | Points) -> Pose:
+    if message.frame == "world" or message.pose is None:
+        return _HERE
+    return Pose(message.pose.translation, message.pose.quaternion)
+
+
+def _cloud(recorded: Recorded) -> Cloud:
+    message = decode(recorded.payload, Points, encoding=recorded.encoding)
+    return Cloud(message.xyz, *_pose(message))

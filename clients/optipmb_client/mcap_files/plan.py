@@ -1,0 +1,155 @@
+"""What a recording holds of each stream, and in which order it is played: pure functions of its messages.
+
+A frame is played with the cloud that took part in its tracks when it was recorded, however late that cloud came then,
+and without one where its recorded tracks were made without. So it does not depend on time what comes out.
+"""
+
+import collections
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias, TypeVar
+
+from optipmb_schemas import Detections, Message, MessageError, SessionParameters, Tracks, decode, encode, encoding_of
+
+from optipmb_client.mcap_files.reading import Recorded
+from optipmb_client.mcap_files.writing import KINDS
+
+__all__ = ["FrameId", "Step", "StreamPlan", "content", "plan", "renamed", "steps"]
+
+FrameId: TypeAlias = tuple[bytes, int]
+"""Epoch and sequence number."""
+
+_T = TypeVar("_T", bound=Message)
+
+_ANYWHERE = {"stream": "any/any/any", "session": "0" * 32, "delivery": None, "revision": 0}
+
+
+@dataclass
+class StreamPlan:
+    """What a recording holds of one stream.
+
+    Attributes:
+        stream: Its name.
+        frames: Stamps of the frames in order of arrival, each frame once.
+        clouds: How often there is a cloud of a stamp.
+        with_cloud: Frames that are played with their cloud.
+        tracks: Newest recorded tracks of each frame.
+        parameters: Parameters in force when the session began; None when they were not recorded.
+    """
+
+    stream: str
+    frames: dict[FrameId, int] = field(default_factory=dict)
+    clouds: collections.Counter[int] = field(default_factory=collections.Counter)
+    with_cloud: set[FrameId] = field(default_factory=set)
+    tracks: dict[FrameId, Tracks] = field(default_factory=dict)
+    parameters: SessionParameters | None = None
+
+    @property
+    def clouds_lost(self) -> int:
+        """Frames whose recorded tracks were made with a cloud that the recording lacks."""
+        used = (frame for frame, tracks in self.tracks.items() if tracks.cloud_used)
+        return sum(frame in self.frames and frame not in self.with_cloud for frame in used)
+
+    def settle(self) -> None:
+        """Give each frame its cloud; to be called when all is known."""
+        left = self.clouds.copy()
+        for frame, stamp in self.frames.items():
+            if left[stamp] and (frame not in self.tracks or self.tracks[frame].cloud_used):
+                left[stamp] -= 1
+                self.with_cloud.add(frame)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What is published at once: detections, and before them their cloud.
+
+    `frame` is None for what is no valid message: it is played too, for the problem that it makes.
+    """
+
+    detections: Recorded
+    cloud: Recorded | None
+    frame: FrameId | None
+
+
+def plan(messages: Iterable[Recorded]) -> dict[str, StreamPlan]:
+    """Return what a recording holds, by stream; streams without detections are left out."""
+    plans: dict[str, StreamPlan] = {}
+    for recorded in messages:
+        one = plans.setdefault(recorded.stream, StreamPlan(recorded.stream))
+        if recorded.topic == "points":
+            one.clouds[recorded.stamp_ns] += 1
+        elif recorded.topic == "detections" and (detections := _read(recorded, Detections)) is not None:
+            one.frames.setdefault(_id(detections), detections.stamp_ns)
+        elif recorded.topic == "tracks" and (tracks := _read(recorded, Tracks)) is not None:
+            known = one.tracks.get(_id(tracks))
+            if known is None or tracks.revision > known.revision:
+                one.tracks[_id(tracks)] = tracks
+        elif recorded.topic == "parameters" and one.parameters is None:
+            one.parameters = _read(recorded, SessionParameters)
+    for one in plans.values():
+        one.settle()
+    return {name: plans[name] for name in sorted(plans) if plans[name].frames}
+
+
+def steps(messages: Iterable[Recorded], plans: Mapping[str, StreamPlan]) -> Iterator[Step]:
+    """Yield what is to be published for the streams of `plans`, in the order in which it was received.
+
+    A frame that was received again is left out, and so is a cloud that is not needed. Frames wait for their cloud, so
+    what is between the two in the recording is kept in memory.
+    """
+    done: set[tuple[str, FrameId]] = set()
+    shelf: dict[tuple[str, int], list[Recorded]] = collections.defaultdict(list)
+    waiting: collections.deque[tuple[Recorded, Detections | None, bool]] = collections.deque()
+    stamps = {(name, one.frames[frame]) for name, one in plans.items() for frame in one.with_cloud}
+    for recorded in messages:
+        if recorded.stream not in plans:
+            continue
+        where = (recorded.stream, recorded.stamp_ns)
+        if recorded.topic == "points" and where in stamps:
+            shelf[where].append(recorded)
+        elif recorded.topic == "detections":
+            detections = _read(recorded, Detections)
+            if detections is None:
+                waiting.append((recorded, None, False))
+            elif (recorded.stream, _id(detections)) not in done:
+                done.add((recorded.stream, _id(detections)))
+                waiting.append((recorded, detections, _id(detections) in plans[recorded.stream].with_cloud))
+        while waiting and (not waiting[0][2] or shelf.get((waiting[0][0].stream, waiting[0][0].stamp_ns))):
+            frame, detections, needs = waiting.popleft()
+            cloud = shelf[frame.stream, frame.stamp_ns].pop(0) if needs else None
+            yield _step(frame, detections, cloud)
+
+
+def renamed(recorded: Recorded, stream: str) -> Recorded:
+    """Return a message under another stream's name; one that is not valid stays as it is inside."""
+    kind = KINDS[recorded.topic]
+    message = _read(recorded, kind)
+    if stream == recorded.stream or message is None:
+        return replace(recorded, stream=stream)
+    message = message.model_copy(update={"stream": stream})
+    return replace(recorded, stream=stream, payload=encode(message), encoding=encoding_of(message))
+
+
+def content(tracks: Tracks) -> bytes:
+    """Return the bytes of tracks without what differs between two runs: names of stream and session, delivery."""
+    return encode(tracks.model_copy(update=_ANYWHERE))
+
+
+def _step(recorded: Recorded, detections: Detections | None, cloud: Recorded | None) -> Step:
+    if detections is None:
+        return Step(recorded, None, None)
+    if cloud is None and detections.has_points is not False:  # nothing is to be waited for
+        without = detections.model_copy(update={"has_points": False})
+        recorded = replace(recorded, payload=encode(without), encoding=encoding_of(without))
+    return Step(recorded, cloud, _id(detections))
+
+
+def _id(message: Detections | Tracks) -> FrameId:
+    return message.epoch, message.seq
+
+
+def _read(recorded: Recorded, kind: type[_T]) -> _T | None:
+    try:
+        return decode(recorded.payload, kind, encoding=recorded.encoding)
+    except MessageError:
+        return None

@@ -1,0 +1,302 @@
+"""Recordings: what is in the file, what is left of it after a cut, and what is played of it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from optipmb_client.datasets import DatasetError, open_dataset
+from optipmb_client.mcap_files.plan import plan, renamed, steps
+from optipmb_client.mcap_files.reading import Recorded, RecordingFile
+from optipmb_client.mcap_files.writing import RecordingWriter
+from optipmb_schemas import (
+    Detections,
+    Keys,
+    Message,
+    Points,
+    SessionParameters,
+    Tracks,
+    decode,
+    encode,
+    encode_json,
+    encoding_of,
+)
+
+KEYS = Keys()
+STREAM = "garage/robot-1/lidar"
+EPOCH = bytes(range(16))
+SESSION = "0" * 32
+
+
+def detections(seq: int, *, stamp: int | None = None, has_points: bool | None = None) -> Detections:
+    """Two cars at frame `seq`."""
+    return Detections(
+        stream=STREAM,
+        epoch=EPOCH,
+        seq=seq,
+        stamp_ns=100 * seq if stamp is None else stamp,
+        frame="world",
+        labels=["Car"],
+        label=[0, 0],
+        center=[[seq, 0.0, 1.0], [seq, 9.0, 1.0]],
+        size=[[4.0, 2.0, 1.5]] * 2,
+        yaw=[0.0, 3.0],
+        score=[0.9, 0.8],
+        has_points=has_points,
+    )
+
+
+def points(seq: int, stamp: int) -> Points:
+    """A small cloud."""
+    return Points(stream=STREAM, epoch=EPOCH, seq=seq, stamp_ns=stamp, frame="world", xyz=np.ones((3, 3), np.float32))
+
+
+def tracks(seq: int, ids: list[int], *, cloud_used: bool = False, revision: int = 0) -> Tracks:
+    """Tracks of these ids at frame `seq`, going along x at 2 m/s."""
+    n = len(ids)
+    column = [0.5] * n
+    return Tracks(
+        stream=STREAM,
+        epoch=EPOCH,
+        seq=seq,
+        stamp_ns=1_500_000_000 + seq,
+        session=SESSION,
+        revision=revision,
+        profile="kitti",
+        cloud_used=cloud_used,
+        labels=["Car"],
+        id=ids,
+        label=[0] * n,
+        center=np.arange(3.0 * n).reshape(n, 3),
+        size=np.full((n, 3), 2.0),
+        yaw=column,
+        velocity=np.tile([2.0, 0.0], (n, 1)),
+        yaw_rate=column,
+        acceleration=column,
+        existence=column,
+        score=column,
+        covariance=np.tile(np.eye(6), (n, 1, 1)),
+        age=column,
+        time_since_detection=column,
+        detection=[-1] * n,
+    )
+
+
+def put(writer: RecordingWriter, message: Message, received_ns: int, *, json: bool = False) -> bytes:
+    """Add a message under its own key; give its bytes."""
+    topic = {Detections: "detections", Points: "points", Tracks: "tracks"}[type(message)]
+    payload = encode_json(message) if json else encode(message)
+    key = f"optipmb/v1/{STREAM}/{topic}"
+    writer.add(key, payload, encoding_of(message, form="json" if json else "msgpack"), received_ns)
+    return payload
+
+
+def test_messages_come_back_byte_for_byte(tmp_path: Path) -> None:
+    """Payload, stream, topic, encoding and times of every message are kept, msgpack and JSON, valid and not."""
+    with RecordingWriter(tmp_path / "a.mcap", {"made_by": "test"}) as writer:
+        payloads = [
+            put(writer, points(0, 700), 10),
+            put(writer, detections(7), 11),
+            put(writer, detections(8), 12, json=True),
+            put(writer, tracks(7, [1, 2]), 13),
+        ]
+        writer.add(KEYS.detections(STREAM), b"\xc1 no message", "zenoh/bytes", 14)
+        asked = SessionParameters(profile="kitti")
+        writer.add(KEYS.query(STREAM, "parameters"), encode(asked), encoding_of(asked), 15)
+    recording = RecordingFile(tmp_path / "a.mcap")
+    found = list(recording)
+    assert not recording.cut
+    assert recording.about == {"made_by": "test"}
+    assert [one.payload for one in found] == [*payloads, b"\xc1 no message", encode(asked)]
+    assert {one.stream for one in found} == {STREAM}
+    assert [one.topic for one in found] == ["points", "detections", "detections", "tracks", "detections", "parameters"]
+    assert [one.received_ns for one in found] == [10, 11, 12, 13, 14, 15]
+    assert [one.stamp_ns for one in found] == [700, 700, 800, 1_500_000_007, 14, 15]
+    assert found[1].encoding == "application/msgpack;optipmb.Detections.v1"
+    assert found[2].encoding == "application/json;optipmb.Detections.v1"
+
+
+def test_foxglove_finds_boxes_arrows_and_ids(tmp_path: Path) -> None:
+    """Read by the MCAP library with the schema in the file: an entity per track, and gone tracks are deleted."""
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        put(writer, tracks(0, [3, 4, 11]), 10)
+        put(writer, tracks(1, [4]), 20)
+    with (tmp_path / "a.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        scenes = list(reader.iter_decoded_messages(topics=[f"{KEYS.tracks(STREAM)}/scene"]))
+    assert [schema.name for schema, *_ in scenes] == ["foxglove.SceneUpdate"] * 2
+    assert [(message.log_time, message.publish_time) for _, _, message, _ in scenes] == [
+        (10, 1_500_000_000),
+        (20, 1_500_000_001),
+    ]
+    first, second = (decoded for *_, decoded in scenes)
+    assert [entity.id for entity in first.entities] == ["3", "4", "11"]
+    assert [deletion.id for deletion in second.deletions] == ["3", "11"]
+    assert not first.deletions
+    (entity,) = second.entities
+    assert entity.frame_id == "world"
+    assert (entity.timestamp.seconds, entity.timestamp.nanos) == (1, 500_000_001)
+    (cube,), (arrow,), (text,) = entity.cubes, entity.arrows, entity.texts
+    assert (cube.pose.position.x, cube.pose.position.y, cube.pose.position.z) == (0.0, 1.0, 2.0)
+    assert (cube.size.x, cube.size.y, cube.size.z) == (2.0, 2.0, 2.0)
+    assert cube.pose.orientation.z == pytest.approx(np.sin(0.25))
+    assert arrow.shaft_length == 2.0
+    assert text.text == "4"
+    colours = {(c.color.r, c.color.g, c.color.b) for one in first.entities for c in one.cubes}
+    assert len(colours) == 2  # ids 4 and 11 are seven apart
+
+
+def recorded_bytes(tmp_path: Path) -> tuple[bytes, list[bytes], list[int]]:
+    """A recording that was flushed after each message, its payloads, and its size at each flush."""
+    sizes = []
+    path = tmp_path / "whole.mcap"
+    with RecordingWriter(path) as writer:
+        payloads = []
+        for number in range(6):
+            payloads.append(put(writer, detections(number), 10 + number))
+            sizes.append(writer.flush())
+    return path.read_bytes(), payloads, sizes
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes, list[bytes], list[int]]:
+    """A folder and what `recorded_bytes` gives."""
+    folder = tmp_path_factory.mktemp("cut")
+    return folder, *recorded_bytes(folder)
+
+
+@given(share=st.floats(0.0, 1.0))
+@settings(deadline=None)
+def test_a_cut_recording_gives_what_was_flushed(
+    share: float, whole: tuple[Path, bytes, list[bytes], list[int]]
+) -> None:
+    """Cut anywhere, a file gives the messages flushed before the cut, in order, and says that it is cut."""
+    folder, content, payloads, sizes = whole
+    at = 8 + round(share * (sizes[-1] - 8))
+    path = folder / "cut.mcap"
+    path.write_bytes(content[:at])
+    recording = RecordingFile(path)
+    found = [one.payload for one in recording]
+    assert recording.cut
+    least = sum(size <= at for size in sizes)
+    assert found == payloads[: len(found)]
+    assert len(found) >= least
+
+
+def test_what_is_no_recording_is_refused_with_its_name(tmp_path: Path) -> None:
+    """Missing, empty, of another kind, damaged in the middle: one error with the path."""
+    content, _, sizes = recorded_bytes(tmp_path)
+    damaged = bytearray(content)
+    damaged[sizes[2] + 60] ^= 0xFF
+    wrong = {"missing.mcap": None, "empty.mcap": b"", "text.mcap": b"no recording", "damaged.mcap": bytes(damaged)}
+    for name, text in wrong.items():
+        path = tmp_path / name
+        if text is not None:
+            path.write_bytes(text)
+        with pytest.raises(DatasetError, match=name):
+            list(RecordingFile(path))
+
+
+def test_a_recording_is_never_written_over(tmp_path: Path) -> None:
+    """A second recording of the same name is refused, the first one stays."""
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        put(writer, detections(0), 1)
+    before = path.read_bytes()
+    with pytest.raises(FileExistsError):
+        RecordingWriter(path)
+    assert path.read_bytes() == before
+
+
+def recorded(message: Message, received_ns: int) -> Recorded:
+    """A message as a recording gives it."""
+    topic = type(message).__name__.lower()
+    return Recorded(
+        STREAM, topic, encode(message), encoding_of(message), received_ns, getattr(message, "stamp_ns", received_ns)
+    )
+
+
+def played(messages: list[Recorded]) -> Iterator[tuple[int, bool, bool | None]]:
+    """What is played: number, whether a cloud goes before it, and what the frame says about it."""
+    for step in steps(messages, plan(messages)):
+        frame = decode(step.detections.payload, Detections)
+        yield frame.seq, step.cloud is not None, frame.has_points
+
+
+def test_a_frame_is_played_with_the_cloud_that_took_part() -> None:
+    """A cloud that came after its frame goes before it; one that came too late for the tracks is left out."""
+    messages = [
+        recorded(detections(0, has_points=True), 1),
+        recorded(detections(1, has_points=True), 2),
+        recorded(points(0, 0), 3),
+        recorded(tracks(0, [1], cloud_used=True), 4),
+        recorded(tracks(1, [1], cloud_used=False), 5),
+        recorded(points(1, 100), 6),
+        recorded(detections(2, has_points=True), 7),
+    ]
+    assert list(played(messages)) == [(0, True, True), (1, False, False), (2, False, False)]
+
+
+def test_repeated_frames_are_played_once_and_bytes_are_kept() -> None:
+    """What came again from a cache is left out; without clouds the payloads are those of the recording."""
+    messages = [recorded(detections(number, has_points=False), at) for at, number in enumerate([0, 1, 1, 0, 2])]
+    found = [step.detections for step in steps(messages, plan(messages))]
+    assert [one.payload for one in found] == [messages[0].payload, messages[1].payload, messages[4].payload]
+
+
+def test_the_newest_correction_counts() -> None:
+    """Of several revisions of the tracks of a frame the highest is what a playback is compared with."""
+    messages = [recorded(detections(0), 1), *(recorded(tracks(0, [n], revision=n), 2 + n) for n in (0, 2, 1))]
+    (one,) = plan(messages).values()
+    assert [int(n) for t in one.tracks.values() for n in t.id] == [2]
+
+
+def test_a_lost_cloud_is_counted() -> None:
+    """Tracks that were made with a cloud that is not in the recording cannot be made again."""
+    messages = [recorded(detections(0), 1), recorded(tracks(0, [1], cloud_used=True), 2)]
+    (one,) = plan(messages).values()
+    assert one.clouds_lost == 1
+
+
+def test_another_name_changes_nothing_else() -> None:
+    """A renamed message is the same but for the stream; what is no message keeps its bytes."""
+    frame = detections(3)
+    other = renamed(recorded(frame, 1), "x/y/z")
+    assert decode(other.payload, Detections) == frame.model_copy(update={"stream": "x/y/z"})
+    broken = Recorded(STREAM, "detections", b"\xc1", "", 1, 1)
+    assert renamed(broken, "x/y/z").payload == b"\xc1"
+
+
+def test_a_recording_is_a_dataset(tmp_path: Path) -> None:
+    """Frames, poses, labels and clouds are those of the messages; the profile is the recorded one."""
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        put(writer, detections(0, has_points=True), 1)
+        put(writer, points(0, 0), 2)
+        put(writer, detections(1), 3)
+        put(writer, tracks(0, [1], cloud_used=True), 4)
+    dataset = open_dataset("mcap", path)
+    assert dataset.profile == "kitti"
+    for name in ("all", "garage.robot-1.lidar", STREAM):
+        (sequence,) = dataset.sequences([name])
+        assert sequence.name == "garage.robot-1.lidar"
+    frames = list(sequence.frames())
+    assert [frame.stamp_ns for frame in frames] == [0, 100]
+    assert [frame.cloud is not None for frame in frames] == [True, False]
+    assert frames[0].labels == ("Car",)
+    assert np.array_equal(frames[1].center, detections(1).center)
+    assert len(sequence.poses) == len(sequence) == 2
+
+
+def test_a_dataset_needs_frames_in_order(tmp_path: Path) -> None:
+    """Late frames need a service that is there when they come late: said with the way that takes them."""
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        put(writer, detections(1), 1)
+        put(writer, detections(0), 2)
+    with pytest.raises(DatasetError, match="optipmb play"):
+        open_dataset("mcap", path).sequences(["all"])

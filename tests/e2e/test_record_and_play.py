@@ -1,0 +1,180 @@
+"""Recordings made by the command from a real service, played into another one."""
+
+import contextlib
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from commands import kill, optipmb, result_of, start
+from mcap.reader import make_reader
+from optipmb_client import Connection, Subscriber
+from optipmb_client.child import ServiceProcess
+from optipmb_client.mcap_files.reading import RecordingFile
+from optipmb_schemas import Tracks, decode, encode
+from real_data import kitti_root
+
+if TYPE_CHECKING:
+    import subprocess
+
+FRAMES = 15
+SCENE = ("--dataset", "scene", "--option", f"frames={FRAMES}", "--option", "vehicles=8", "--option", "pedestrians=2")
+FOUR = ("--sequences", "0000", "0001", "0002", "0003", "--streams", 4)
+DEADLINE_S = 60.0
+
+
+@contextlib.contextmanager
+def recording(service: ServiceProcess, path: Path) -> Iterator["subprocess.Popen[str]"]:
+    """Record all that goes through a service into `path`; ready when its subscriptions are."""
+    process = start("record", "--out", path, "--connect", service.endpoint)
+    try:
+        with Connection(service.endpoint) as connection:
+            probe = connection.plain_sender("optipmb/v1/a/probe/x/points", "")  # subscribed to last
+            wait_for(lambda: probe.wanted and path.exists() and len(path.read_bytes()) > 0, service)
+        yield process
+    finally:
+        if process.poll() is None:
+            kill(process)
+
+
+def wait_for(condition: object, service: ServiceProcess) -> None:
+    """Wait until `condition()` holds."""
+    assert callable(condition)
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert service.process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)  # a file and a matching status cannot be waited on
+
+
+def newest_tracks(path: Path) -> dict[tuple[str, int], bytes]:
+    """Tracks of a recording without what tells of their delivery, by stream and number."""
+    found: dict[tuple[str, int], Tracks] = {}
+    for one in RecordingFile(path):
+        if one.topic == "tracks":
+            tracks = decode(one.payload, Tracks, encoding=one.encoding)
+            known = found.get((tracks.stream, tracks.seq))
+            if known is None or known.revision <= tracks.revision:
+                found[tracks.stream, tracks.seq] = tracks
+    return {key: encode(tracks.model_copy(update={"delivery": None})) for key, tracks in found.items()}
+
+
+def recorded_replay(service: ServiceProcess, folder: Path, data: tuple[object, ...]) -> Path:
+    """Replay data through a service while it is recorded; give the recording."""
+    path = folder / "incident.mcap"
+    with recording(service, path) as process:
+        result_of(optipmb("replay", *data, "--connect", service.endpoint, "--out", folder / "replay", "--json"))
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=DEADLINE_S)
+        assert process.returncode == 0, err
+        assert "parameters" in out
+    return path
+
+
+def play_into_another(path: Path, folder: Path, *options: object) -> None:
+    """Play a recording into a service that knows nothing, and record that; all tracks must be the same bytes."""
+    with ServiceProcess() as fresh:
+        fresh.wait_until_ready()
+        with recording(fresh, folder / "again.mcap") as process:
+            result = result_of(
+                optipmb("play", path, "--as-recorded", *options, "--connect", fresh.endpoint, "--json"),
+            )
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=DEADLINE_S)
+    names = {stream["name"] for stream in result["streams"]}
+    first = {key: content for key, content in newest_tracks(path).items() if key[0] in names}
+    again = newest_tracks(folder / "again.mcap")
+    assert len(first) > 3 * FRAMES
+    assert again == first
+    for stream in result["streams"]:
+        assert stream["equal"] == stream["recorded"] == stream["frames"] == stream["returned"]
+        assert stream["first_difference"] is None
+        assert stream["clouds_lost"] == 0
+
+
+def test_four_streams_played_into_a_fresh_service(service: ServiceProcess, tmp_path: Path) -> None:
+    """Ids, sessions, numbers, stamps and every byte of the tracks are those of the recording; offline, too."""
+    path = recorded_replay(service, tmp_path, (*SCENE, *FOUR))
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    topics = {channel.topic.rsplit("/", 1)[1] for channel in summary.channels.values()}
+    assert topics == {"detections", "points", "tracks", "scene", "parameters"}
+    play_into_another(path, tmp_path)
+    offline = result_of(optipmb("track", "--dataset", "mcap", "--root", path, "--out", tmp_path / "offline", "--json"))
+    for entry in offline["sequences"]:
+        name = entry["name"].rsplit(".", 1)[1]
+        replayed = (tmp_path / "replay" / f"{name}.txt").read_bytes()
+        assert Path(entry["file"]).read_bytes() == replayed
+        assert len(replayed) > 1000
+
+
+@pytest.fixture(scope="module")
+def incident(service: ServiceProcess, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of one stream."""
+    return recorded_replay(service, tmp_path_factory.mktemp("incident"), SCENE)
+
+
+def test_a_recording_is_played_again_and_again(service: ServiceProcess, incident: Path, tmp_path: Path) -> None:
+    """Under names of its own it meets no session, so the same service plays it twice, with the same result files."""
+    for folder in ("one", "two"):
+        done = optipmb("play", incident, "--connect", service.endpoint, "--out", tmp_path / folder, "--speed", 4)
+        assert done.returncode == 0, done.stderr
+        assert f"{FRAMES} of {FRAMES} equal to the recorded tracks" in done.stdout
+    (one,), (two,) = ((tmp_path / folder).glob("*.txt") for folder in ("one", "two"))
+    assert one.read_bytes() == two.read_bytes() == (incident.parent / "replay" / "0000.txt").read_bytes()
+
+
+def test_tracks_that_differ_are_told(service: ServiceProcess, incident: Path) -> None:
+    """With other parameters the tracks are others: status 1 and the number of the first frame that differs."""
+    done = optipmb("play", incident, "--connect", service.endpoint, "--profile", "kitti")
+    assert done.returncode == 1
+    assert "differ from the recorded ones, the first is number" in done.stderr
+
+
+def test_a_killed_recording_still_plays(service: ServiceProcess, tmp_path: Path) -> None:
+    """SIGKILL in the middle of a stream: what was written until a second before is there, and plays the same."""
+    path = tmp_path / "cut.mcap"
+    with recording(service, path) as process, Subscriber("replay/*/0000", service.endpoint) as tracks:
+        replay = start("replay", *SCENE, "--option", "frames=60", "--speed", 1, "--connect", service.endpoint)
+        try:
+            for _ in range(30):
+                assert tracks.receive(DEADLINE_S) is not None
+        finally:
+            kill(process)
+            kill(replay)
+    cut = RecordingFile(path)
+    assert sum(one.topic == "tracks" for one in cut) >= 30 - 25  # at 10 Hz, a flush a second on a busy machine
+    assert cut.cut
+    done = optipmb("play", path, "--connect", service.endpoint)
+    assert "was cut off" in done.stderr
+    assert "equal to the recorded tracks" in done.stdout
+    assert done.returncode == 0, done.stderr
+
+
+def test_kitti(service: ServiceProcess, tmp_path: Path) -> None:
+    """Real detections, with the clouds that there are."""
+    data = ("--dataset", "kitti", "--root", kitti_root(), "--detections", "pointrcnn")
+    path = recorded_replay(service, tmp_path, (*data, "--sequences", "0000", "0003", "--streams", 2))
+    play_into_another(path, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("play", "no.mcap"), "no.mcap"),
+        (("play", __file__), "a recording"),
+        (("play", "no.mcap", "--speed", "0"), "--speed"),
+        (("record", "--out", __file__), "a new file"),
+        (("track", "--dataset", "mcap", "--root", __file__), "a recording"),
+    ],
+)
+def test_what_cannot_be_is_one_line_with_status_2(arguments: tuple[str, ...], words: str) -> None:
+    """Wrong files and options are told before anything is connected."""
+    done = optipmb(*arguments)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert words in line
