@@ -38,24 +38,75 @@ def associate(hypotheses: Hypotheses, n_objects: int) -> Index:
     Returns:
         (N,) the measurement of each object, `UNASSIGNED` for the missed ones.
     """
-    assigned = np.full(n_objects, UNASSIGNED, np.int64)
-    pairs = hypotheses.detections
-    gain = hypotheses.detection_cost - hypotheses.first_cost[pairs.measurement]
-    useful = np.flatnonzero(gain < 0.0)
-    if not useful.size:
-        return assigned
-    rows, columns, gain = pairs.row[useful], pairs.measurement[useful], gain[useful]
-    order, start = clusters(rows, columns, n_objects, hypotheses.first_cost.shape[0])
-    for cluster in settle_small(rows, columns, gain, order, start, assigned):
-        members = order[start[cluster] : start[cluster + 1]]
-        objects, i = np.unique(rows[members], return_inverse=True)
-        measurements, j = np.unique(columns[members], return_inverse=True)
-        matrix = np.zeros((objects.size, measurements.size))  # zero: the measurement keeps its first-time detection
-        matrix[i, j] = gain[members]
-        i, j = linear_sum_assignment(matrix)
-        won = matrix[i, j] < 0.0
+    row, measurement, cost = hypotheses.row, hypotheses.measurement, hypotheses.detection_cost
+    assigned = np.empty(n_objects, np.int64)
+    pairs, start = np.empty_like(row), np.empty(row.shape[0] + 1, np.int64)
+    ambiguous = settle(row, measurement, cost, hypotheses.first_cost, assigned, pairs, start)
+    for c in range(ambiguous):
+        cluster = pairs[start[c] : start[c + 1]]
+        objects, measurements, gain = gain_matrix(cluster, row, measurement, cost, hypotheses.first_cost)
+        i, j = linear_sum_assignment(gain)
+        won = gain[i, j] < 0.0
         assigned[objects[i[won]]] = measurements[j[won]]
     return assigned
+
+
+@kernel
+def settle(
+    row: Index, measurement: Index, cost: Array, first_cost: Array, assigned: Index, pairs_out: Index, start_out: Index
+) -> int:
+    """Settle what a minimum settles, and list the clusters that need the Hungarian algorithm.
+
+    Args:
+        row: (K,) object of each pair.
+        measurement: (K,) measurement of each pair.
+        cost: (K,) w of each pair.
+        first_cost: (M,) w of the first-time detection of each measurement.
+        assigned: (N,) receives the measurement of each settled object, `UNASSIGNED` for the others.
+        pairs_out: (K,) receives the pairs of the clusters that are left, cluster after cluster.
+        start_out: (K + 1,) receives where each of those clusters starts and the last one ends.
+
+    Returns:
+        The number of clusters that are left.
+    """
+    assigned[:] = UNASSIGNED
+    useful = np.empty(row.shape[0], np.int64)
+    gain = np.empty(row.shape[0])
+    count = 0
+    for k in range(row.shape[0]):
+        gain[count] = cost[k] - first_cost[measurement[k]]
+        if gain[count] < 0.0:
+            useful[count] = k
+            count += 1
+    useful = useful[:count]
+    rows, columns = row[useful], measurement[useful]
+    order, start = clusters(rows, columns, assigned.shape[0], first_cost.shape[0])
+    left = settle_small(rows, columns, gain, order, start, assigned)
+    start_out[0] = 0
+    for c in range(left.shape[0]):
+        start_out[c + 1] = start_out[c]
+        for k in range(start[left[c]], start[left[c] + 1]):
+            pairs_out[start_out[c + 1]] = useful[order[k]]
+            start_out[c + 1] += 1
+    clusters_left: int = left.shape[0]
+    return clusters_left
+
+
+@kernel
+def gain_matrix(
+    cluster: Index, row: Index, measurement: Index, cost: Array, first_cost: Array
+) -> tuple[Index, Index, Array]:
+    """Lay out one cluster as a matrix of what each pair saves; zero: the measurement keeps its first-time detection.
+
+    Returns:
+        (I,) objects, (J,) measurements, both ascending, and (I, J) gains, none positive.
+    """
+    objects, measurements = np.unique(row[cluster]), np.unique(measurement[cluster])
+    gain = np.zeros((objects.shape[0], measurements.shape[0]))
+    for k in cluster:
+        i, j = np.searchsorted(objects, row[k]), np.searchsorted(measurements, measurement[k])
+        gain[i, j] = cost[k] - first_cost[measurement[k]]
+    return objects, measurements, gain
 
 
 @kernel

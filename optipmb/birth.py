@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import STATE, Bernoullis, Poissons
-from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN
+from optipmb.density import STATE, Poissons
+from optipmb.hypotheses import CLUTTER, FROM_POISSON
 from optipmb.motion import wrap
-from optipmb.update import moment_match, update_states
+from optipmb.update import moment_match, ukf_updates
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 @kernel
 def birth_states(
+    rows: Index,
     position: Array,
     yaw: Array,
     velocity: Array,
@@ -40,10 +41,13 @@ def birth_states(
     heading_speed: Array,
     known: Array,
     unknown: Array,
-) -> tuple[Array, Array]:
-    """Compute m^0 and P^0 of each measurement.
+    mean_out: Array,
+    covariance_out: Array,
+) -> None:
+    """Compute m^0 and P^0 of the measurements in `rows`.
 
     Args:
+        rows: (K,) measurements.
         position: (M, 2) z_xy.
         yaw: (M,) z_phi.
         velocity: (M, 2) z_v, NaN where unknown.
@@ -51,13 +55,11 @@ def birth_states(
         heading_speed: (C,) speed from which the heading is that of the velocity.
         known: (C, 6) standard deviations of P^0 with a velocity.
         unknown: (C, 6) without.
-
-    Returns:
-        (M, 6) means and (M, 6, 6) diagonal covariances.
+        mean_out: (K, 6) receives the means.
+        covariance_out: (K, 6, 6) receives the diagonal covariances.
     """
-    mean = np.zeros((position.shape[0], STATE))
-    covariance = np.zeros((position.shape[0], STATE, STATE))
-    for m in range(position.shape[0]):
+    for k in range(rows.shape[0]):
+        m = rows[k]
         speed, heading = 0.0, yaw[m]
         spread = unknown[label[m]]
         if not (math.isnan(velocity[m, 0]) or math.isnan(velocity[m, 1])):
@@ -67,29 +69,34 @@ def birth_states(
                 heading = math.atan2(velocity[m, 1], velocity[m, 0])
             else:
                 speed = velocity[m, 0] * math.cos(heading) + velocity[m, 1] * math.sin(heading)
-        mean[m, 0], mean[m, 1], mean[m, 2], mean[m, 3] = position[m, 0], position[m, 1], speed, wrap(heading)
+        mean_out[k] = 0.0
+        mean_out[k, 0], mean_out[k, 1], mean_out[k, 2], mean_out[k, 3] = (
+            position[m, 0],
+            position[m, 1],
+            speed,
+            wrap(heading),
+        )
+        covariance_out[k] = 0.0
         for s in range(STATE):
-            covariance[m, s, s] = spread[s] * spread[s]
-    return mean, covariance
-
-
-def births(measurements: Measurements, rows: Index, table: ClassTable) -> tuple[Array, Array]:
-    """Compute m^0 (K, 6) and P^0 (K, 6, 6) of the measurements that `rows` names."""
-    return birth_states(
-        measurements.position[rows],
-        measurements.yaw[rows],
-        measurements.velocity[rows],
-        measurements.label[rows],
-        table.birth_heading_speed,
-        table.birth_known,
-        table.birth_unknown,
-    )
+            covariance_out[k, s, s] = spread[s] * spread[s]
 
 
 def announce(measurements: Measurements, rows: Index, weight: Array, stamp_ns: int, table: ClassTable) -> Poissons:
     """Make a Poisson component of each measurement in `rows`, with the given weights; a zero weight makes none."""
     rows, weight = rows[weight > 0.0], weight[weight > 0.0]
-    mean, covariance = births(measurements, rows, table)
+    mean, covariance = np.empty((rows.shape[0], STATE)), np.empty((rows.shape[0], STATE, STATE))
+    birth_states(
+        rows,
+        measurements.position,
+        measurements.yaw,
+        measurements.velocity,
+        measurements.label,
+        table.birth_heading_speed,
+        table.birth_known,
+        table.birth_unknown,
+        mean,
+        covariance,
+    )
     return Poissons(
         mean=mean,
         covariance=covariance,
@@ -102,7 +109,9 @@ def announce(measurements: Measurements, rows: Index, weight: Array, stamp_ns: i
 
 def adaptive_births(measurements: Measurements, hypotheses: Hypotheses, stamp_ns: int, table: ClassTable) -> Poissons:
     """Make lambda_b of the low-scored measurements M_low, of weight ``mu_b = mu_ab (1 - p_a)`` (eq. HABM)."""
-    low = np.flatnonzero(hypotheses.first_kind == CLUTTER)
+    low = (hypotheses.first_kind == CLUTTER).nonzero()[0]
+    if not low.size:
+        return Poissons.empty()
     weight = table.adaptive_birth_rate[measurements.label[low]] * (1.0 - hypotheses.association[low])
     return announce(measurements, low, weight, stamp_ns, table)
 
@@ -113,76 +122,164 @@ def measurement_births(measurements: Measurements, stamp_ns: int, table: ClassTa
     return announce(measurements, every, table.adaptive_birth_rate[measurements.label], stamp_ns, table)
 
 
-def new_objects(
+def first_detected_states(
+    rows: Index,
     measurements: Measurements,
-    free: NDArray[np.bool_],
     hypotheses: Hypotheses,
     poisson: Poissons,
-    stamp_ns: int,
     table: ClassTable,
-) -> tuple[Bernoullis, Index, int]:
-    """Make the Bernoullis of the first-time detections that the best global hypothesis contains.
+    mean_out: Array,
+    covariance_out: Array,
+) -> int:
+    """Compute the states of the objects that the measurements in `rows` detect for the first time.
 
-    A newborn is N(m^0, P^0) with r = 1 (eq. Newborn Hypothesis). An announced object is the mixture of its
-    components, each updated by the measurement, matched by one Gaussian (eq. First-Time Detection Hypothesis Update
-    1). Clutter makes none.
+    A newborn is N(m^0, P^0) (eq. Newborn Hypothesis). An announced object is the mixture of its components, each
+    updated by the measurement, matched by one Gaussian (eq. First-Time Detection Hypothesis Update 1).
 
     Args:
+        rows: (K,) measurements, none of them clutter.
         measurements: Z_k.
-        free: (M,) measurements that no object took.
         hypotheses: of this frame.
         poisson: predicted components.
-        stamp_ns: stamp of the frame.
         table: parameters as columns.
+        mean_out: (K, 6) receives the means.
+        covariance_out: (K, 6, 6) receives the covariances.
 
     Returns:
-        The Bernoullis in the order of their measurements, without ids (all zero); the measurement of each; the
-        number of covariances that had to be repaired.
+        How many covariances had to be repaired.
     """
-    kind = hypotheses.first_kind
-    alive = hypotheses.first_existence >= table.min_existence[measurements.label]
-    rows = np.flatnonzero(free & alive & (kind != CLUTTER))
-    mean, covariance = births(measurements, rows, table)
-    announced = np.flatnonzero(kind[rows] == FROM_POISSON)
-    repaired = 0
-    if announced.size:
-        mean[announced], covariance[announced], repaired = _announced_states(
-            measurements, rows[announced], hypotheses, poisson, table
-        )
-    count = rows.shape[0]
-    objects = Bernoullis(
-        mean=mean,
-        covariance=covariance,
-        existence=np.where(kind[rows] == NEWBORN, 1.0, hypotheses.first_existence[rows]),
-        label=measurements.label[rows],
-        auxiliary=measurements.auxiliary[rows],
-        id=np.zeros(count, np.int64),
-        born_ns=np.full(count, stamp_ns, np.int64),
-        seen_ns=np.full(count, stamp_ns, np.int64),
-        score=np.zeros(count),
-        evidence=np.zeros(count),
-        extracted=np.zeros(count, np.bool_),
+    birth_states(
+        rows,
+        measurements.position,
+        measurements.yaw,
+        measurements.velocity,
+        measurements.label,
+        table.birth_heading_speed,
+        table.birth_known,
+        table.birth_unknown,
+        mean_out,
+        covariance_out,
     )
-    return objects, rows, repaired
+    repaired: int = announced_states(
+        rows,
+        hypotheses.first_kind,
+        hypotheses.component,
+        hypotheses.announced,
+        hypotheses.log_e,
+        poisson.mean,
+        poisson.covariance,
+        measurements.position,
+        measurements.velocity,
+        measurements.yaw,
+        measurements.label,
+        table.noise_position,
+        table.noise_velocity,
+        table.noise_heading,
+        table.heading_sign_reliable,
+        mean_out,
+        covariance_out,
+    )
+    return repaired
 
 
-def _announced_states(
-    measurements: Measurements, rows: Index, hypotheses: Hypotheses, poisson: Poissons, table: ClassTable
-) -> tuple[Array, Array, int]:
-    """Compute the moment-matched posterior of the components in J^m for each measurement in `rows` (ascending)."""
-    pairs = hypotheses.announced
-    wanted = np.isin(pairs.measurement, rows)
-    by_measurement = np.argsort(pairs.measurement[wanted], kind="stable")
-    component = pairs.row[wanted][by_measurement]
-    measurement = pairs.measurement[wanted][by_measurement]
-    log_e = hypotheses.log_e[wanted][by_measurement]
-    start = np.append(np.searchsorted(measurement, rows), measurement.size)
-    # e^j / e, with the largest e^j of each measurement taken out first.
-    weight = np.exp(log_e - np.repeat(np.maximum.reduceat(log_e, start[:-1]), np.diff(start)))
-    weight /= np.repeat(np.add.reduceat(weight, start[:-1]), np.diff(start))
-    mean, covariance, repaired = update_states(
-        poisson.mean[component], poisson.covariance[component], measurement, measurements, table
+@kernel
+def announced_states(
+    rows: Index,
+    first_kind: Index,
+    component: Index,
+    announced: Index,
+    log_e: Array,
+    mean: Array,
+    covariance: Array,
+    position: Array,
+    velocity: Array,
+    yaw: Array,
+    label: Index,
+    noise_position: Array,
+    noise_velocity: Array,
+    noise_heading: Array,
+    heading_sign_reliable: NDArray[np.bool_],
+    mean_out: Array,
+    covariance_out: Array,
+) -> int:
+    """Write the moment-matched posteriors of the components in J^m over the states of the announced objects.
+
+    Args:
+        rows: (K,) measurements.
+        first_kind: (M,) kind of the first-time detection of each measurement.
+        component: (L,) component of each pair.
+        announced: (L,) measurement of each pair.
+        log_e: (L,) ln e^j of each pair.
+        mean: (J, 6) predicted means of the components.
+        covariance: (J, 6, 6) their covariances.
+        position: (M, 2) z_xy; this and what follows as in `ukf_updates`.
+        velocity: (M, 2) z_v.
+        yaw: (M,) z_phi.
+        label: (M,) z_c.
+        noise_position: (C,).
+        noise_velocity: (C,).
+        noise_heading: (C,).
+        heading_sign_reliable: (C,).
+        mean_out: (K, 6) receives the means of the announced objects.
+        covariance_out: (K, 6, 6) receives their covariances.
+
+    Returns:
+        How many covariances had to be repaired.
+    """
+    wanted = np.array([k for k in range(rows.shape[0]) if first_kind[rows[k]] == FROM_POISSON], np.int64)
+    if wanted.shape[0] == 0:
+        return 0
+    # The pairs of each measurement, one measurement after the other.
+    first = np.zeros(first_kind.shape[0] + 1, np.int64)
+    for m in announced:
+        first[m + 1] += 1
+    first = np.cumsum(first)
+    fill = first.copy()
+    of_measurement = np.empty(announced.shape[0], np.int64)
+    for pair in range(announced.shape[0]):
+        of_measurement[fill[announced[pair]]] = pair
+        fill[announced[pair]] += 1
+
+    # The mixtures, one after the other, with weights e^j / e; the largest e^j of each is taken out first.
+    start = np.zeros(wanted.shape[0] + 1, np.int64)
+    pairs = np.empty(announced.shape[0], np.int64)
+    weight = np.empty(announced.shape[0])
+    for i in range(wanted.shape[0]):
+        m = rows[wanted[i]]
+        begin, end = start[i], start[i] + first[m + 1] - first[m]
+        start[i + 1] = end
+        pairs[begin:end] = of_measurement[first[m] : first[m + 1]]
+        largest = log_e[pairs[begin:end]].max()
+        others = 0.0
+        for k in range(begin, end):
+            weight[k] = math.exp(log_e[pairs[k]] - largest)
+            if k > begin:
+                others += weight[k]
+        total = weight[begin] + others  # in the order in which numpy adds a few numbers
+        for k in range(begin, end):
+            weight[k] /= total
+
+    pairs = pairs[: start[-1]]
+    parts, spreads = np.empty((pairs.shape[0], STATE)), np.empty((pairs.shape[0], STATE, STATE))
+    repaired = ukf_updates(
+        component[pairs],
+        announced[pairs],
+        mean,
+        covariance,
+        position,
+        velocity,
+        yaw,
+        label,
+        noise_position,
+        noise_velocity,
+        noise_heading,
+        heading_sign_reliable,
+        parts,
+        spreads,
     )
-    mean_out, covariance_out = np.empty((rows.size, STATE)), np.empty((rows.size, STATE, STATE))
-    moment_match(start, weight, mean, covariance, mean_out, covariance_out)
-    return mean_out, covariance_out, repaired
+    matched, matched_spread = np.empty((wanted.shape[0], STATE)), np.empty((wanted.shape[0], STATE, STATE))
+    moment_match(start, weight, parts, spreads, matched, matched_spread)
+    mean_out[wanted] = matched
+    for i in range(wanted.shape[0]):
+        covariance_out[wanted[i]] = matched_spread[i]
+    return repaired

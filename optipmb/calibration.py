@@ -21,16 +21,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from optipmb.compiled import kernel
 from optipmb.density import PHI
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from optipmb.density import Bernoullis
-    from optipmb.preprocess import Measurements
     from optipmb.table import ClassTable
 
     Array = NDArray[np.float64]
@@ -40,54 +38,38 @@ SURE: Final = 7.0
 """Log odds of the surest detection and of the least sure one: what scores say beyond 0.999 they do not know."""
 
 
-def weighed_evidence(
-    bernoulli: Bernoullis, measurement: Index, measurements: Measurements, periods: Array, table: ClassTable
-) -> Array:
-    """Compute the evidence after a frame.
-
-    Args:
-        bernoulli: the objects.
-        measurement: (N,) index of the measurement of each, negative where missed.
-        measurements: Z_k.
-        periods: (N,) nominal periods that the frame stands for.
-        table: parameters as columns.
-
-    Returns:
-        (N,) log odds.
-    """
-    label = bernoulli.label
-    score = np.append(measurements.score, 0.5)[measurement]
-    with np.errstate(divide="ignore"):  # a score of one has infinite log odds and is bounded
-        odds = np.clip(np.log(score) - np.log1p(-score), -SURE, SURE)
-    latest = np.where(measurement >= 0, odds, -table.missed_evidence[label])
-    kept = table.memory[label] ** periods
-    evidence: Array = kept * bernoulli.evidence + (1.0 - kept) * latest
-    return evidence
+@kernel
+def log_odds(score: float) -> float:
+    """Return ln[z_s / (1 - z_s)] of a score in (0, 1], bounded by `SURE`."""
+    odds = math.log(score) - math.log1p(-score)  # a score of one has infinite log odds
+    return min(max(odds, -SURE), SURE)
 
 
-def calibrated(bernoulli: Bernoullis, table: ClassTable) -> tuple[Array, Array, Array]:
-    """Return existence probability (N,), confidence score (N,) and covariance (N, 6, 6) of objects as they are told."""
-    existence, score = bernoulli.existence.copy(), bernoulli.score.copy()
-    covariance = bernoulli.covariance.copy()
-    calibrate_rows(
-        bernoulli.label,
-        bernoulli.evidence,
-        bernoulli.mean,
-        table.knots,
-        table.knot_evidence,
-        table.knot_existence,
-        table.knot_along,
-        table.knot_across,
-        table.score_of_evidence,
-        existence,
-        score,
-        covariance,
-    )
+def calibrated(bernoulli: Bernoullis, rows: Index, table: ClassTable) -> tuple[Array, Array, Array]:
+    """Return existence (K,), score (K,) and covariance (K, 6, 6) of the objects in `rows`, as they are told."""
+    existence, score, covariance = bernoulli.existence[rows], bernoulli.score[rows], bernoulli.covariance[rows]
+    if table.knots.any():
+        calibrate_rows(
+            rows,
+            bernoulli.label,
+            bernoulli.evidence,
+            bernoulli.mean,
+            table.knots,
+            table.knot_evidence,
+            table.knot_existence,
+            table.knot_along,
+            table.knot_across,
+            table.score_of_evidence,
+            existence,
+            score,
+            covariance,
+        )
     return existence, score, covariance
 
 
 @kernel
 def calibrate_rows(
+    rows: Index,
     label: Index,
     evidence: Array,
     mean: Array,
@@ -104,6 +86,7 @@ def calibrate_rows(
     """Overwrite existence, score and covariance of the rows whose class has a calibration.
 
     Args:
+        rows: (K,) objects.
         label: (N,) classes.
         evidence: (N,) e_k.
         mean: (N, 6) motion states.
@@ -113,11 +96,12 @@ def calibrate_rows(
         knot_along: (C, K) standard deviation of the lasting error along the heading, m.
         knot_across: (C, K) across it, m.
         score_of_evidence: (C,) whether the score is the evidence, brought to [0, 1].
-        existence: (N,) in: r, out: f(e_k).
-        score: (N,) in: x_s, out: the score that is told.
-        covariance: (N, 6, 6) in: P, out: with the lasting error.
+        existence: (K,) in: r, out: f(e_k).
+        score: (K,) in: x_s, out: the score that is told.
+        covariance: (K, 6, 6) in: P, out: with the lasting error.
     """
-    for n in range(label.shape[0]):
+    for row in range(rows.shape[0]):
+        n = rows[row]
         c = label[n]
         count = knots[c]
         if count == 0:
@@ -130,14 +114,14 @@ def calibrate_rows(
         share = 0.0
         if high > low:
             share = (e - knot_evidence[c, low]) / (knot_evidence[c, high] - knot_evidence[c, low])
-        existence[n] = knot_existence[c, low] + share * (knot_existence[c, high] - knot_existence[c, low])
+        existence[row] = knot_existence[c, low] + share * (knot_existence[c, high] - knot_existence[c, low])
         along = knot_along[c, low] + share * (knot_along[c, high] - knot_along[c, low])
         across = knot_across[c, low] + share * (knot_across[c, high] - knot_across[c, low])
         cos, sin = math.cos(mean[n, PHI]), math.sin(mean[n, PHI])
-        covariance[n, 0, 0] += along * along * cos * cos + across * across * sin * sin
-        covariance[n, 1, 1] += along * along * sin * sin + across * across * cos * cos
+        covariance[row, 0, 0] += along * along * cos * cos + across * across * sin * sin
+        covariance[row, 1, 1] += along * along * sin * sin + across * across * cos * cos
         mixed = (along * along - across * across) * cos * sin
-        covariance[n, 0, 1] += mixed
-        covariance[n, 1, 0] += mixed
+        covariance[row, 0, 1] += mixed
+        covariance[row, 1, 0] += mixed
         if score_of_evidence[c]:
-            score[n] = 0.5 + 0.5 * e / SURE
+            score[row] = 0.5 + 0.5 * e / SURE

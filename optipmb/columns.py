@@ -5,7 +5,7 @@ Names are `bernoulli.mean`, `poisson.weight` and so on; the two scalars of a den
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _Rows = TypeVar("_Rows", Bernoullis, Poissons)
-
-_EMPTY: Final = {"bernoulli": Bernoullis.empty(), "poisson": Poissons.empty()}
 
 
 def columns_of(density: Density) -> dict[str, NDArray[Any]]:
@@ -59,7 +57,7 @@ def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], classes:
 def _rows(part: str, kind: type[_Rows], columns: Mapping[str, Any]) -> _Rows:
     found: dict[str, Any] = {}
     count: int | None = None
-    for name, like in _EMPTY[part].columns():
+    for name, like in kind.empty().columns():
         path = f"{part}.{name}"
         column = columns.get(path)
         if not isinstance(column, np.ndarray) or column.dtype != like.dtype or column.shape[1:] != like.shape[1:]:
@@ -69,7 +67,7 @@ def _rows(part: str, kind: type[_Rows], columns: Mapping[str, Any]) -> _Rows:
             raise DensityError(path, f"{count} rows", _shown(column))
         if column.dtype.kind == "f" and not np.isfinite(column).all():
             raise DensityError(path, "finite numbers", "others")
-        found[name] = column
+        found[name] = np.array(column, order="C")  # as kernels are compiled for: in one piece, and not read-only
     return kind(**found)
 
 

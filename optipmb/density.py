@@ -10,10 +10,13 @@ Auxiliary state x_A = [length, width, height, z]: box size and height of the box
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
+
+from optipmb.compiled import kernel
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -162,7 +165,7 @@ class Density:
         return cls(stamp_ns=NO_FRAME, next_id=next_id, bernoulli=Bernoullis.empty(), poisson=Poissons.empty())
 
 
-def whole_periods(since_ns: NDArray[np.int64], now_ns: int, period: float) -> NDArray[np.int64]:
-    """Count the nominal periods (s) from each stamp to now, to the nearest: step counters for any frame rate."""
-    periods: NDArray[np.int64] = np.floor((now_ns - since_ns) * 1e-9 / period + 0.5).astype(np.int64)
-    return periods
+@kernel
+def whole_periods(since_ns: int, now_ns: int, period: float) -> int:
+    """Count the nominal periods (s) from a stamp to now, to the nearest: step counters for any frame rate."""
+    return math.floor((now_ns - since_ns) * 1e-9 / period + 0.5)

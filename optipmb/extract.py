@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optipmb.calibration import calibrated
-from optipmb.density import OMEGA, PHI, A, V, whole_periods
+from optipmb.compiled import kernel
+from optipmb.density import OMEGA, PHI, A, V, X, Y, whole_periods
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from optipmb.table import ClassTable
 
     Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,45 +62,139 @@ class Tracks:
         return len(self.id)
 
 
-def extraction(bernoulli: Bernoullis, stamp_ns: int, table: ClassTable, *, two_thresholds: bool) -> NDArray[np.bool_]:
-    """Tell which objects are extracted.
+def extract(
+    bernoulli: Bernoullis,
+    measurement: Index,
+    source: Index,
+    stamp_ns: int,
+    table: ClassTable,
+    *,
+    two_thresholds: bool,
+) -> Tracks:
+    """Extract the tracks, and mark in `bernoulli.extracted` the objects that were extracted for the first time.
 
     A track that never was: from ``r >= eta_ext1``. A known one: while ``r >= eta_ext2`` and ``x_cnt < eta_cnt``. The
     baseline of the ablation has the first threshold alone.
+
+    Args:
+        bernoulli: the posterior, not yet given away.
+        measurement: (N,) measurement of each object, negative where missed.
+        source: (M,) place of each measurement in the caller's arrays.
+        stamp_ns: stamp of the frame.
+        table: parameters as columns.
+        two_thresholds: whether OTE is on.
     """
-    first: NDArray[np.bool_] = bernoulli.existence >= table.extract_new[bernoulli.label]
-    if not two_thresholds:
-        return first
-    misses = whole_periods(bernoulli.seen_ns, stamp_ns, table.period)
-    again = (bernoulli.existence >= table.extract_known[bernoulli.label]) & (
-        misses < table.extract_misses[bernoulli.label]
+    rows = np.empty(len(bernoulli), np.int64)
+    count = select_tracks(
+        bernoulli.existence,
+        bernoulli.seen_ns,
+        bernoulli.label,
+        stamp_ns,
+        table.period,
+        table.extract_new,
+        table.extract_known,
+        table.extract_misses,
+        two_thresholds,
+        bernoulli.extracted,
+        rows,
     )
-    return np.where(bernoulli.extracted, again, first)
-
-
-def seconds(nanoseconds: NDArray[np.int64]) -> Array:
-    """Convert differences of stamps to seconds."""
-    return np.asarray(nanoseconds * 1e-9, dtype=np.float64)
-
-
-def tracks_of(bernoulli: Bernoullis, detection: NDArray[np.int64], stamp_ns: int, table: ClassTable) -> Tracks:
-    """Read the tracks off the extracted Bernoullis; `detection` (N,) is what each was associated with."""
-    mean = bernoulli.mean
-    existence, score, covariance = calibrated(bernoulli, table)
-    v, phi = mean[:, V], mean[:, PHI]
-    return Tracks(
-        id=bernoulli.id,
-        label=bernoulli.label,
-        center=np.column_stack((mean[:, :2], bernoulli.auxiliary[:, 3])),
-        size=bernoulli.auxiliary[:, :3].copy(),
-        yaw=phi.copy(),
-        velocity=np.column_stack((v * np.cos(phi), v * np.sin(phi))),
-        yaw_rate=mean[:, OMEGA].copy(),
-        acceleration=mean[:, A].copy(),
+    rows = rows[:count]
+    existence, score, covariance = calibrated(bernoulli, rows, table)
+    tracks = Tracks(
+        id=bernoulli.id[rows],
+        label=bernoulli.label[rows],
+        center=np.empty((count, 3)),
+        size=np.empty((count, 3)),
+        yaw=np.empty(count),
+        velocity=np.empty((count, 2)),
+        yaw_rate=np.empty(count),
+        acceleration=np.empty(count),
         existence=existence,
         score=score,
         covariance=covariance,
-        age=seconds(stamp_ns - bernoulli.born_ns),
-        time_since_detection=seconds(stamp_ns - bernoulli.seen_ns),
-        detection=detection,
+        age=np.empty(count),
+        time_since_detection=np.empty(count),
+        detection=np.empty(count, np.int64),
     )
+    read_tracks(
+        rows,
+        bernoulli.mean,
+        bernoulli.auxiliary,
+        bernoulli.born_ns,
+        bernoulli.seen_ns,
+        measurement,
+        source,
+        stamp_ns,
+        tracks.center,
+        tracks.size,
+        tracks.yaw,
+        tracks.velocity,
+        tracks.yaw_rate,
+        tracks.acceleration,
+        tracks.age,
+        tracks.time_since_detection,
+        tracks.detection,
+    )
+    return tracks
+
+
+@kernel
+def select_tracks(
+    existence: Array,
+    seen_ns: Index,
+    label: Index,
+    stamp_ns: int,
+    period: float,
+    extract_new: Array,
+    extract_known: Array,
+    extract_misses: Index,
+    two_thresholds: bool,
+    extracted: NDArray[np.bool_],
+    rows: Index,
+) -> int:
+    """Write the rows that are extracted, mark them in `extracted`, and return how many they are."""
+    count = 0
+    for n in range(existence.shape[0]):
+        c = label[n]
+        if extracted[n] and two_thresholds:
+            now = existence[n] >= extract_known[c] and whole_periods(seen_ns[n], stamp_ns, period) < extract_misses[c]
+        else:
+            now = existence[n] >= extract_new[c]
+        if now:
+            extracted[n] = True
+            rows[count] = n
+            count += 1
+    return count
+
+
+@kernel
+def read_tracks(
+    rows: Index,
+    mean: Array,
+    auxiliary: Array,
+    born_ns: Index,
+    seen_ns: Index,
+    measurement: Index,
+    source: Index,
+    stamp_ns: int,
+    center: Array,
+    size: Array,
+    yaw: Array,
+    velocity: Array,
+    yaw_rate: Array,
+    acceleration: Array,
+    age: Array,
+    time_since_detection: Array,
+    detection: Index,
+) -> None:
+    """Write the columns of `Tracks` that are not those of the objects in `rows`."""
+    for k in range(rows.shape[0]):
+        n = rows[k]
+        v, phi = mean[n, V], mean[n, PHI]
+        center[k, 0], center[k, 1], center[k, 2] = mean[n, X], mean[n, Y], auxiliary[n, 3]
+        for s in range(3):
+            size[k, s] = auxiliary[n, s]
+        yaw[k], yaw_rate[k], acceleration[k] = phi, mean[n, OMEGA], mean[n, A]
+        velocity[k, 0], velocity[k, 1] = v * math.cos(phi), v * math.sin(phi)
+        age[k], time_since_detection[k] = (stamp_ns - born_ns[n]) * 1e-9, (stamp_ns - seen_ns[n]) * 1e-9
+        detection[k] = source[measurement[n]] if measurement[n] >= 0 else -1

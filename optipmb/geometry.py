@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 MAX_CORNERS = 16
 """Two rectangles intersect in at most eight corners; clipping keeps a few more for a moment."""
 
+CERTAIN = 1.0 - 1e-9
+"""A bound below this share of a threshold is below the threshold, whatever rounding did to either."""
+
 GRID_CELLS = 128
 """Cells along one side of the grid that finds the boxes near a point."""
 
@@ -90,6 +93,33 @@ def box_iou(first: Array, second: Array) -> float:
         return 0.0
     union: float = first[2] * first[3] + second[2] * second[3] - common
     return common / union
+
+
+@kernel
+def iou_exceeds(first: Array, second: Array, threshold: float) -> bool:
+    """Tell whether `box_iou` is above a threshold; most boxes that are not too close show it before any clipping.
+
+    The intersection is at most the smaller box, and at most what `first` shares with the rectangle around `second`
+    that is parallel to it. A bound that rounding could put on the wrong side of the threshold decides nothing.
+    """
+    area, other = first[2] * first[3], second[2] * second[3]
+    shared = min(area, other)
+    if shared < CERTAIN * threshold * (area + other - shared):
+        return False
+    cos_yaw, sin_yaw = math.cos(first[4]), math.sin(first[4])
+    dx, dy = second[0] - first[0], second[1] - first[1]
+    turn = second[4] - first[4]
+    cos_turn, sin_turn = abs(math.cos(turn)), abs(math.sin(turn))
+    inside = 1.0
+    for axis in range(2):
+        offset = abs(cos_yaw * dx + sin_yaw * dy if axis == 0 else cos_yaw * dy - sin_yaw * dx)
+        half = 0.5 * first[2 + axis]
+        other_half = 0.5 * (cos_turn * second[2 + axis] + sin_turn * second[3 - axis])
+        inside *= max(min(half, offset + other_half) - max(-half, offset - other_half), 0.0)
+    shared = min(shared, inside)
+    if shared < CERTAIN * threshold * (area + other - shared):
+        return False
+    return box_iou(first, second) > threshold
 
 
 @kernel

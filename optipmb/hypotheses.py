@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from optipmb.compiled import kernel
+from optipmb.neighbours import NOBODY, block, empty_torus, insert
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,28 +35,15 @@ NEWBORN: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Pairs:
-    """Objects and measurements of one class within the gate, ordered by object, then by measurement.
-
-    Attributes:
-        row: (K,) index of the object or component.
-        measurement: (K,) index of the measurement.
-        log_likelihood: (K,) ln N(z_xy; z_hat, S), eq. Predicted Measurement.
-    """
-
-    row: Index
-    measurement: Index
-    log_likelihood: Array
-
-
-@dataclass(frozen=True, slots=True)
 class Hypotheses:
-    """All local hypotheses of one frame.
+    """All local hypotheses of one frame. Pairs are ordered by object or component, then by measurement.
 
     Attributes:
-        detections: object-measurement pairs in the gate.
-        detection_cost: (K,) w of each pair (eq. Detection Hypothesis Update).
-        announced: component-measurement pairs in the gate, the sets J^m.
+        row: (K,) object of each object-measurement pair in the gate.
+        measurement: (K,) measurement of each of those pairs.
+        detection_cost: (K,) w of each of those pairs (eq. Detection Hypothesis Update).
+        component: (L,) component of each component-measurement pair in the gate, the sets J^m.
+        announced: (L,) measurement of each of those pairs.
         log_e: (L,) ln e^j of each of those pairs (eq. First-Time Detection Hypothesis Update 2).
         first_kind: (M,) `FROM_POISSON`, `CLUTTER` or `NEWBORN`.
         first_cost: (M,) w of the first-time detection of each measurement.
@@ -63,9 +51,11 @@ class Hypotheses:
         association: (M,) p_a, probability that an existing object made the measurement (eq. Association Probability).
     """
 
-    detections: Pairs
+    row: Index
+    measurement: Index
     detection_cost: Array
-    announced: Pairs
+    component: Index
+    announced: Index
     log_e: Array
     first_kind: Index
     first_cost: Array
@@ -94,30 +84,66 @@ def enumerate_hypotheses(
         measurements: Z_k.
         table: parameters as columns.
     """
-    detections = _gate(bernoulli.mean, bernoulli.covariance, bernoulli.label, measurements, table)
-    detection_cost, association = detection_costs(
-        detections.row, detections.measurement, detections.log_likelihood, bernoulli.existence, p_d, len(measurements)
+    return Hypotheses(
+        *local_hypotheses(
+            bernoulli.mean,
+            bernoulli.covariance,
+            bernoulli.label,
+            bernoulli.existence,
+            p_d,
+            poisson.mean,
+            poisson.covariance,
+            poisson.label,
+            poisson.weight,
+            p_d_poisson,
+            measurements.position,
+            measurements.label,
+            measurements.score,
+            table.gate,
+            table.noise_position,
+            table.clutter_intensity,
+            table.birth_intensity,
+            table.birth_score,
+        )
     )
-    announced = _gate(poisson.mean, poisson.covariance, poisson.label, measurements, table)
-    log_e = np.log(poisson.weight * p_d_poisson)[announced.row] + announced.log_likelihood
-    kind, cost, existence = first_detections(
-        announced.measurement,
-        log_e,
-        measurements.score,
-        association,
-        table.clutter_intensity[measurements.label],
-        table.birth_intensity[measurements.label],
-        table.birth_score[measurements.label],
-    )
-    return Hypotheses(detections, detection_cost, announced, log_e, kind, cost, existence, association)
 
 
-def _gate(mean: Array, covariance: Array, label: Index, measurements: Measurements, table: ClassTable) -> Pairs:
-    by_x = np.argsort(measurements.position[:, 0], kind="stable")
+@kernel
+def local_hypotheses(
+    mean: Array,
+    covariance: Array,
+    label: Index,
+    existence: Array,
+    p_d: Array,
+    mean_poisson: Array,
+    covariance_poisson: Array,
+    label_poisson: Index,
+    weight: Array,
+    p_d_poisson: Array,
+    position: Array,
+    measured_label: Index,
+    score: Array,
+    gate_distance: Array,
+    noise_position: Array,
+    clutter_intensity: Array,
+    birth_intensity: Array,
+    birth_score: Array,
+) -> tuple[Index, Index, Array, Index, Index, Array, Index, Array, Array, Array]:
+    """Enumerate the local hypotheses; the columns of `Hypotheses`, in their order."""
     row, measurement, log_likelihood = gate(
-        mean, covariance, label, measurements.position, measurements.label, by_x, table.gate, table.noise_position
+        mean, covariance, label, position, measured_label, gate_distance, noise_position
     )
-    return Pairs(row, measurement, log_likelihood)
+    detection_cost, association = detection_costs(row, measurement, log_likelihood, existence, p_d, position.shape[0])
+    component, announced, log_e = gate(
+        mean_poisson, covariance_poisson, label_poisson, position, measured_label, gate_distance, noise_position
+    )
+    for k in range(component.shape[0]):
+        j = component[k]
+        log_e[k] = math.log(weight[j] * p_d_poisson[j]) + log_e[k]
+    kind, cost, first_existence = first_detections(
+        announced, log_e, score, association, measured_label, clutter_intensity, birth_intensity, birth_score
+    )
+    return row, measurement, detection_cost, component, announced, log_e, kind, cost, first_existence, association
 
 
 @kernel
@@ -127,13 +153,12 @@ def gate(
     label: Index,
     position: Array,
     measured_label: Index,
-    by_x: Index,
     gate_distance: Array,
     noise_position: Array,
 ) -> tuple[Index, Index, Array]:
     """Find the measurements of an object's class within its gate and their position likelihoods.
 
-    A sweep along x: of the measurements sorted by x, only those within the gate's reach are looked at.
+    The measurements stand in a torus of cells as wide as the gate of their class; an object looks at its neighbours.
 
     Args:
         mean: (N, 6) predicted means.
@@ -141,41 +166,46 @@ def gate(
         label: (N,) classes.
         position: (M, 2) z_xy.
         measured_label: (M,) z_c.
-        by_x: (M,) order of the measurements by x.
         gate_distance: (C,) eta_dist.
         noise_position: (C,) standard deviation of z_x and z_y; R_xy = sigma^2 I.
 
     Returns:
-        Objects, measurements and log-likelihoods of the pairs, ordered by object, then measurement.
+        Objects, measurements and log-likelihoods ln N(z_xy; z_hat, S) of the pairs (eq. Predicted Measurement),
+        ordered by object, then measurement.
     """
-    sorted_x = position[by_x, 0]
-    capacity = 4 * (mean.shape[0] + position.shape[0]) + 16
+    capacity = 4 * (mean.shape[0] + position.shape[0]) + 16 if mean.shape[0] else 0
     row = np.empty(capacity, np.int64)
     measurement = np.empty(capacity, np.int64)
     log_likelihood = np.empty(capacity)
+    if mean.shape[0] == 0:
+        return row, measurement, log_likelihood
+    head, following, side = empty_torus(position.shape[0])
+    for m in range(position.shape[0]):
+        insert(head, following, side, m, position[m, 0], position[m, 1], gate_distance[measured_label[m]])
     count = 0
     for n in range(mean.shape[0]):
         eta = gate_distance[label[n]]
         begin = count
-        for k in range(np.searchsorted(sorted_x, mean[n, 0] - eta), position.shape[0]):
-            m = by_x[k]
-            dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
-            if dx > eta:
-                break
-            if measured_label[m] != label[n] or dx * dx + dy * dy > eta * eta:
-                continue
-            if count == capacity:
-                capacity *= 2
-                row = _grown(row, capacity)
-                measurement = _grown(measurement, capacity)
-                log_likelihood = _grown(log_likelihood, capacity)
-            slot = count  # keep the measurements of this object in ascending order
-            while slot > begin and measurement[slot - 1] > m:
-                measurement[slot] = measurement[slot - 1]
-                slot -= 1
-            measurement[slot] = m
-            row[count] = n
-            count += 1
+        first_x, last_x, first_y, last_y = block(mean[n, 0], mean[n, 1], eta, eta)
+        for i in range(first_x, last_x + 1):
+            for j in range(first_y, last_y + 1):
+                m = head[(i & (side - 1)) * side + (j & (side - 1))]
+                while m != NOBODY:
+                    dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
+                    if measured_label[m] == label[n] and dx * dx + dy * dy <= eta * eta:
+                        if count == capacity:
+                            capacity *= 2
+                            row = _grown(row, capacity)
+                            measurement = _grown(measurement, capacity)
+                            log_likelihood = _grown(log_likelihood, capacity)
+                        slot = count  # keep the measurements of this object in ascending order
+                        while slot > begin and measurement[slot - 1] > m:
+                            measurement[slot] = measurement[slot - 1]
+                            slot -= 1
+                        measurement[slot] = m
+                        row[count] = n
+                        count += 1
+                    m = following[m]
         r_xy = noise_position[label[n]] ** 2
         s_xx, s_xy, s_yy = covariance[n, 0, 0] + r_xy, covariance[n, 0, 1], covariance[n, 1, 1] + r_xy
         determinant = s_xx * s_yy - s_xy * s_xy
@@ -221,6 +251,7 @@ def first_detections(
     log_e: Array,
     score: Array,
     association: Array,
+    label: Index,
     clutter_intensity: Array,
     birth_intensity: Array,
     birth_score: Array,
@@ -237,9 +268,10 @@ def first_detections(
         log_e: (L,) ln e^j.
         score: (M,) z_s.
         association: (M,) p_a.
-        clutter_intensity: (M,) lambda_c at each measurement.
-        birth_intensity: (M,) mu_b0 / A at each measurement.
-        birth_score: (M,) eta_score at each measurement.
+        label: (M,) z_c.
+        clutter_intensity: (C,) lambda_c.
+        birth_intensity: (C,) mu_b0 / A.
+        birth_score: (C,) eta_score.
     """
     n_measurements = score.shape[0]
     log_sum = np.full(n_measurements, -math.inf)  # ln e, e = sum_j e^j
@@ -252,15 +284,16 @@ def first_detections(
     cost = np.empty(n_measurements)
     existence = np.empty(n_measurements)
     for m in range(n_measurements):
+        clutter = clutter_intensity[label[m]]
         if kind[m] == FROM_POISSON:
-            ratio = math.exp(min(log_sum[m] - math.log(clutter_intensity[m]), 700.0))  # e / lambda_c
-            cost[m] = -math.log(clutter_intensity[m]) - math.log1p(ratio)
+            ratio = math.exp(min(log_sum[m] - math.log(clutter), 700.0))  # e / lambda_c
+            cost[m] = -math.log(clutter) - math.log1p(ratio)
             existence[m] = ratio / (1.0 + ratio)
-        elif score[m] < birth_score[m]:
-            cost[m] = -math.log(clutter_intensity[m])
+        elif score[m] < birth_score[label[m]]:
+            cost[m] = -math.log(clutter)
             existence[m] = 0.0
         else:
             kind[m] = NEWBORN
-            cost[m] = -math.log(birth_intensity[m] * (1.0 - association[m]) + clutter_intensity[m])
+            cost[m] = -math.log(birth_intensity[label[m]] * (1.0 - association[m]) + clutter)
             existence[m] = 1.0
     return kind, cost, existence

@@ -1,58 +1,156 @@
-"""The light-weight filter of the non-motion states (Section IV.E): box size, height, counters, confidence, evidence."""
+"""The light-weight filter of the non-motion states (Section IV.E): box size, height, counters and confidence."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optipmb.calibration import weighed_evidence
+from optipmb.calibration import log_odds
+from optipmb.compiled import kernel
+from optipmb.density import Bernoullis
+from optipmb.prune import NEW
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb.density import Bernoullis
     from optipmb.preprocess import Measurements
+    from optipmb.prune import Survivors
     from optipmb.table import ClassTable
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
 
 
 def light_weight_filter(
+    survivors: Survivors,
+    mean: Array,
+    covariance: Array,
     bernoulli: Bernoullis,
-    measurement: NDArray[np.int64],
+    next_id: int,
     measurements: Measurements,
     stamp_ns: int,
     before_ns: int,
     table: ClassTable,
 ) -> Bernoullis:
-    """Update the non-motion states of all objects, new and old.
+    """Update the non-motion states of all objects, new and old, and put the posterior together.
 
     Detected: ``x_A = (1 - z_s) x_A + z_s z_A``, ``x_cnt = 0``, ``x_s = [1 - exp(-x_len)] z_s`` (eq. Confidence
-    Score). Missed: x_A stays, ``x_s = 0``. The counters are kept as stamps, so that they mean the same at every
-    frame rate: x_cnt is the number of nominal periods since `seen_ns`, x_len is one more than the (real) number
-    since `born_ns`.
+    Score). Missed: x_A stays, ``x_s = 0``. New: x_A = z_A before, ids from `next_id` on. The counters are kept as
+    stamps, so that they mean the same at every frame rate: x_cnt is the number of nominal periods since `seen_ns`,
+    x_len is one more than the (real) number since `born_ns`. The evidence follows `optipmb.calibration`.
 
     Args:
-        bernoulli: the objects after the update, new ones with z_A as auxiliary state.
-        measurement: (N,) index of the measurement of each, negative where missed.
+        survivors: which objects the posterior has.
+        mean: (K, 6) their posterior means.
+        covariance: (K, 6, 6) their posterior covariances.
+        bernoulli: the predicted objects.
+        next_id: id of the first new object.
         measurements: Z_k.
         stamp_ns: stamp of the frame.
         before_ns: stamp of the frame before. The evidence of a frame weighs by the time since then, that of a first
             detection by one nominal period.
         table: parameters as columns.
     """
-    seen = measurement >= 0
-    auxiliary, score = bernoulli.auxiliary.copy(), np.zeros(len(bernoulli))
-    m = measurement[seen]
-    z_s = measurements.score[m]
-    auxiliary[seen] = (1.0 - z_s[:, None]) * auxiliary[seen] + z_s[:, None] * measurements.auxiliary[m]
-    x_len = 1.0 + (stamp_ns - bernoulli.born_ns[seen]) * 1e-9 / table.period
-    score[seen] = (1.0 - np.exp(-x_len)) * z_s
-    periods = np.where(bernoulli.born_ns == stamp_ns, 1.0, (stamp_ns - before_ns) * 1e-9 / table.period)
-    return replace(
-        bernoulli,
-        auxiliary=auxiliary,
-        score=score,
-        evidence=weighed_evidence(bernoulli, measurement, measurements, periods, table),
-        seen_ns=np.where(seen, stamp_ns, bernoulli.seen_ns).astype(np.int64),
+    count = len(survivors)
+    posterior = Bernoullis(
+        mean=mean,
+        covariance=covariance,
+        existence=survivors.existence,
+        label=np.empty(count, np.int64),
+        auxiliary=np.empty((count, 4)),
+        id=np.empty(count, np.int64),
+        born_ns=np.empty(count, np.int64),
+        seen_ns=np.empty(count, np.int64),
+        score=np.empty(count),
+        evidence=np.empty(count),
+        extracted=np.empty(count, np.bool_),
     )
+    update_light_weight(
+        survivors.row,
+        survivors.measurement,
+        bernoulli.label,
+        bernoulli.auxiliary,
+        bernoulli.id,
+        bernoulli.born_ns,
+        bernoulli.seen_ns,
+        bernoulli.evidence,
+        bernoulli.extracted,
+        next_id,
+        measurements.label,
+        measurements.auxiliary,
+        measurements.score,
+        stamp_ns,
+        before_ns,
+        table.period,
+        table.memory,
+        table.missed_evidence,
+        posterior.label,
+        posterior.auxiliary,
+        posterior.id,
+        posterior.born_ns,
+        posterior.seen_ns,
+        posterior.score,
+        posterior.evidence,
+        posterior.extracted,
+    )
+    return posterior
+
+
+@kernel
+def update_light_weight(
+    row: Index,
+    measurement: Index,
+    label: Index,
+    auxiliary: Array,
+    identity: Index,
+    born_ns: Index,
+    seen_ns: Index,
+    evidence: Array,
+    extracted: NDArray[np.bool_],
+    next_id: int,
+    measured_label: Index,
+    measured_auxiliary: Array,
+    measured_score: Array,
+    stamp_ns: int,
+    before_ns: int,
+    period: float,
+    memory: Array,
+    missed_evidence: Array,
+    label_out: Index,
+    auxiliary_out: Array,
+    identity_out: Index,
+    born_ns_out: Index,
+    seen_ns_out: Index,
+    score_out: Array,
+    evidence_out: Array,
+    extracted_out: NDArray[np.bool_],
+) -> None:
+    """Write the non-motion columns of the posterior; `extracted` stays as it was."""
+    for k in range(row.shape[0]):
+        n, m = row[k], measurement[k]
+        if n == NEW:
+            label_out[k], identity_out[k] = measured_label[m], next_id
+            born_ns_out[k], extracted_out[k], evidence_out[k] = stamp_ns, False, 0.0
+            auxiliary_out[k] = measured_auxiliary[m]
+            next_id += 1
+        else:
+            label_out[k], identity_out[k] = label[n], identity[n]
+            born_ns_out[k], extracted_out[k], evidence_out[k] = born_ns[n], extracted[n], evidence[n]
+            seen_ns_out[k] = seen_ns[n]
+            auxiliary_out[k] = auxiliary[n]
+        c = label_out[k]
+        score_out[k] = 0.0
+        latest = -missed_evidence[c]
+        if m >= 0:
+            z_s = measured_score[m]
+            for s in range(4):
+                auxiliary_out[k, s] = (1.0 - z_s) * auxiliary_out[k, s] + z_s * measured_auxiliary[m, s]
+            x_len = 1.0 + (stamp_ns - born_ns_out[k]) * 1e-9 / period
+            score_out[k] = (1.0 - math.exp(-x_len)) * z_s
+            seen_ns_out[k] = stamp_ns
+            latest = log_odds(z_s)
+        periods = 1.0 if born_ns_out[k] == stamp_ns else (stamp_ns - before_ns) * 1e-9 / period
+        kept = memory[c] ** periods
+        evidence_out[k] = kept * evidence_out[k] + (1.0 - kept) * latest

@@ -15,12 +15,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from optipmb.compiled import kernel
-from optipmb.density import PHI, STATE, A, V, X, Y
+from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
@@ -100,76 +99,75 @@ def square_root(covariance: Array, root: Array) -> int:
 
 
 @kernel
-def predict_states(
+def predict_state(
     mean: Array,
     covariance: Array,
-    label: NDArray[np.int64],
     dt: float,
     process_noise: Array,
+    root: Array,
+    points: Array,
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
-    """Predict every state by the unscented transform of the CTRA model (eq. Motion Predict).
+    """Predict one state by the unscented transform of the CTRA model (eq. Motion Predict).
 
     Args:
-        mean: (N, 6) posterior means.
-        covariance: (N, 6, 6) posterior covariances.
-        label: (N,) class indices.
+        mean: (6,) posterior mean.
+        covariance: (6, 6) posterior covariance.
         dt: time to predict over, s, positive.
-        process_noise: (C, 6) standard deviations per square root of a second and class; ``Q = diag(q^2) dt``.
-        mean_out: (N, 6) receives m_+.
-        covariance_out: (N, 6, 6) receives P_+.
+        process_noise: (6,) standard deviations per square root of a second; ``Q = diag(q^2) dt``.
+        root: (6, 6) buffer for the square root.
+        points: (12, 6) buffer for the transformed points, as deviations from the transformed centre; the mean is
+            added last, so that large world coordinates cost no digits.
+        mean_out: (6,) receives m_+.
+        covariance_out: (6, 6) receives P_+.
 
     Returns:
-        How many covariances had to be repaired.
+        Number of pivots that had to be repaired.
     """
-    root = np.empty((STATE, STATE))
-    # Deviations of the transformed points from the transformed centre; the mean is added last, so that large world
-    # coordinates cost no digits.
-    points = np.empty((2 * STATE, STATE))
-    repaired = 0
-    for n in range(mean.shape[0]):
-        if square_root(covariance[n], root) > 0:
-            repaired += 1
-        v, phi, omega, a = mean[n, V], mean[n, PHI], mean[n, PHI + 1], mean[n, A]
-        along0, across0 = ctra_displacement(v, omega, a, dt)
-        cos_phi, sin_phi = math.cos(phi), math.sin(phi)
-        dx0 = cos_phi * along0 - sin_phi * across0
-        dy0 = sin_phi * along0 + cos_phi * across0
-        for column in range(STATE):
-            for side in range(2):
-                step = SPREAD if side == 0 else -SPREAD
-                point = points[2 * column + side]
-                for row in range(STATE):
-                    point[ORDER[row]] = step * root[row, column]
-                if column < STATE - 2:  # the columns of x and y leave the motion itself as it is at the centre
-                    along, across = ctra_displacement(v + point[V], omega + point[PHI + 1], a + point[A], dt)
-                    cos_point, sin_point = math.cos(phi + point[PHI]), math.sin(phi + point[PHI])
-                    point[X] += cos_point * along - sin_point * across - dx0
-                    point[Y] += sin_point * along + cos_point * across - dy0
-                    point[V] += point[A] * dt
-                    point[PHI] += point[PHI + 1] * dt
-        shift = np.zeros(STATE)
-        for i in range(2 * STATE):
-            for s in range(STATE):
-                shift[s] += WEIGHT * points[i, s]
-        for i in range(2 * STATE):
-            for s in range(STATE):
-                points[i, s] -= shift[s]
-        for s in range(STATE):
-            for t in range(s + 1):
-                value = 0.0
-                for i in range(2 * STATE):
-                    value += points[i, s] * points[i, t]
-                value *= WEIGHT
-                if s == t:
-                    value += process_noise[label[n], s] ** 2 * dt
-                covariance_out[n, s, t] = value
-                covariance_out[n, t, s] = value
-        mean_out[n, X] = mean[n, X] + (dx0 + shift[X])
-        mean_out[n, Y] = mean[n, Y] + (dy0 + shift[Y])
-        mean_out[n, V] = v + a * dt + shift[V]
-        mean_out[n, PHI] = wrap(phi + omega * dt + shift[PHI])
-        mean_out[n, PHI + 1] = omega + shift[PHI + 1]
-        mean_out[n, A] = a + shift[A]
+    repaired = square_root(covariance, root)
+    v, phi, omega, a = mean[V], mean[PHI], mean[OMEGA], mean[A]
+    along0, across0 = ctra_displacement(v, omega, a, dt)
+    cos_phi, sin_phi = math.cos(phi), math.sin(phi)
+    dx0 = cos_phi * along0 - sin_phi * across0
+    dy0 = sin_phi * along0 + cos_phi * across0
+    for column in range(STATE):
+        for side in range(2):
+            step = SPREAD if side == 0 else -SPREAD
+            point = points[2 * column + side]
+            for row in range(STATE):
+                point[ORDER[row]] = step * root[row, column]
+            if column < STATE - 2:  # the columns of x and y leave the motion itself as it is at the centre
+                along, across = ctra_displacement(v + point[V], omega + point[OMEGA], a + point[A], dt)
+                cos_point, sin_point = math.cos(phi + point[PHI]), math.sin(phi + point[PHI])
+                point[X] += cos_point * along - sin_point * across - dx0
+                point[Y] += sin_point * along + cos_point * across - dy0
+                point[V] += point[A] * dt
+                point[PHI] += point[OMEGA] * dt
+    mean_out[X], mean_out[Y] = mean[X] + (dx0 + centred(points, X)), mean[Y] + (dy0 + centred(points, Y))
+    mean_out[V] = v + a * dt + centred(points, V)
+    mean_out[PHI] = wrap(phi + omega * dt + centred(points, PHI))
+    mean_out[OMEGA] = omega + centred(points, OMEGA)
+    mean_out[A] = a + centred(points, A)
+    for s in range(STATE):
+        for t in range(s + 1):
+            value = 0.0
+            for i in range(2 * STATE):
+                value += points[i, s] * points[i, t]
+            value *= WEIGHT
+            if s == t:
+                value += process_noise[s] ** 2 * dt
+            covariance_out[s, t] = value
+            covariance_out[t, s] = value
     return repaired
+
+
+@kernel
+def centred(points: Array, s: int) -> float:
+    """Take the mean of the points (12, 6) out of their entry s, and return it."""
+    shift = 0.0
+    for i in range(2 * STATE):
+        shift += WEIGHT * points[i, s]
+    for i in range(2 * STATE):
+        points[i, s] -= shift
+    return shift

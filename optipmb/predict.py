@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optipmb.density import NO_FRAME, Density, whole_periods
-from optipmb.motion import predict_states
+from optipmb.compiled import kernel
+from optipmb.density import NO_FRAME, STATE, Bernoullis, Density, Poissons, whole_periods
+from optipmb.motion import predict_state
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from optipmb.table import ClassTable
 
     Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
 
 
 def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density, int]:
@@ -23,8 +24,8 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
 
     Means and covariances follow the CTRA model. The survival probability p_s holds for one nominal period of the
     stream: over dt it is ``p_s ** (dt / period)``, so that a stream at twice the rate does not forget twice as fast.
-        Components that a silent stream
-    has carried past their limits (`max_misses`, `poisson_steps`) are removed before they could be associated.
+    Components that a silent stream has carried past their limits (`max_misses`, `poisson_steps`) are removed before
+    they could be associated.
 
     Args:
         density: posterior of the last frame.
@@ -34,34 +35,127 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     Returns:
         The predicted density and how many covariances had to be repaired.
     """
-    if density.stamp_ns == NO_FRAME:
-        return replace(density, stamp_ns=stamp_ns), 0
-    dt = (stamp_ns - density.stamp_ns) * 1e-9
-    if dt == 0.0:
-        return density, 0
     bernoulli, poisson = density.bernoulli, density.poisson
-    # The frame at hand may still bring the detection that is missing, hence one period less.
-    silent = whole_periods(bernoulli.seen_ns, stamp_ns, table.period) - 1 > table.max_misses[bernoulli.label]
-    if silent.any():
-        bernoulli = bernoulli.take(~silent)
-    stale = whole_periods(poisson.born_ns, stamp_ns, table.period) - 1 > table.poisson_steps[poisson.label]
-    if stale.any():
-        poisson = poisson.take(~stale)
+    dt = 0.0 if density.stamp_ns == NO_FRAME else (stamp_ns - density.stamp_ns) * 1e-9
+    if dt == 0.0:
+        return Density(stamp_ns, density.next_id, bernoulli, poisson), 0
     survival = table.survival ** (dt / table.period)
 
-    mean, covariance, repaired_mb = _carry(bernoulli.mean, bernoulli.covariance, bernoulli.label, dt, table)
-    bernoulli = replace(
-        bernoulli, mean=mean, covariance=covariance, existence=bernoulli.existence * survival[bernoulli.label]
+    kept, mean, covariance, existence, repaired_mb = _carry(
+        bernoulli, bernoulli.existence, bernoulli.seen_ns, table.max_misses, survival, dt, stamp_ns, table
     )
-    mean, covariance, repaired_ppp = _carry(poisson.mean, poisson.covariance, poisson.label, dt, table)
-    poisson = replace(poisson, mean=mean, covariance=covariance, weight=poisson.weight * survival[poisson.label])
-    predicted = Density(stamp_ns=stamp_ns, next_id=density.next_id, bernoulli=bernoulli, poisson=poisson)
-    return predicted, repaired_mb + repaired_ppp
+    if kept.shape[0] < len(bernoulli):
+        bernoulli = bernoulli.take(kept)
+    bernoulli = Bernoullis(
+        mean=mean,
+        covariance=covariance,
+        existence=existence,
+        label=bernoulli.label,
+        auxiliary=bernoulli.auxiliary,
+        id=bernoulli.id,
+        born_ns=bernoulli.born_ns,
+        seen_ns=bernoulli.seen_ns,
+        score=bernoulli.score,
+        evidence=bernoulli.evidence,
+        extracted=bernoulli.extracted,
+    )
+    if not len(poisson):
+        return Density(stamp_ns, density.next_id, bernoulli, poisson), repaired_mb
+    kept, mean, covariance, weight, repaired_ppp = _carry(
+        poisson, poisson.weight, poisson.born_ns, table.poisson_steps, survival, dt, stamp_ns, table
+    )
+    if kept.shape[0] < len(poisson):
+        poisson = poisson.take(kept)
+    poisson = Poissons(mean, covariance, weight, poisson.label, poisson.auxiliary, poisson.born_ns)
+    return Density(stamp_ns, density.next_id, bernoulli, poisson), repaired_mb + repaired_ppp
 
 
 def _carry(
-    mean: Array, covariance: Array, label: NDArray[np.int64], dt: float, table: ClassTable
-) -> tuple[Array, Array, int]:
-    mean_out, covariance_out = np.empty_like(mean), np.empty_like(covariance)
-    repaired = predict_states(mean, covariance, label, dt, table.process_noise, mean_out, covariance_out)
-    return mean_out, covariance_out, repaired
+    rows: Bernoullis | Poissons,
+    weight: Array,
+    since_ns: Index,
+    limit: Index,
+    survival: Array,
+    dt: float,
+    stamp_ns: int,
+    table: ClassTable,
+) -> tuple[Index, Array, Array, Array, int]:
+    """Predict the rows within their limit: which they are, their mean, covariance and weight, and the repairs."""
+    count = weight.shape[0]
+    kept, mean, covariance = np.empty(count, np.int64), np.empty((count, STATE)), np.empty((count, STATE, STATE))
+    carried = np.empty(count)
+    left, repaired = predict_components(
+        rows.mean,
+        rows.covariance,
+        rows.label,
+        weight,
+        since_ns,
+        limit,
+        survival,
+        dt,
+        stamp_ns,
+        table.period,
+        table.process_noise,
+        kept,
+        mean,
+        covariance,
+        carried,
+    )
+    return kept[:left], mean[:left], covariance[:left], carried[:left], repaired
+
+
+@kernel
+def predict_components(
+    mean: Array,
+    covariance: Array,
+    label: Index,
+    weight: Array,
+    since_ns: Index,
+    limit: Index,
+    survival: Array,
+    dt: float,
+    stamp_ns: int,
+    period: float,
+    process_noise: Array,
+    kept: Index,
+    mean_out: Array,
+    covariance_out: Array,
+    weight_out: Array,
+) -> tuple[int, int]:
+    """Predict the components that are within the limit of their class.
+
+    Args:
+        mean: (N, 6) posterior means.
+        covariance: (N, 6, 6) posterior covariances.
+        label: (N,) classes.
+        weight: (N,) existence probability r or weight mu.
+        since_ns: (N,) stamp from which periods are counted.
+        limit: (C,) periods after which a component goes.
+        survival: (C,) p_s over dt.
+        dt: time to predict over, s, positive.
+        stamp_ns: stamp of the new frame.
+        period: nominal period, s.
+        process_noise: (C, 6) standard deviations per square root of a second.
+        kept: (N,) receives the rows that stay, in front.
+        mean_out: (N, 6) receives m_+ of those.
+        covariance_out: (N, 6, 6) receives P_+.
+        weight_out: (N,) receives ``weight p_s``.
+
+    Returns:
+        How many rows stay, and how many covariances had to be repaired.
+    """
+    root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
+    count, repaired = 0, 0
+    for n in range(mean.shape[0]):
+        c = label[n]
+        # The frame at hand may still bring the detection that is missing, hence one period less.
+        if whole_periods(since_ns[n], stamp_ns, period) - 1 > limit[c]:
+            continue
+        kept[count] = n
+        weight_out[count] = weight[n] * survival[c]
+        if predict_state(
+            mean[n], covariance[n], dt, process_noise[c], root, points, mean_out[count], covariance_out[count]
+        ):
+            repaired += 1
+        count += 1
+    return count, repaired

@@ -6,13 +6,15 @@ depends on the order in which a detector lists its boxes.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.geometry import box_iou
+from optipmb.geometry import iou_exceeds
+from optipmb.neighbours import NOBODY, block, empty_torus, insert
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from optipmb.table import ClassTable
 
     Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +45,8 @@ class Measurements:
     velocity: Array
     auxiliary: Array
     score: Array
-    label: NDArray[np.int64]
-    source: NDArray[np.int64]
+    label: Index
+    source: Index
 
     def __len__(self) -> int:
         return len(self.score)
@@ -55,27 +58,129 @@ def preprocess(frame: Frame, table: ClassTable) -> tuple[Measurements, int, int]
     Returns:
         The measurements, the number below the score filter and the number suppressed.
     """
-    above = np.flatnonzero(frame.score >= table.score_filter[frame.label])
-    center, size, yaw = frame.center[above], frame.size[above], frame.yaw[above]
-    score, label, source = frame.score[above], frame.label[above], frame.source[above]
-    keys = (source, yaw, size[:, 2], size[:, 1], size[:, 0], center[:, 2], center[:, 1], center[:, 0], -score)
-    order = np.lexsort(keys)  # the last key counts most
-    boxes = np.column_stack((center[:, :2], size[:, :2], yaw))[order]
-    keep = order[non_maximum_suppression(boxes, label[order], table.nms_iou)]
-    measurements = Measurements(
-        position=center[keep, :2].copy(),
-        yaw=yaw[keep],
-        velocity=frame.velocity[above][keep],
-        auxiliary=np.column_stack((size[keep], center[keep, 2])),
-        score=score[keep],
-        label=label[keep],
-        source=source[keep],
+    count = frame.score.shape[0]
+    chosen = np.empty(count, np.int64)
+    above, kept = select(
+        frame.center,
+        frame.size,
+        frame.yaw,
+        frame.score,
+        frame.label,
+        frame.source,
+        table.score_filter,
+        table.nms_iou,
+        chosen,
     )
-    return measurements, frame.score.shape[0] - above.shape[0], above.shape[0] - keep.shape[0]
+    measurements = Measurements(
+        position=np.empty((kept, 2)),
+        yaw=np.empty(kept),
+        velocity=np.empty((kept, 2)),
+        auxiliary=np.empty((kept, 4)),
+        score=np.empty(kept),
+        label=np.empty(kept, np.int64),
+        source=np.empty(kept, np.int64),
+    )
+    gather(
+        chosen,
+        frame.center,
+        frame.size,
+        frame.yaw,
+        frame.velocity,
+        frame.score,
+        frame.label,
+        frame.source,
+        measurements.position,
+        measurements.yaw,
+        measurements.velocity,
+        measurements.auxiliary,
+        measurements.score,
+        measurements.label,
+        measurements.source,
+    )
+    return measurements, count - above, above - kept
 
 
 @kernel
-def non_maximum_suppression(boxes: Array, label: NDArray[np.int64], threshold: Array) -> NDArray[np.bool_]:
+def select(
+    center: Array,
+    size: Array,
+    yaw: Array,
+    score: Array,
+    label: Index,
+    source: Index,
+    score_filter: Array,
+    nms_iou: Array,
+    chosen: Index,
+) -> tuple[int, int]:
+    """Write the rows of the measurements, in their order, to the front of `chosen` (M,).
+
+    Returns:
+        How many rows pass the score filter, and how many of those the suppression too.
+    """
+    above = 0
+    for m in range(score.shape[0]):
+        if score[m] >= score_filter[label[m]]:
+            chosen[above] = m
+            above += 1
+    order = chosen[:above]
+    sort_canonically(order, score, center, size, yaw, source)
+    boxes = np.empty((above, 5))
+    ordered_label = np.empty(above, np.int64)
+    for k in range(above):
+        m = order[k]
+        boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = center[m, 0], center[m, 1], size[m, 0], size[m, 1]
+        boxes[k, 4] = yaw[m]
+        ordered_label[k] = label[m]
+    keep = non_maximum_suppression(boxes, ordered_label, nms_iou)
+    kept = 0
+    for k in range(above):
+        if keep[k]:
+            chosen[kept] = chosen[k]
+            kept += 1
+    return above, kept
+
+
+@kernel
+def precedes(m: int, n: int, score: Array, center: Array, size: Array, yaw: Array, source: Index) -> bool:
+    """Tell whether detection m stands before n: by falling score, then by coordinates, size, yaw and place."""
+    if score[m] != score[n]:
+        return bool(score[m] > score[n])
+    for s in range(3):
+        if center[m, s] != center[n, s]:
+            return bool(center[m, s] < center[n, s])
+    for s in range(3):
+        if size[m, s] != size[n, s]:
+            return bool(size[m, s] < size[n, s])
+    if yaw[m] != yaw[n]:
+        return bool(yaw[m] < yaw[n])
+    return bool(source[m] < source[n])
+
+
+@kernel
+def sort_canonically(order: Index, score: Array, center: Array, size: Array, yaw: Array, source: Index) -> None:
+    """Sort the rows in `order` in place by `precedes`: a merge sort, runs of 1, 2, 4 … rows at a time."""
+    count = order.shape[0]
+    merged = np.empty(count, np.int64)
+    width = 1
+    while width < count:
+        for begin in range(0, count, 2 * width):
+            middle, end = min(begin + width, count), min(begin + 2 * width, count)
+            left, right = begin, middle
+            for k in range(begin, end):
+                if right == end or (
+                    left < middle and not precedes(order[right], order[left], score, center, size, yaw, source)
+                ):
+                    merged[k] = order[left]
+                    left += 1
+                else:
+                    merged[k] = order[right]
+                    right += 1
+        order[:] = merged
+        width *= 2
+
+
+@kernel
+def non_maximum_suppression(boxes: Array, label: Index, threshold: Array) -> NDArray[np.bool_]:
     """Keep each box unless a kept box of its class before it overlaps it by more than the threshold of the class.
 
     Args:
@@ -88,19 +193,55 @@ def non_maximum_suppression(boxes: Array, label: NDArray[np.int64], threshold: A
     """
     count = boxes.shape[0]
     keep = np.ones(count, np.bool_)
-    # A sweep along x: boxes whose circles cannot touch are never compared.
-    by_x = np.argsort(boxes[:, 0])
-    place = np.empty(count, np.int64)
-    place[by_x] = np.arange(count)
-    radius = 0.5 * np.hypot(boxes[:, 2], boxes[:, 3])
-    largest = radius.max() if count else 0.0
+    radius = np.empty(count)
+    widest = np.zeros(threshold.shape[0])
     for m in range(count):
-        reach = radius[m] + largest
-        for step in (-1, 1):
-            p = place[m] + step
-            while 0 <= p < count and keep[m] and abs(boxes[by_x[p], 0] - boxes[m, 0]) <= reach:
-                k = by_x[p]
-                if k < m and keep[k] and label[k] == label[m] and box_iou(boxes[k], boxes[m]) > threshold[label[m]]:
-                    keep[m] = False
-                p += step
+        radius[m] = 0.5 * math.hypot(boxes[m, 2], boxes[m, 3])
+        widest[label[m]] = max(widest[label[m]], radius[m])
+    # Only kept boxes stand in the torus; the cells of a class are as wide as two of its boxes reach.
+    head, following, side = empty_torus(count)
+    for m in range(count):
+        cell_size = 2.0 * widest[label[m]]
+        first_x, last_x, first_y, last_y = block(boxes[m, 0], boxes[m, 1], radius[m] + widest[label[m]], cell_size)
+        for i in range(first_x, last_x + 1):
+            for j in range(first_y, last_y + 1):
+                k = head[(i & (side - 1)) * side + (j & (side - 1))]
+                while k != NOBODY and keep[m]:
+                    if label[k] == label[m]:
+                        dx, dy, reach = boxes[k, 0] - boxes[m, 0], boxes[k, 1] - boxes[m, 1], radius[k] + radius[m]
+                        if dx * dx + dy * dy < reach * reach and iou_exceeds(boxes[k], boxes[m], threshold[label[m]]):
+                            keep[m] = False
+                    k = following[k]
+        if keep[m]:
+            insert(head, following, side, m, boxes[m, 0], boxes[m, 1], cell_size)
     return keep
+
+
+@kernel
+def gather(
+    chosen: Index,
+    center: Array,
+    size: Array,
+    yaw: Array,
+    velocity: Array,
+    score: Array,
+    label: Index,
+    source: Index,
+    position_out: Array,
+    yaw_out: Array,
+    velocity_out: Array,
+    auxiliary_out: Array,
+    score_out: Array,
+    label_out: Index,
+    source_out: Index,
+) -> None:
+    """Copy the chosen detections to the columns of `Measurements`."""
+    for k in range(score_out.shape[0]):
+        m = chosen[k]
+        for s in range(2):
+            position_out[k, s] = center[m, s]
+            velocity_out[k, s] = velocity[m, s]
+        for s in range(3):
+            auxiliary_out[k, s] = size[m, s]
+        auxiliary_out[k, 3] = center[m, 2]
+        yaw_out[k], score_out[k], label_out[k], source_out[k] = yaw[m], score[m], label[m], source[m]

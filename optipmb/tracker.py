@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from operator import sub
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from optipmb.association import UNASSIGNED, associate
-from optipmb.birth import adaptive_births, measurement_births, new_objects
-from optipmb.density import NO_FRAME, Bernoullis, Density, Poissons
+from optipmb.birth import adaptive_births, first_detected_states, measurement_births
+from optipmb.density import NO_FRAME, STATE, Density, Poissons
 from optipmb.detection_probability import detection_probability
 from optipmb.errors import FrameError
-from optipmb.extract import extraction, tracks_of
+from optipmb.extract import extract
 from optipmb.hypotheses import enumerate_hypotheses
 from optipmb.lightweight import light_weight_filter
 from optipmb.predict import predict
@@ -22,16 +23,36 @@ from optipmb.table import ClassTable
 from optipmb.update import update_states
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
+    from optipmb.density import Bernoullis
     from optipmb.extract import Tracks
     from optipmb.frame import Frame, PointCloud
     from optipmb.hypotheses import Hypotheses
     from optipmb.parameters import Parameters
     from optipmb.preprocess import Measurements
+    from optipmb.prune import Survivors
 
     Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
+
+
+STAGES: Final = (
+    "predict",
+    "preprocess",
+    "detection_probability",
+    "hypotheses",
+    "associate",
+    "update",
+    "undetected",
+    "extract",
+)
+"""The stages of a step, in their order, as `Diagnostics.stage_ns` has them."""
+
+
+def _no_clock() -> int:
+    return 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +85,7 @@ class Diagnostics:
         associated: measurements given to objects.
         born: new objects.
         repaired: covariances that had lost rank in rounding and were repaired.
+        stage_ns: nanoseconds that each of `STAGES` took by the clock of the tracker; zeros without one.
     """
 
     cloud_used: bool
@@ -73,6 +95,7 @@ class Diagnostics:
     associated: int
     born: int
     repaired: int
+    stage_ns: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,19 +115,25 @@ class Tracker:
             │ preprocess         eta_sf, NMS
             │ hypotheses         eq. Misdetect, Detection, First-Time Detection Hypothesis Update; HABM
             │ associate          Hungarian algorithm on clusters
-            │ update             UKF for the pairs of the best global hypothesis
-            │ light-weight filter, prune
+            │ prune              r, misses
+            │ update             UKF for the pairs of the best global hypothesis, light-weight filter
             ▼ extract, calibrate eta_ext1, eta_ext2, eta_cnt
         lambda_u, {(r, p)} at k, tracks
 
     Attributes:
         parameters: the profile.
         modules: which modules of the paper are on.
+
+    `clock` returns nanoseconds and is read between the stages of a step for `Diagnostics.stage_ns`, as
+    `time.perf_counter_ns`; nothing else depends on it.
     """
 
-    def __init__(self, parameters: Parameters, modules: Modules | None = None) -> None:
+    def __init__(
+        self, parameters: Parameters, modules: Modules | None = None, *, clock: Callable[[], int] = _no_clock
+    ) -> None:
         self.parameters = parameters
         self.modules = modules if modules is not None else Modules()
+        self._clock = clock
         self._table = ClassTable.of(parameters)
 
     @staticmethod
@@ -127,63 +156,67 @@ class Tracker:
         """
         if density.stamp_ns != NO_FRAME and frame.stamp_ns < density.stamp_ns:
             raise FrameError("stamp_ns", f"a stamp from {density.stamp_ns} on", str(frame.stamp_ns))
-        now, table, modules = frame.stamp_ns, self._table, self.modules
+        now, table, modules, clock = frame.stamp_ns, self._table, self.modules, self._clock
+        times = [clock()]
 
         # PMB prediction
         predicted, repaired = predict(density, now, table)
         bernoulli, poisson = predicted.bernoulli, predicted.poisson
+        times.append(clock())
 
         # PMB update: measurements, detection probabilities, local hypotheses
         measurements, below_score, suppressed = preprocess(frame, table)
         n_predicted = len(poisson)
         if not modules.habm:
             poisson = poisson.join(measurement_births(measurements, now, table))
+        times.append(clock())
         cloud = frame.cloud if modules.adp else None
         p_d, p_d_poisson = self._detection_probabilities(bernoulli, poisson, cloud)
+        times.append(clock())
         hypotheses = enumerate_hypotheses(bernoulli, p_d, poisson, p_d_poisson, measurements, table)
+        times.append(clock())
 
-        # Data association
+        # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
         assigned = associate(hypotheses, len(bernoulli))
+        survivors = surviving_objects(bernoulli, p_d, assigned, hypotheses, measurements, now, table)
+        times.append(clock())
 
-        # The hypotheses of the best global hypothesis: detected and missed objects, new objects
-        old, repaired_old = self._update_objects(bernoulli, p_d, assigned, measurements)
-        free = np.ones(len(measurements), np.bool_)
-        free[assigned[assigned != UNASSIGNED]] = False
-        new, new_measurement, repaired_new = new_objects(measurements, free, hypotheses, poisson, now, table)
-
-        # Light-weight filter, then pruning of the MB: what was seen now was not missed
-        ids = predicted.next_id + np.arange(len(new))
-        objects = old.join(replace(new, id=ids))
-        measurement = np.concatenate((assigned, new_measurement))
-        objects = light_weight_filter(objects, measurement, measurements, now, density.stamp_ns, table)
-        alive = surviving_objects(objects, now, table)
-        objects, measurement = objects.take(alive), measurement[alive]
+        # Detected, missed and new objects: motion states, then the light-weight filter
+        mean, covariance, repaired_now = self._update_states(survivors, bernoulli, poisson, hypotheses, measurements)
+        objects = light_weight_filter(
+            survivors, mean, covariance, bernoulli, predicted.next_id, measurements, now, density.stamp_ns, table
+        )
+        times.append(clock())
 
         # PPP update and redundant PPP pruning
-        undetected = self._update_poisson(poisson, p_d_poisson, hypotheses, measurements, n_predicted, now)
+        undetected = self._update_poisson(poisson, p_d_poisson, n_predicted, hypotheses, measurements, now)
+        times.append(clock())
 
         # Track extraction
-        extracted = extraction(objects, now, table, two_thresholds=modules.ote)
-        objects = replace(objects, extracted=objects.extracted | extracted)
-        source = np.append(measurements.source, -1)[measurement]
-        tracks = tracks_of(objects.take(extracted), source[extracted], now, table)
+        tracks = extract(objects, survivors.measurement, measurements.source, now, table, two_thresholds=modules.ote)
+        times.append(clock())
 
-        posterior = Density(stamp_ns=now, next_id=predicted.next_id + len(new), bernoulli=objects, poisson=undetected)
+        born = len(survivors) - survivors.known
+        posterior = Density(stamp_ns=now, next_id=predicted.next_id + born, bernoulli=objects, poisson=undetected)
         diagnostics = Diagnostics(
             cloud_used=cloud is not None,
             detections=frame.score.shape[0],
             below_score=below_score,
             suppressed=suppressed,
             associated=int(np.count_nonzero(assigned != UNASSIGNED)),
-            born=len(new),
-            repaired=repaired + repaired_old + repaired_new,
+            born=born,
+            repaired=repaired + repaired_now,
+            stage_ns=tuple(map(sub, times[1:], times)),
         )
         return StepResult(posterior, tracks, diagnostics)
 
     def _detection_probabilities(
         self, bernoulli: Bernoullis, poisson: Poissons, cloud: PointCloud | None
     ) -> tuple[Array, Array]:
-        """Compute p_d(x_+) of objects and of Poisson components in one pass over the cloud."""
+        """Compute p_d(x_+) of objects and of Poisson components, in one pass over the cloud if there is one."""
+        if cloud is None:
+            p_d0 = self._table.detection
+            return p_d0[bernoulli.label], p_d0[poisson.label]
         p_d = detection_probability(
             np.concatenate((bernoulli.mean, poisson.mean)),
             np.concatenate((bernoulli.auxiliary, poisson.auxiliary)),
@@ -193,40 +226,44 @@ class Tracker:
         )
         return p_d[: len(bernoulli)], p_d[len(bernoulli) :]
 
-    def _update_objects(
-        self, bernoulli: Bernoullis, p_d: Array, assigned: Index, measurements: Measurements
-    ) -> tuple[Bernoullis, int]:
-        """Update detected objects (r = 1, UKF) and missed ones (eq. Misdetect Hypothesis Update)."""
-        mean, covariance, repaired = update_states(
-            bernoulli.mean, bernoulli.covariance, assigned, measurements, self._table
-        )
-        r = bernoulli.existence
-        missed = r * (1.0 - p_d) / (1.0 - r + r * (1.0 - p_d))
-        existence = np.where(assigned != UNASSIGNED, 1.0, missed)
-        return replace(bernoulli, mean=mean, covariance=covariance, existence=existence), repaired
+    def _update_states(
+        self,
+        survivors: Survivors,
+        bernoulli: Bernoullis,
+        poisson: Poissons,
+        hypotheses: Hypotheses,
+        measurements: Measurements,
+    ) -> tuple[Array, Array, int]:
+        """Compute the motion states of the posterior: by the UKF for known objects, as births for new ones."""
+        count, known = len(survivors), survivors.known
+        mean, covariance = np.empty((count, STATE)), np.empty((count, STATE, STATE))
+        repaired = update_states(survivors, bernoulli, measurements, self._table, mean[:known], covariance[:known])
+        if known < count:
+            rows = survivors.measurement[known:]
+            repaired += first_detected_states(
+                rows, measurements, hypotheses, poisson, self._table, mean[known:], covariance[known:]
+            )
+        return mean, covariance, repaired
 
     def _update_poisson(
         self,
         poisson: Poissons,
         p_d: Array,
+        n_predicted: int,
         hypotheses: Hypotheses,
         measurements: Measurements,
-        n_predicted: int,
         now: int,
     ) -> Poissons:
-        """Update the PPP and prune it.
-
-        The weight of an undetected object is ``mu_+ (1 - p_d)``. The paper's eq. PPP Update prints ``mu_+ p_d``,
-        which is the weight of an object that was detected; the standard PMBM recursion, and the sense of the
-        sentence around it, is the former.
-        """
+        """Update the PPP, prune it and add the births that later frames may find (HABM)."""
         if not self.modules.rpp:
             return Poissons.empty()
-        updated = replace(poisson, weight=poisson.weight * (1.0 - p_d))
-        announced = hypotheses.announced.row
-        # A component is not used up by the very measurement that has just made it (only without HABM are there such).
-        keep = surviving_components(updated, announced[announced < n_predicted], now, self._table)
-        updated = updated.take(keep)
-        if self.modules.habm:
-            updated = updated.join(adaptive_births(measurements, hypotheses, now, self._table))
-        return updated
+        undetected = poisson
+        if len(poisson):
+            kept, weight = surviving_components(poisson, p_d, n_predicted, hypotheses, now, self._table)
+            undetected = replace(poisson.take(kept), weight=weight)
+        if not self.modules.habm:
+            return undetected
+        born = adaptive_births(measurements, hypotheses, now, self._table)
+        if not len(undetected):
+            return born
+        return undetected.join(born) if len(born) else undetected

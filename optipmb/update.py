@@ -21,7 +21,9 @@ from optipmb.motion import ORDER, SPREAD, WEIGHT, square_root, wrap
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from optipmb.density import Bernoullis
     from optipmb.preprocess import Measurements
+    from optipmb.prune import Survivors
     from optipmb.table import ClassTable
 
     Array = NDArray[np.float64]
@@ -32,25 +34,32 @@ MEASURED = 5
 
 
 def update_states(
-    mean: Array, covariance: Array, measurement: Index, measurements: Measurements, table: ClassTable
-) -> tuple[Array, Array, int]:
-    """Update states with the measurement of each; a negative index leaves the state as predicted.
+    survivors: Survivors,
+    bernoulli: Bernoullis,
+    measurements: Measurements,
+    table: ClassTable,
+    mean_out: Array,
+    covariance_out: Array,
+) -> int:
+    """Update the known objects of the posterior with their measurements; missed ones stay as predicted.
 
     Args:
-        mean: (N, 6) predicted means.
-        covariance: (N, 6, 6) predicted covariances.
-        measurement: (N,) index of the associated measurement, or -1.
+        survivors: which objects, and the measurement of each.
+        bernoulli: predicted objects.
         measurements: Z_k.
         table: parameters as columns.
+        mean_out: (K, 6) receives the means of the known objects.
+        covariance_out: (K, 6, 6) receives their covariances.
 
     Returns:
-        (N, 6) and (N, 6, 6) posterior, and how many covariances had to be repaired.
+        How many covariances had to be repaired.
     """
-    mean_out, covariance_out = np.empty_like(mean), np.empty_like(covariance)
-    repaired = ukf_updates(
-        mean,
-        covariance,
-        measurement,
+    known = survivors.known
+    repaired: int = ukf_updates(
+        survivors.row[:known],
+        survivors.measurement[:known],
+        bernoulli.mean,
+        bernoulli.covariance,
         measurements.position,
         measurements.velocity,
         measurements.yaw,
@@ -62,14 +71,28 @@ def update_states(
         mean_out,
         covariance_out,
     )
-    return mean_out, covariance_out, repaired
+    return repaired
+
+
+@kernel
+def workspace() -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Return the buffers of an update, to be used for one state after the other: root, chi, psi, nu, factor, W."""
+    return (
+        np.empty((STATE, STATE)),
+        np.empty((2 * STATE, STATE)),
+        np.empty((2 * STATE, MEASURED)),
+        np.empty(MEASURED),
+        np.empty((MEASURED, MEASURED)),
+        np.empty((STATE, MEASURED)),
+    )
 
 
 @kernel
 def ukf_updates(
+    row: Index,
+    measurement: Index,
     mean: Array,
     covariance: Array,
-    measurement: Index,
     position: Array,
     velocity: Array,
     yaw: Array,
@@ -81,15 +104,36 @@ def ukf_updates(
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
-    """Run `ukf_update` for every state with a measurement; return how many covariances had to be repaired."""
+    """Update states with the measurement of each; a negative measurement leaves the state as predicted.
+
+    Args:
+        row: (K,) state that each result is made of.
+        measurement: (K,) index of the associated measurement, or negative.
+        mean: (N, 6) predicted means.
+        covariance: (N, 6, 6) predicted covariances.
+        position: (M, 2) z_xy.
+        velocity: (M, 2) z_v.
+        yaw: (M,) z_phi.
+        label: (M,) z_c.
+        noise_position: (C,) standard deviations of z_x and z_y.
+        noise_velocity: (C,) of z_vx and z_vy.
+        noise_heading: (C,) of z_phi.
+        heading_sign_reliable: (C,) whether the sign of a measured heading can be trusted.
+        mean_out: (>= K, 6) receives the posterior means.
+        covariance_out: (>= K, 6, 6) receives the posterior covariances.
+
+    Returns:
+        How many covariances had to be repaired.
+    """
     repaired = 0
     z = np.empty(MEASURED)
     sigma = np.empty(MEASURED)
-    for n in range(mean.shape[0]):
-        m = measurement[n]
+    buffers = workspace()
+    for k in range(row.shape[0]):
+        n, m = row[k], measurement[k]
         if m < 0:
-            mean_out[n] = mean[n]
-            covariance_out[n] = covariance[n]
+            mean_out[k] = mean[n]
+            covariance_out[k] = covariance[n]
             continue
         c = label[m]
         z[0], z[1], z[4] = position[m, 0], position[m, 1], yaw[m]
@@ -97,7 +141,8 @@ def ukf_updates(
         sigma[0] = sigma[1] = noise_position[c]
         sigma[2] = sigma[3] = noise_velocity[c]
         sigma[4] = noise_heading[c]
-        if ukf_update(mean[n], covariance[n], z, sigma, heading_sign_reliable[c], mean_out[n], covariance_out[n]) > 0:
+        sign = heading_sign_reliable[c]
+        if ukf_update(mean[n], covariance[n], z, sigma, sign, buffers, mean_out[k], covariance_out[k]) > 0:
             repaired += 1
     return repaired
 
@@ -109,6 +154,7 @@ def ukf_update(
     z: Array,
     sigma: Array,
     heading_sign: bool,
+    buffers: tuple[Array, Array, Array, Array, Array, Array],
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
@@ -123,6 +169,7 @@ def ukf_update(
         z: (5,) z_M; NaN at 2 and 3 where the velocity is unknown.
         sigma: (5,) standard deviations of the measurement noise, ``R = diag(sigma^2)``.
         heading_sign: whether the sign of the measured heading can be trusted.
+        buffers: of `workspace`; what they hold does not matter.
         mean_out: (6,) receives m.
         covariance_out: (6, 6) receives P.
 
@@ -131,14 +178,12 @@ def ukf_update(
     """
     with_velocity = not (math.isnan(z[2]) or math.isnan(z[3]))
     size = MEASURED if with_velocity else 3
-    root = np.empty((STATE, STATE))
+    root, chi, psi, innovation, factor, weighted = buffers
     repaired = square_root(covariance, root)
     v, phi = mean[V], mean[PHI]
 
     # Deviations of the sigma points (chi) and of their measurements (psi) from the centre.
-    chi = np.empty((2 * STATE, STATE))
-    psi = np.empty((2 * STATE, size))
-    innovation = np.zeros(size)
+    innovation[:] = 0.0
     vx0, vy0 = v * math.cos(phi), v * math.sin(phi)
     for i in range(2 * STATE):
         step = SPREAD if i % 2 == 0 else -SPREAD
@@ -163,7 +208,6 @@ def ukf_update(
     innovation[size - 1] = wrap(turn) if heading_sign else 0.5 * wrap(2.0 * turn)
 
     # S = Psi' W Psi + R, factored in place; then W = C L^-T and u = L^-1 nu.
-    factor = np.empty((size, size))
     for r in range(size):
         for s in range(r + 1):
             value = 0.0
@@ -180,7 +224,6 @@ def ukf_update(
         for k in range(r):
             innovation[r] -= factor[r, k] * innovation[k]
         innovation[r] /= factor[r, r]
-    weighted = np.empty((STATE, size))
     for s in range(STATE):
         for r in range(size):
             value = 0.0

@@ -19,7 +19,6 @@ from optipmb.hypotheses import (
     FROM_POISSON,
     NEWBORN,
     Hypotheses,
-    Pairs,
     detection_costs,
     first_detections,
     gate,
@@ -46,8 +45,7 @@ def test_the_gate_holds_every_pair_of_a_class_within_the_distance(seed: int, cou
     position, measured = rng.normal(0, 4, (40, 2)), rng.integers(0, 2, 40)
     position[:3] = position[0]  # several at one place
     distance, noise = np.array([1.5, 5.0]), np.array([0.2, 0.7])
-    by_x = np.argsort(position[:, 0], kind="stable")
-    found = gate(mean, covariance, label, position, measured, by_x, distance, noise)
+    found = gate(mean, covariance, label, position, measured, distance, noise)
     wanted = [
         (n, m)
         for n in range(count)
@@ -63,8 +61,7 @@ def test_the_edge_of_the_gate_is_inside() -> None:
     """A measurement at exactly the gating distance passes, on all sides; one float farther does not."""
     position = np.array([[3.0, 0], [-3, 0], [0, 3], [0, -3], [np.nextafter(3, 4), 0], [-np.nextafter(3, 4), 0]])
     arguments = np.zeros((1, 6)), np.eye(6)[None], np.zeros(1, np.int64), position, np.zeros(6, np.int64)
-    by_x = np.argsort(position[:, 0], kind="stable")
-    _, measurement, _ = gate(*arguments, by_x, np.array([3.0]), np.array([1.0]))
+    _, measurement, _ = gate(*arguments, np.array([3.0]), np.array([1.0]))
     np.testing.assert_array_equal(measurement, [0, 1, 2, 3])
 
 
@@ -96,15 +93,16 @@ def test_costs_stay_finite_where_likelihoods_vanish() -> None:
 def test_each_kind_of_first_detection_has_its_formula() -> None:
     """Poisson components in the gate, a low score without, a high score without."""
     log_e = np.log([0.2, 0.3, 0.05])
-    clutter, birth = np.full(4, 0.01), np.full(4, 0.002)
+    clutter, birth = np.array([np.nan, 0.01]), np.array([np.nan, 0.002])
     kind, cost, existence = first_detections(
         np.array([0, 0, 3]),
         log_e,
         np.array([0.9, 0.1, 0.5, 0.1]),
         np.array([0, 0, 0.25, 1.0]),
+        np.ones(4, np.int64),
         clutter,
         birth,
-        np.full(4, 0.5),
+        np.array([np.nan, 0.5]),
     )
     np.testing.assert_array_equal(kind, [FROM_POISSON, CLUTTER, NEWBORN, FROM_POISSON])
     wanted = [-math.log(0.5 + 0.01), -math.log(0.01), -math.log(0.002 * 0.75 + 0.01), -math.log(0.05 + 0.01)]
@@ -117,7 +115,8 @@ def test_each_kind_of_first_detection_has_its_formula() -> None:
 def test_first_detections_hold_over_all_magnitudes(log_e: list[float]) -> None:
     """E is summed as logarithms: no overflow, no underflow, r in [0, 1]."""
     arguments = np.zeros(len(log_e), np.int64), np.array(log_e), np.array([0.5]), np.zeros(1)
-    _, cost, existence = first_detections(*arguments, np.array([1e-3]), np.array([1e-4]), np.array([0.5]))
+    table = np.array([1e-3]), np.array([1e-4]), np.array([0.5])
+    _, cost, existence = first_detections(*arguments, np.zeros(1, np.int64), *table)
     total = np.logaddexp.reduce([*log_e, math.log(1e-3)])
     assert cost[0] == pytest.approx(-total, rel=1e-10, abs=1e-10)
     assert existence[0] == pytest.approx(math.exp(np.logaddexp.reduce(log_e) - total), rel=1e-9, abs=1e-300)
@@ -126,10 +125,19 @@ def test_first_detections_hold_over_all_magnitudes(log_e: list[float]) -> None:
 def hypotheses(cost: Array, first: Array) -> Hypotheses:
     """The hypotheses of a cost matrix (N, M), infinite where the gate is closed."""
     row, measurement = np.nonzero(np.isfinite(cost))
-    pairs = Pairs(row, measurement, np.zeros(row.size))
-    nothing = Pairs(NO_INDEX, NO_INDEX, NOTHING)
     kind = np.full(first.size, CLUTTER)
-    return Hypotheses(pairs, cost[row, measurement], nothing, NOTHING, kind, first, np.zeros(first.size), NOTHING)
+    return Hypotheses(
+        row,
+        measurement,
+        cost[row, measurement],
+        NO_INDEX,
+        NO_INDEX,
+        NOTHING,
+        kind,
+        first,
+        np.zeros(first.size),
+        NOTHING,
+    )
 
 
 def total(cost: Array, first: Array, assigned: NDArray[np.int64]) -> float:

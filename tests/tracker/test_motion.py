@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
 
-from optipmb.motion import ORDER, TINY_PIVOT, ctra_displacement, predict_states, square_root, wrap
+from optipmb.motion import ORDER, TINY_PIVOT, ctra_displacement, predict_state, square_root, wrap
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -109,11 +109,11 @@ def test_a_covariance_without_full_rank_is_repaired_and_counted() -> None:
 
 
 def predicted(mean: Array, covariance: Array, dt: float, noise: Array) -> tuple[Array, Array]:
-    """One state through the kernel; its class is the second of two."""
-    table = np.stack([np.full(6, np.nan), noise])
-    out, spread = np.full((1, 6), np.nan), np.full((1, 6, 6), np.nan)
-    assert predict_states(mean[None], covariance[None], np.array([1]), dt, table, out, spread) == 0
-    return out[0], spread[0]
+    """One state through the kernel, with buffers that hold rubbish."""
+    root, points = np.full((6, 6), np.nan), np.full((12, 6), np.nan)
+    out, spread = np.full(6, np.nan), np.full((6, 6), np.nan)
+    assert predict_state(mean, covariance, dt, noise, root, points, out, spread) == 0
+    return out, spread
 
 
 @pytest.mark.parametrize("dt", [1e-3, 0.1, 0.5, 2.0])

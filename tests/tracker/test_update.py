@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from optipmb.birth import birth_states
-from optipmb.update import moment_match, ukf_update, ukf_updates
+from optipmb.update import moment_match, ukf_update, ukf_updates, workspace
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,10 @@ def updated(mean: Array, covariance: Array, z: textbook.Measurement, c: SimpleNa
     sigma = np.array([r.position, r.position, r.velocity, r.velocity, r.heading])
     vector = np.array([*z.xy, *velocity, z.yaw])
     out, spread = np.full(6, np.nan), np.full((6, 6), np.nan)
-    assert ukf_update(mean, covariance, vector, sigma, c.heading_sign_reliable, out, spread) == 0
+    buffers = workspace()
+    for buffer in buffers:
+        buffer[:] = np.nan  # what they hold does not matter
+    assert ukf_update(mean, covariance, vector, sigma, c.heading_sign_reliable, buffers, out, spread) == 0
     return out, spread
 
 
@@ -119,12 +122,13 @@ def test_states_without_a_measurement_stay_as_predicted() -> None:
     mean, covariance = np.stack([m for m, _ in states]), np.stack([p for _, p in states])
     zs = [measurement(rng, mean[2], velocity=True), measurement(rng, mean[0], velocity=False)]
     classes = [noise(rng, heading_sign=True), noise(rng, heading_sign=False)]
-    chosen, label = np.array([1, -1, 0, -1]), np.array([1, 0])
-    out, spread = np.full_like(mean, np.nan), np.full_like(covariance, np.nan)
+    rows, chosen, label = np.array([0, 1, 2, 3, 0]), np.array([1, -1, 0, -1, -1]), np.array([1, 0])
+    out, spread = np.full((5, 6), np.nan), np.full((5, 6, 6), np.nan)
     ukf_updates(
+        rows,
+        chosen,
         mean,
         covariance,
-        chosen,
         np.stack([z.xy for z in zs]),
         np.stack([z.velocity if z.velocity is not None else [np.nan, np.nan] for z in zs]),
         np.array([z.yaw for z in zs]),
@@ -136,13 +140,13 @@ def test_states_without_a_measurement_stay_as_predicted() -> None:
         out,
         spread,
     )
-    for n, m in enumerate(chosen):
+    for k, (n, m) in enumerate(zip(rows, chosen, strict=True)):
         if m < 0:
-            np.testing.assert_array_equal(out[n], mean[n])
-            np.testing.assert_array_equal(spread[n], covariance[n])
+            np.testing.assert_array_equal(out[k], mean[n])
+            np.testing.assert_array_equal(spread[k], covariance[n])
         else:
             wanted = textbook.ukf_update(mean[n], covariance[n], zs[m], classes[label[m]])
-            assert_same_gaussian((out[n], spread[n]), wanted)
+            assert_same_gaussian((out[k], spread[k]), wanted)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
@@ -188,14 +192,18 @@ def test_a_mixture_is_matched_by_what_its_samples_say() -> None:
 def test_a_birth_is_the_textbook_birth(velocity: tuple[float, float] | None, yaw: float, threshold: float) -> None:
     """m0 and P0 with, without and below the speed that gives a heading."""
     known, unknown = np.arange(1.0, 7.0), np.arange(11.0, 17.0)
-    mean, covariance = birth_states(
-        np.array([[3.0, 4.0]]),
-        np.array([yaw]),
-        np.array([velocity if velocity is not None else (np.nan, np.nan)]),
+    mean, covariance = np.full((1, 6), np.nan), np.full((1, 6, 6), np.nan)
+    birth_states(
         np.array([1]),
+        np.array([[np.nan, np.nan], [3.0, 4.0]]),
+        np.array([np.nan, yaw]),
+        np.array([(9.0, 9.0), velocity if velocity is not None else (np.nan, np.nan)]),
+        np.array([0, 1]),
         np.array([99.0, threshold]),
         np.stack([np.zeros(6), known]),
         np.stack([np.zeros(6), unknown]),
+        mean,
+        covariance,
     )
     spread = known if velocity is not None else unknown
     np.testing.assert_array_equal(covariance[0], np.diag(spread**2))
