@@ -18,6 +18,7 @@ from typer.main import get_command
 import optipmb
 from optipmb_service import __version__, health, logs
 from optipmb_service.profiles import Profiles
+from optipmb_service.router import route
 from optipmb_service.service import leave, run
 from optipmb_service.settings import Loaded, SettingsInvalidError, load
 
@@ -48,6 +49,9 @@ Profile = Annotated[
     str | None, typer.Option(metavar="NAME|FILE", help="Profile of streams that no pattern in the settings names.")
 ]
 Http = Annotated[str | None, typer.Option(metavar="ADDRESS", help="Serve health and metrics there; as 127.0.0.1:8080.")]
+ZenohConfig = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Zenoh configuration (JSON5): TLS, access control, limits.")
+]
 LogFormat = Annotated[str | None, typer.Option(metavar="console|json", help="Form of the log lines on stderr.")]
 LogLevel = Annotated[str | None, typer.Option(metavar="LEVEL", help="debug, info, warning or error.")]
 
@@ -59,6 +63,7 @@ def run_command(  # noqa: PLR0913 - one argument per option of the command
     router: Router = None,
     listen: Listen = None,
     connect: Connect = None,
+    zenoh_config: ZenohConfig = None,
     instance: Instance = None,
     profile: Profile = None,
     http: Http = None,
@@ -71,6 +76,7 @@ def run_command(  # noqa: PLR0913 - one argument per option of the command
         router=router,
         listen=listen or None,
         connect=connect or None,
+        zenoh_config=zenoh_config,
         instance=instance,
         profile=profile,
         http=http,
@@ -93,6 +99,7 @@ def config_command(  # noqa: PLR0913 - one argument per option of the command
     router: Router = None,
     listen: Listen = None,
     connect: Connect = None,
+    zenoh_config: ZenohConfig = None,
     instance: Instance = None,
     profile: Profile = None,
     http: Http = None,
@@ -106,6 +113,7 @@ def config_command(  # noqa: PLR0913 - one argument per option of the command
         router=router,
         listen=listen or None,
         connect=connect or None,
+        zenoh_config=zenoh_config,
         instance=instance,
         profile=profile,
         http=http,
@@ -124,6 +132,35 @@ def config_command(  # noqa: PLR0913 - one argument per option of the command
         typer.echo(f"\n[{name}]  # {loaded.sources[name]}")
         for key, value in values[name].items():
             typer.echo(f"{_toml(key) if name == 'profiles' else key} = {_toml(value)}")
+
+
+@app.command("router")
+def router_command(
+    *,
+    settings: SettingsFile = None,
+    listen: Listen = None,
+    connect: Connect = None,
+    zenoh_config: ZenohConfig = None,
+    instance: Instance = None,
+    http: Http = None,
+    log_format: LogFormat = None,
+    log_level: LogLevel = None,
+) -> None:
+    """Run a Zenoh router alone, without tracking, until SIGINT or SIGTERM."""
+    loaded = _load(
+        settings,
+        router=True,
+        listen=listen or None,
+        connect=connect or None,
+        zenoh_config=zenoh_config,
+        instance=instance,
+        http=http,
+        log_format=log_format,
+        log_level=log_level,
+    )
+    logs.configure(loaded.settings.log_format, loaded.settings.log_level)
+    logs.unknown_environment(loaded.unknown)
+    leave(route(loaded.settings))
 
 
 @app.command("health")

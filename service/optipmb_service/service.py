@@ -32,7 +32,7 @@ from optipmb_service.problems import Desk
 from optipmb_service.queries import Queries
 from optipmb_service.registry import Registry
 from optipmb_service.transport import Transport
-from optipmb_service.vitals import BEAT_S, Vitals
+from optipmb_service.vitals import BEAT_S, Vitals, shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -180,7 +180,7 @@ async def run(settings: Settings, profiles: Profiles) -> int:
     log.info("starting", instance=settings.instance, version=__version__, profiles=profiles.names)
     vitals = Vitals(settings.instance)
     try:
-        with _http(settings, vitals):
+        with shown(settings, vitals):
             beating = loop.create_task(_beat(vitals))
             try:
                 return await _serve(settings, profiles, asked, arm, vitals)
@@ -208,7 +208,7 @@ async def _serve(
     if service is None:
         return 0
     service.start()
-    vitals.serve(service)
+    vitals.report(service)
     endpoints = ",".join((*settings.endpoints, *settings.connect))
     print(f"ready instance={settings.instance} endpoints={endpoints}", flush=True)  # noqa: T201 - what starters wait for
     log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
@@ -234,26 +234,6 @@ async def _beat(vitals: Vitals) -> None:
     while True:
         vitals.beat()
         await asyncio.sleep(BEAT_S)
-
-
-@contextlib.contextmanager
-def _http(settings: Settings, vitals: Vitals) -> Iterator[None]:
-    """Answer over HTTP, where that is asked for.
-
-    Raises:
-        HttpError: the address cannot be listened on.
-    """
-    if not settings.http:
-        yield
-        return
-    from optipmb_service.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
-
-    server = Server(application(vitals), settings.http)
-    log.info("http", address=server.address)
-    try:
-        yield
-    finally:
-        server.close()
 
 
 async def _passed(event: asyncio.Event, seconds: float) -> None:

@@ -13,6 +13,7 @@ import re
 import socket
 import tomllib
 from dataclasses import dataclass
+from pathlib import Path  # noqa: TC003 - pydantic reads the annotation
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from optipmb_schemas import DEFAULT, Limits
@@ -28,7 +29,6 @@ from pydantic_settings import (
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
 PREFIX: Final = "OPTIPMB_"
 DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"
@@ -120,6 +120,11 @@ class Settings(BaseSettings):
         default=None, description=f"endpoints to listen on; default: `{DEFAULT_LISTEN}` as a router, none as a client"
     )
     connect: Endpoints = Field(default=(), description="endpoints of the routers to connect to; retried for ever")
+    zenoh_config: Path | None = Field(
+        default=None,
+        description="Zenoh configuration file (JSON5) for what has no setting here: TLS, access control, limits of a"
+        " router; the settings hold over it",
+    )
     shared_memory: bool = Field(
         default=False,
         description="Zenoh's implicit shared memory; faster for clouds on one host, but it may lose messages and leaves"

@@ -31,6 +31,7 @@ from optipmb_service.ports import Packet, TransportError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
+    from pathlib import Path
 
     from optipmb_service.ports import Request
     from optipmb_service.settings import Settings
@@ -82,7 +83,7 @@ def configuration(settings: Settings) -> zenoh.Config:
     """Return Zenoh's configuration for the settings.
 
     Raises:
-        TransportError: an endpoint that Zenoh cannot use.
+        TransportError: an endpoint or a file that Zenoh cannot use.
     """
     values: dict[str, object] = {
         "mode": "router" if settings.is_router else "client",
@@ -100,13 +101,44 @@ def configuration(settings: Settings) -> zenoh.Config:
     }
     if settings.is_router:
         values["connect/exit_on_failure"] = False  # a router starts without the routers that it looks for
-    config = zenoh.Config()
+    config = _base(settings.zenoh_config)
     for key, value in values.items():
         try:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
             raise TransportError(f"setting {key}: {_line(error)}") from error
     return config
+
+
+def _base(file: Path | None) -> zenoh.Config:
+    """Return what the settings are laid over."""
+    try:
+        return zenoh.Config() if file is None else zenoh.Config.from_file(file)
+    except (zenoh.ZError, OSError) as error:
+        reason = _line(error) if isinstance(error, zenoh.ZError) else str(error)
+        raise TransportError(f"Zenoh configuration {file}: {reason}") from error
+
+
+class Router:
+    """A Zenoh router and nothing else.
+
+    Args:
+        settings: endpoints, and the file with everything else.
+
+    Raises:
+        TransportError: an endpoint is in use or unusable, or the file is.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        try:
+            self._session = zenoh.open(configuration(settings))
+        except zenoh.ZError as error:
+            raise TransportError(_opening(settings, error)) from error
+
+    def close(self) -> None:
+        """Close the router; who is linked to it looks for another one."""
+        with contextlib.suppress(zenoh.ZError):
+            cast("_Closed", self._session).close()
 
 
 class Transport:
