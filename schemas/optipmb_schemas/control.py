@@ -50,7 +50,10 @@ class SessionState(Message):
 
     stream: Stream = Field(description="Name of the stream.")
     session: SessionId = Field(description="32 hexadecimal digits, as in the tracks.")
-    state: Literal["new", "running", "closed"] = Field(description="New: no frame yet.")
+    state: Literal["new", "running", "recovering", "quarantined", "closed"] = Field(
+        description="New: no frame yet. Recovering: taken up again after a restart, frames that were missed may still "
+        "come. Quarantined: tracking failed, frames are refused until a reset or another start of the publisher."
+    )
     profile: Name = Field(description="Name of the parameters in force.")
     epoch: Epoch | None = Field(default=None, description="Epoch of the newest frame.")
     seq: Count | None = Field(default=None, description="Number of the newest frame.")
@@ -58,12 +61,15 @@ class SessionState(Message):
     frames: Count = Field(default=0, description="Frames tracked.")
     duplicates: Count = Field(default=0, description="Frames that had been tracked before and were dropped.")
     late: Count = Field(default=0, description="Frames that came too late and were dropped.")
+    inserted: Count = Field(default=0, description="Late frames and clouds that were put in their place.")
+    corrected: Count = Field(default=0, description="Tracks that were published anew because of these.")
     refused: Count = Field(default=0, description="Messages that were not valid.")
     shed: Count = Field(default=0, description="Frames dropped because the queue was full.")
     gaps: Count = Field(default=0, description="Frames missing.")
-    new_epochs: Count = Field(default=0, description="How often the publisher started anew.")
+    new_epochs: Count = Field(default=0, description="How often the publisher started anew or its stamps jumped.")
     clouds_used: Count = Field(default=0, description="Frames tracked with their cloud.")
     clouds_missed: Count = Field(default=0, description="Frames that waited for a cloud in vain.")
+    repaired: Count = Field(default=0, description="Covariances that had lost rank in rounding and were repaired.")
     tracks: Count = Field(default=0, description="Tracks extracted at the newest frame.")
     bernoullis: Count = Field(default=0, description="Bernoulli components now.")
     poissons: Count = Field(default=0, description="Poisson components now.")

@@ -18,7 +18,7 @@ from optipmb_service.inbox import Inbox
 from optipmb_service.meter import Meter
 from optipmb_service.ports import Packet, TransportError
 from optipmb_service.problems import problem_of
-from optipmb_service.records import SECOND, Begun, Life, Output, Policy, Tracked
+from optipmb_service.records import SECOND, Begun, Life, Output, Policy, Quarantined, Tracked
 from optipmb_service.session import Session
 
 if TYPE_CHECKING:
@@ -178,10 +178,10 @@ class Lane:
         if self.stale and frame:
             self.stale = False
             log.info("stream_back", stream=self.stream)
+        ticket = _Ticket(packet.wall_ns, packet.now_ns, time.perf_counter_ns() - began_ns)
         if isinstance(message, schemas.Points):
-            outputs = session.on_points(message, now_ns)
+            outputs = session.on_points(message, now_ns, ticket=ticket)
         else:
-            ticket = _Ticket(packet.wall_ns, packet.now_ns, time.perf_counter_ns() - began_ns)
             outputs = session.on_detections(message, now_ns, arrived_ns=packet.now_ns, ticket=ticket)
         self._deliver(outputs)
 
@@ -205,7 +205,7 @@ class Lane:
         if self.session is None:
             self.refused += 1
         else:
-            self.session.counters.refused += 1
+            self.session.refuse()
 
     def _deliver(self, outputs: Sequence[Output]) -> None:
         for output in outputs:
@@ -220,6 +220,8 @@ class Lane:
                     profile=self.session.parameters.name if self.session else "",
                     jump_s=output.jump_ns / 1e9,
                 )
+            elif isinstance(output, Quarantined):
+                log.error("session_quarantined", stream=self.stream, error=output.error)
             else:
                 self._circle.desk.report(output, time.monotonic_ns())
 

@@ -21,7 +21,9 @@ EVENTS: Final = {
     "peer_lost": "That link is gone. A client links again by itself and recovers what the caches still hold.",
     "session_opened": "A stream sent its first valid message, or parameters were set for it.",
     "session_begun": "A density began: `first` frame, `publisher` restarted with a jump, a `jump` of stamps, `reset`, "
-    "`parameters`. Repeated jumps: check the sensor's clock.",
+    "`parameters`, a `pose` far off, the end of a `quarantine`. Repeated jumps: check the sensor's clock.",
+    "session_quarantined": "Tracking a stream raised `error`: its frames are refused until a reset or another start of "
+    "the publisher. Its last frames are saved; report them.",
     "session_closed": "A session was freed: `idle` for long, or by a `query`.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames came again.",

@@ -147,6 +147,24 @@ class Settings(BaseSettings):
     gap_limit_s: float = Field(
         default=5.0, gt=0, le=86400, description="a larger step of the stamps, ahead or back, starts the session anew"
     )
+    rewind_s: float = Field(
+        default=1.0,
+        ge=0,
+        le=60,
+        description="sensor time within which a late frame is put in its place and tracks are corrected; 0: refused",
+    )
+    late_clouds: bool = Field(
+        default=False, description="whether a cloud that comes after its frame was tracked corrects the tracks too"
+    )
+    recovery_wait_s: float = Field(
+        default=2.0, ge=0, le=60, description="after a restart, longest wait of frames behind a gap for those missing"
+    )
+    max_speed: float = Field(
+        default=100.0,
+        ge=0,
+        le=1e6,
+        description="fastest that a sensor moves, m/s; frames whose pose lies beyond are refused; 0: any pose is taken",
+    )
     queue_frames: int = Field(
         default=256, ge=1, le=65536, description="frames waiting per stream; the oldest is shed beyond it"
     )
