@@ -9,6 +9,7 @@ from optipmb_schemas.arrays import Array
 from optipmb_schemas.codec import MESSAGES, decode, encode, encode_json, encoding_of
 from optipmb_schemas.columns import pack_columns, read_columns
 from optipmb_schemas.control import (
+    MoveRequest,
     Problem,
     ResetRequest,
     ServiceStatus,
@@ -39,6 +40,7 @@ __all__ = [
     "Limits",
     "Message",
     "MessageError",
+    "MoveRequest",
     "Points",
     "Pose",
     "Problem",

@@ -42,6 +42,16 @@ class ResetRequest(Message):
     close: Flag = Field(default=False, description="End the session and free it instead of starting it anew.")
 
 
+class MoveRequest(Message):
+    """Query `service/<instance>/q/move`: give a stream to another worker process. The reply repeats it when it is done.
+
+    The move lasts until the instance is started anew. A stream may be moved before its first message.
+    """
+
+    stream: Stream = Field(description="Name of the stream.")
+    worker: Count = Field(description="Number of the worker process, from 0.")
+
+
 class SessionState(Message):
     """Reply of `q/state` and `q/reset`: the state of one session.
 
@@ -121,6 +131,9 @@ class SessionSummary(Message):
     tracks: Count = Field(default=0, description="Tracks extracted at the newest frame.")
     queue: Count = Field(default=0, description="Frames waiting now.")
     age_s: NonNegative | None = Field(default=None, description="Seconds since the last frame arrived.")
+    worker: Count | None = Field(
+        default=None, description="Number of the worker process that has the stream, where there are several."
+    )
 
 
 class ServiceStatus(Message):

@@ -15,12 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 import typer
 from typer.main import get_command
 
-import optipmb
 from optipmb_service import __version__, health, logs
-from optipmb_service.profiles import Profiles
+from optipmb_service.loops import leave
 from optipmb_service.router import route
-from optipmb_service.service import leave, run
-from optipmb_service.settings import Loaded, SettingsInvalidError, load
+from optipmb_service.settings import Loaded, Settings, SettingsInvalidError, load
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,6 +46,7 @@ Instance = Annotated[str | None, typer.Option(metavar="NAME", help="Name of this
 Profile = Annotated[
     str | None, typer.Option(metavar="NAME|FILE", help="Profile of streams that no pattern in the settings names.")
 ]
+Workers = Annotated[int | None, typer.Option(metavar="N", help="Processes that track, each a share of the streams.")]
 Http = Annotated[str | None, typer.Option(metavar="ADDRESS", help="Serve health and metrics there; as 127.0.0.1:8080.")]
 ZenohConfig = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Zenoh configuration (JSON5): TLS, access control, limits.")
@@ -66,6 +65,7 @@ def run_command(  # noqa: PLR0913 - one argument per option of the command
     zenoh_config: ZenohConfig = None,
     instance: Instance = None,
     profile: Profile = None,
+    workers: Workers = None,
     http: Http = None,
     log_format: LogFormat = None,
     log_level: LogLevel = None,
@@ -79,17 +79,14 @@ def run_command(  # noqa: PLR0913 - one argument per option of the command
         zenoh_config=zenoh_config,
         instance=instance,
         profile=profile,
+        workers=workers,
         http=http,
         log_format=log_format,
         log_level=log_level,
     )
-    try:
-        profiles = Profiles.read(loaded.settings.profile, loaded.settings.profiles)
-    except optipmb.ParameterError as error:
-        _wrong(str(error))
     logs.configure(loaded.settings.log_format, loaded.settings.log_level)
     logs.unknown_environment(loaded.unknown)
-    leave(asyncio.run(run(loaded.settings, profiles)))
+    leave(_run_one(loaded.settings) if loaded.settings.workers == 1 else _run_many(loaded.settings))
 
 
 @app.command("config")
@@ -102,6 +99,7 @@ def config_command(  # noqa: PLR0913 - one argument per option of the command
     zenoh_config: ZenohConfig = None,
     instance: Instance = None,
     profile: Profile = None,
+    workers: Workers = None,
     http: Http = None,
     log_format: LogFormat = None,
     log_level: LogLevel = None,
@@ -116,6 +114,7 @@ def config_command(  # noqa: PLR0913 - one argument per option of the command
         zenoh_config=zenoh_config,
         instance=instance,
         profile=profile,
+        workers=workers,
         http=http,
         log_format=log_format,
         log_level=log_level,
@@ -198,6 +197,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         _wrong(describe())
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _run_one(settings: Settings) -> int:
+    # Imported here, for it takes the tracker along: 150 MB and seconds that neither a parent nor a question needs.
+    from optipmb_service.worker import run_alone  # noqa: PLC0415
+
+    return run_alone(settings)
+
+
+def _run_many(settings: Settings) -> int:
+    from optipmb_service.supervisor import supervise  # noqa: PLC0415 - a process that tracks needs none
+
+    return asyncio.run(supervise(settings))
 
 
 def _load(file: Path | None, **options: Any) -> Loaded:

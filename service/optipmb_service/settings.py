@@ -171,7 +171,12 @@ class Settings(BaseSettings):
     queue_clouds: int = Field(
         default=16, ge=1, le=1024, description="point clouds kept per stream; the oldest is shed beyond it"
     )
-    threads: int = Field(default=0, ge=0, le=256, description="threads that track; 0: one per processor, at most 8")
+    workers: int = Field(
+        default=1, ge=1, le=64, description="processes that track, each a share of the streams; 1: this process itself"
+    )
+    threads: int = Field(
+        default=0, ge=0, le=256, description="threads that track, per worker; 0: one per processor, at most 8"
+    )
     max_sessions: int = Field(
         default=1000, ge=1, le=100_000, description="streams tracked at once; further ones are refused"
     )
@@ -267,6 +272,11 @@ def load(file: Path | None = None, options: Mapping[str, Any] | None = None) -> 
         raise SettingsInvalidError(f"setting {path}{where}: {message}") from error
     if not settings.endpoints and not settings.connect:
         raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
+    if settings.workers > 1 and settings.zenoh_config is not None and settings.is_router:
+        # Its access control would be deaf to the workers, which come over a socket and without a certificate.
+        raise SettingsInvalidError(
+            "setting workers: with zenoh_config, a router of its own: start `optipmb-service router` and connect to it"
+        )
     known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields}
     unknown = (name for name in os.environ if name.startswith(PREFIX) and name.split("__")[0] not in known)
     return Loaded(settings, sources, tuple(sorted(unknown)))

@@ -184,12 +184,24 @@ class Transport:
 
     def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""
-        for key, answer in (
-            (f"{self._prefix}/*/*/*/q/*", about_streams),
-            (f"{self._prefix}/service/{self._instance}/q/*", about_service),
-        ):
-            queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(CHANNEL // 16))
-            self._read("queries", queryable, queryable.handler, _answering(answer))
+        self._serve(f"{self._prefix}/*/*/*/q/*", about_streams)
+        self.serve_service(about_service)
+
+    def serve_service(self, about_service: Callable[[Request], None]) -> None:
+        """Hand over the queries about this instance alone, on a thread of its own."""
+        self._serve(f"{self._prefix}/service/{self._instance}/q/*", about_service)
+
+    def ask(self, key: str, timeout: float) -> bytes | None:
+        """Ask at a key and return the first answer; None when none comes in time (s)."""
+        with contextlib.suppress(zenoh.ZError):  # the session is closed
+            for reply in self._session.get(key, timeout=timeout):
+                if (sample := reply.ok) is not None:
+                    return bytes(sample.payload.to_bytes())
+        return None
+
+    def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
+        queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(CHANNEL // 16))
+        self._read("queries", queryable, queryable.handler, _answering(answer))
 
     def watch(self) -> None:
         """Log the nodes and routers that this session is linked to, as they come and go."""

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     import optipmb_schemas as schemas
 
+    from optipmb_service.http.app import Source
     from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
@@ -99,7 +100,7 @@ class Vitals:
 
 
 @contextmanager
-def shown(settings: Settings, vitals: Vitals) -> Iterator[None]:
+def shown(settings: Settings, source: Source) -> Iterator[None]:
     """Answer over HTTP, where that is asked for.
 
     Raises:
@@ -110,7 +111,7 @@ def shown(settings: Settings, vitals: Vitals) -> Iterator[None]:
         return
     from optipmb_service.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
 
-    server = Server(application(vitals), settings.http)
+    server = Server(application(source), settings.http)
     log.info("http", address=server.address)
     try:
         yield
