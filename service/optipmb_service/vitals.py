@@ -8,40 +8,21 @@ from __future__ import annotations
 
 import threading
 import time
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final, Protocol
-
-import structlog
+from typing import TYPE_CHECKING, Final
 
 from optipmb_service import figures
 from optipmb_service.metrics import Metrics
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     import optipmb_schemas as schemas
 
-    from optipmb_service.http.app import Source
-    from optipmb_service.settings import Settings
-
-log = structlog.get_logger("optipmb_service")
+    from optipmb_service.service import Service
 
 BEAT_S: Final = 0.5
 STUCK_S: Final = 10.0
 """A loop that has not turned for so long is taken for stuck."""
 
 USABLE: Final = frozenset({"ready", "degraded"})
-
-
-class Reporter(Protocol):
-    """What works, seen from here."""
-
-    @property
-    def state(self) -> str:
-        """How it is, as in the status."""
-
-    def status(self) -> schemas.ServiceStatus | None:
-        """Return its report; None when it makes none."""
 
 
 class Vitals:
@@ -53,7 +34,7 @@ class Vitals:
 
     def __init__(self, instance: str) -> None:
         self.metrics = Metrics()
-        self._service: Reporter | None = None
+        self._service: Service | None = None
         self._state = "starting"
         self._lock = threading.Lock()
         self._beat_ns = time.monotonic_ns()
@@ -63,8 +44,8 @@ class Vitals:
         """Say that the control loop turns."""
         self._beat_ns = time.monotonic_ns()
 
-    def report(self, service: Reporter) -> None:
-        """Say what this one says, from now on."""
+    def serve(self, service: Service) -> None:
+        """Report what this service says from now on."""
         with self._lock:
             self._service = service
 
@@ -97,23 +78,3 @@ class Vitals:
     def text(self) -> bytes:
         """Return the metrics in Prometheus' text format."""
         return self.metrics.text()
-
-
-@contextmanager
-def shown(settings: Settings, source: Source) -> Iterator[None]:
-    """Answer over HTTP, where that is asked for.
-
-    Raises:
-        HttpError: the address cannot be listened on.
-    """
-    if not settings.http:
-        yield
-        return
-    from optipmb_service.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
-
-    server = Server(application(source), settings.http)
-    log.info("http", address=server.address)
-    try:
-        yield
-    finally:
-        server.close()

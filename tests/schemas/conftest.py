@@ -6,7 +6,6 @@ from optipmb_schemas import (
     Delivery,
     Detections,
     Message,
-    MoveRequest,
     Points,
     Pose,
     Problem,
@@ -105,17 +104,7 @@ def _examples() -> list[Message]:
         refused=4,
         problems=(problem,),
     )
-    return [
-        detections,
-        points,
-        tracks,
-        state,
-        parameters,
-        ResetRequest(close=True),
-        MoveRequest(stream="a/b/c", worker=1),
-        problem,
-        status,
-    ]
+    return [detections, points, tracks, state, parameters, ResetRequest(close=True), problem, status]
 
 
 @pytest.fixture(scope="session")

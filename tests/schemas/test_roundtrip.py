@@ -13,7 +13,6 @@ from optipmb_schemas import (
     Delivery,
     Detections,
     Message,
-    MoveRequest,
     Points,
     Pose,
     Problem,
@@ -195,7 +194,6 @@ messages: dict[type[Message], st.SearchStrategy[Message]] = {
         values=st.none() | values,
     ),
     ResetRequest: st.builds(ResetRequest, close=st.booleans()),
-    MoveRequest: st.builds(MoveRequest, stream=stream, worker=st.integers(0, 63)),
     Problem: problems,
     ServiceStatus: st.builds(
         ServiceStatus,
