@@ -168,6 +168,10 @@ class Service:
             problems=self._desk.newest(),
         )
 
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
+        """Hand over what comes on a stream to a viewer, until the result is called."""
+        return self._transport.tap(stream, receive)
+
     def _summaries(self, now_ns: int) -> tuple[schemas.SessionSummary, ...]:
         summaries = (lane.summary(now_ns) for lane in self._registry.lanes())
         return tuple(summary for summary in summaries if summary is not None)
@@ -272,9 +276,10 @@ def _http(settings: Settings, vitals: Vitals) -> Iterator[None]:
     if not settings.http:
         yield
         return
-    from optipmb_service.http import Server, application  # noqa: PLC0415 - a third of a second that only this needs
+    # A third of a second that only this needs.
+    from optipmb_service.http import Server, application, page  # noqa: PLC0415
 
-    server = Server(application(vitals), settings.http)
+    server = Server(application(vitals, page(vitals)), settings.http)
     log.info("http", address=server.address)
     try:
         yield

@@ -191,7 +191,7 @@ class Settings(BaseSettings):
     grace_s: float = Field(default=1.0, ge=0, le=60, description="at the end, time for the frames already received")
     http: Annotated[str, AfterValidator(_address)] = Field(
         default="",
-        description="address of `/healthz`, `/readyz` and `/metrics`, as `127.0.0.1:8080`; default: no HTTP",
+        description="where the live page, `/healthz`, `/readyz` and `/metrics` are, as `127.0.0.1:8080`; default: none",
     )
     http_streams: int = Field(
         default=100, ge=0, le=10_000, description="streams that have series of their own in the metrics, by name"

@@ -20,7 +20,7 @@ import json
 import re
 import threading
 import time
-from typing import TYPE_CHECKING, Final, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Final, Literal, Protocol, TypeVar, cast
 
 import optipmb_schemas as schemas
 import structlog
@@ -169,6 +169,39 @@ class Transport:
         ):
             queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(CHANNEL // 16))
             self._read("queries", queryable, queryable.handler, _answering(answer))
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
+        """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
+
+        Each topic has a thread of its own, until the result is called.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        taps: list[_Undeclared] = []
+
+        def follow(topic: Literal["tracks", "detections"]) -> None:
+            def hand_over(samples: Iterable[zenoh.Sample]) -> None:
+                with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
+                    for sample in samples:
+                        receive(topic, sample.payload.to_bytes(), str(sample.encoding))
+
+            key = f"{self._prefix}/{stream}/{topic}"
+            subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
+            taps.append(subscriber)
+            threading.Thread(target=hand_over, args=(subscriber.handler,), name=f"viewer-{topic}", daemon=True).start()
+
+        def release() -> None:
+            for subscriber in taps:
+                _undeclare(subscriber)
+
+        try:
+            follow("tracks")
+            follow("detections")
+        except zenoh.ZError as error:
+            release()
+            raise TransportError(_line(error)) from error
+        return release
 
     def watch(self) -> None:
         """Log the nodes and routers that this session is linked to, as they come and go."""

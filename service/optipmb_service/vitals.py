@@ -14,6 +14,8 @@ from optipmb_service import figures
 from optipmb_service.metrics import Metrics
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import optipmb_schemas as schemas
 
     from optipmb_service.service import Service
@@ -74,6 +76,11 @@ class Vitals:
         """Return the service's own report; None while it starts."""
         service = self._service
         return None if service is None else service.status()
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
+        """Hand over what comes on a stream to a viewer, until the result is called; None while the service starts."""
+        service = self._service
+        return None if service is None else service.tap(stream, receive)
 
     def text(self) -> bytes:
         """Return the metrics in Prometheus' text format."""

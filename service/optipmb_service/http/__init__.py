@@ -1,6 +1,7 @@
 """Health, metrics and whatever else the service shows over HTTP."""
 
 from optipmb_service.http.app import Source, application
+from optipmb_service.http.page import page
 from optipmb_service.http.server import Server
 
-__all__ = ["Server", "Source", "application"]
+__all__ = ["Server", "Source", "application", "page"]

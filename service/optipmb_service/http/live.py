@@ -1,0 +1,132 @@
+"""What a viewer of a stream gets: the newest tracks and detections as one line of JSON.
+
+World frame, metres, radians, seconds; numbers are rounded to what can be seen.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+from typing import Any, Final
+
+import numpy as np
+import optipmb_schemas as schemas
+
+_MOST: Final = 1000
+"""Tracks, and detections, in one frame at most."""
+
+Sample = tuple[bytes, str]
+"""Payload and encoding."""
+
+
+class Newest:
+    """Keeps the newest message of each topic for one reader on an event loop; what nobody took is replaced.
+
+    Args:
+        loop: of the reader.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._lock = threading.Lock()
+        self._tracks: Sample | None = None
+        self._detections: Sample | None = None
+        self._event = asyncio.Event()
+        self._heard = time.monotonic()
+
+    def put(self, topic: str, payload: bytes, encoding: str) -> None:
+        """Take a message, on any thread."""
+        with self._lock:
+            if topic == "detections":
+                self._detections = (payload, encoding)
+                return  # it is shown with its tracks
+            waits = self._tracks is not None
+            self._tracks = (payload, encoding)
+        if not waits and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._event.set)
+
+    async def came(self, seconds: float) -> bool:
+        """Wait for tracks, at most so long; tell whether there are any."""
+        try:
+            await asyncio.wait_for(self._event.wait(), seconds)
+        except TimeoutError:
+            return False
+        return True
+
+    def take(self) -> tuple[Sample | None, Sample | None]:
+        """Return the newest tracks, once, and the newest detections."""
+        self.heard()
+        with self._lock:
+            self._event.clear()
+            tracks, self._tracks = self._tracks, None
+            return tracks, self._detections
+
+    def heard(self) -> None:
+        """Begin to count silence anew."""
+        self._heard = time.monotonic()
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds since something was taken."""
+        return time.monotonic() - self._heard
+
+
+def live_frame(tracks: Sample | None, detections: Sample | None) -> str | None:
+    """Return what the page draws, as JSON; None for what is no valid message."""
+    if tracks is None:
+        return None
+    try:
+        message = schemas.decode(tracks[0], schemas.Tracks, encoding=tracks[1])
+    except schemas.MessageError:
+        return None
+    rows = np.column_stack(
+        [
+            message.center[:, :2],
+            message.size[:, :2],
+            message.yaw,
+            message.velocity,
+            message.existence,
+            message.score,
+            message.age,
+            message.time_since_detection,
+        ]
+    )[:_MOST]
+    numbers = np.round(rows, 3).tolist()
+    heads = zip(message.id.tolist(), message.label.tolist(), numbers, strict=False)
+    sensor, found = _seen(detections)
+    frame: dict[str, Any] = {
+        "time": message.stamp_ns / 1e9,
+        "session": message.session,
+        "profile": message.profile,
+        "labels": message.labels,
+        "tracks": [[identity, label, *values] for identity, label, values in heads],
+        "sensor": sensor,
+        "detections": found,
+    }
+    return json.dumps(frame, separators=(",", ":"))
+
+
+def _seen(sample: Sample | None) -> tuple[list[float] | None, list[list[float]]]:
+    """Return x, y, heading of the sensor, where it is known, and x, y of the detections, in the world frame."""
+    if sample is None:
+        return None, []
+    try:
+        message = schemas.decode(sample[0], schemas.Detections, encoding=sample[1])
+    except schemas.MessageError:
+        return None, []
+    center, sensor = message.center[:_MOST], None
+    if message.pose is not None:
+        w, x, y, z = message.pose.quaternion
+        rows = np.array(  # the first two rows of the rotation: what is seen from above
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            ]
+        )
+        place = message.pose.translation[:2]
+        sensor = np.round([*place, np.arctan2(rows[1, 0], rows[0, 0])], 3).tolist()
+        if message.frame == "sensor":
+            center = center @ rows.T + place
+    return sensor, np.round(center[:, :2], 2).tolist()

@@ -1,0 +1,158 @@
+"""The page of a real service, seen by a real browser while detections come in."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+from browser import browser, console, requested, size, wait
+from optipmb_client import Publisher
+from routers import free_endpoint
+from service_process import ServiceProcess
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from selenium.webdriver import Chrome
+
+ENDPOINT, HTTP = free_endpoint(), free_endpoint().removeprefix("tcp/")
+BASE = f"http://{HTTP}"
+CARS, WALKERS = "yard/gate/lidar", "yard/hall/lidar"
+LOAD_S = 1.0
+
+
+def service() -> ServiceProcess:
+    """The service, always at the same addresses."""
+    return ServiceProcess("--listen", ENDPOINT, "--http", HTTP, "--profile", "nuscenes", listen=False)
+
+
+@contextlib.contextmanager
+def publishing(stream: str, label: str, length: float) -> Iterator[None]:
+    """Publish three objects that go in circles around a sensor, ten times a second."""
+    over = threading.Event()
+
+    def run() -> None:
+        with Publisher(stream, ENDPOINT, frame="sensor", timeout=60) as publisher:
+            while not over.wait(0.1):
+                now = time.monotonic() % 1000
+                angles = [0.3 * now + part for part in (0.0, 2.0, 4.0)]
+                publisher.publish(
+                    stamp_ns=time.time_ns(),
+                    label=[label] * 3,
+                    center=[[12 * math.cos(angle), 12 * math.sin(angle), 0.0] for angle in angles],
+                    size=[[length, 1.0, 1.6]] * 3,
+                    yaw=[angle + math.pi / 2 for angle in angles],
+                    velocity=[[-3.6 * math.sin(angle), 3.6 * math.cos(angle)] for angle in angles],
+                    score=[0.9] * 3,
+                    pose=([100.0, 50.0, 0.0], [1.0, 0.0, 0.0, 0.0]),
+                )
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
+    """A browser, and two streams for it to see."""
+    with browser(tmp_path_factory.mktemp("profile")) as found:
+        yield found
+
+
+def test_the_page_shows_live_tracks_and_survives_a_restart(chrome: Chrome, tmp_path: Path) -> None:
+    """It is a page for one who looks.
+
+    Loaded within a second; live tracks of the chosen stream, drawn where they are; figures at a tap; nothing in the
+    console, nothing from elsewhere; after a restart of the service it goes on by itself.
+    """
+    size(chrome, 1280, 800)
+    with service() as first:
+        first.wait_ready()
+        with publishing(CARS, "car", 4.0), publishing(WALKERS, "pedestrian", 1.0):
+            chrome.get("about:blank")
+            requested(chrome)  # forgets the browser's own start page
+            chrome.get(BASE)
+            assert 0 < chrome.execute_script(LOADED) < 1000 * LOAD_S
+            wait(chrome, "at('streams').rows.length === 2 && frame !== null && frame.tracks.length === 3")
+            wait(chrome, "at('state').textContent === 'ready'")
+            assert chrome.execute_script("return chosen") == CARS
+            chrome.execute_script(
+                f"[...document.querySelectorAll('td button')].find(b => b.textContent === '{WALKERS}').click()"
+            )
+            wait(
+                chrome,
+                "frame !== null && frame.tracks.length === 3 && frame.labels[frame.tracks[0][LABEL]] === 'pedestrian'",
+            )
+            assert "yard%2Fhall%2Flidar" in chrome.current_url
+            shown_moving(chrome)
+            figures(chrome)
+            assert console(chrome) == []
+            urls = requested(chrome)
+            assert f"{BASE}/look.js" in urls
+            assert {url for url in urls if not url.startswith((BASE, "data:"))} == set()
+            before = chrome.execute_script("return frame.time")
+            assert first.end()[0] == 0
+            wait(chrome, "at('state').textContent === 'no answer'")
+            with service() as second:
+                second.wait_ready()
+                wait(chrome, f"at('state').textContent === 'ready' && frame.time > {before} + 1")
+                assert chrome.execute_script("return chosen") == WALKERS
+                shown_moving(chrome)
+                refused = [line for line in console(chrome) if "net::ERR_" not in line]
+                assert refused == []
+                phone(chrome)
+
+
+LOADED = "return performance.getEntriesByType('navigation')[0].loadEventEnd"
+
+
+def shown_moving(chrome: Chrome) -> None:
+    """The first track has the colour of its id where it is, and is somewhere else a second later."""
+    wait(chrome, "!dirty && trails.get(frame.tracks[0][ID]).length > 5")
+    (r, g, b, alpha), index = chrome.execute_script(
+        "const t = frame.tracks[0]; dirty = true; draw(); const [x, y] = toScreen(t[X], t[Y]);"
+        "const copy = new OffscreenCanvas(1, 1).getContext('2d', {willReadFrequently: true});"
+        "copy.drawImage(canvas, -x, -y); return [[...copy.getImageData(0, 0, 1, 1).data], t[ID]]"
+    )
+    colours = ["0072B2", "D55E00", "009E73", "CC79A7", "56B4E9", "E69F00", "8C6D1F"]
+    want = bytes.fromhex(colours[index % 7])
+    assert alpha > 128
+    assert max(abs(a - w) for a, w in zip((r, g, b), want, strict=True)) < 140
+    assert (r, g, b) != (255, 255, 255)
+    x, y = chrome.execute_script("return [frame.tracks[0][X], frame.tracks[0][Y]]")
+    assert math.hypot(x - 100, y - 50) == pytest.approx(12, abs=1.5)
+    wait(chrome, f"Math.hypot(frame.tracks[0][X] - {x}, frame.tracks[0][Y] - {y}) > 1")
+
+
+def figures(chrome: Chrome) -> None:
+    """A tap on a track shows its existence and score; a tap beside hides them."""
+    for place, hidden in (("toScreen(frame.tracks[1][X], frame.tracks[1][Y])", False), ("[60, 20]", True)):
+        chrome.execute_script(
+            f"const [x, y] = {place}, box = canvas.getBoundingClientRect();"
+            "for (const kind of ['pointerdown', 'pointerup']) canvas.dispatchEvent(new PointerEvent(kind,"
+            "{clientX: box.x + x, clientY: box.y + y, pointerId: 1}))"
+        )
+        wait(chrome, f"at('details').hidden === {str(hidden).lower()}")
+        if not hidden:
+            text = chrome.execute_script("return at('details').innerText")
+            assert "existence" in text
+            assert "score" in text
+
+
+def phone(chrome: Chrome) -> None:
+    """On a narrow screen nothing is wider than it, and the tracks are still drawn."""
+    size(chrome, 390, 844)
+    chrome.refresh()
+    wait(chrome, "frame !== null && frame.tracks.length === 3 && canvas.width === 390")
+    assert chrome.execute_script("return document.documentElement.scrollWidth") <= 390
+    assert chrome.execute_script("return canvas.clientHeight") > 300
+    shown_moving(chrome)
