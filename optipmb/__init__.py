@@ -18,8 +18,9 @@ from optipmb.density import Bernoullis, Density, Poissons
 from optipmb.errors import DensityError, FrameError, OptipmbError, ParameterError
 from optipmb.extract import Tracks
 from optipmb.frame import Frame, PointCloud, Pose, make_frame
-from optipmb.geometry import bev_iou, points_in_boxes
+from optipmb.geometry import bev_iou
 from optipmb.parameters import Calibration, ClassParameters, Parameters, load_profile, parse_parameters, profiles
+from optipmb.points import points_in_boxes
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
 from optipmb.warm import warm_up
 

@@ -81,45 +81,117 @@ def birth_states(
             covariance_out[k, s, s] = spread[s] * spread[s]
 
 
-def announce(measurements: Measurements, rows: Index, weight: Array, stamp_ns: int, table: ClassTable) -> Poissons:
-    """Make a Poisson component of each measurement in `rows`, with the given weights; a zero weight makes none."""
-    rows, weight = rows[weight > 0.0], weight[weight > 0.0]
-    mean, covariance = np.empty((rows.shape[0], STATE)), np.empty((rows.shape[0], STATE, STATE))
-    birth_states(
-        rows,
-        measurements.position,
-        measurements.yaw,
-        measurements.velocity,
-        measurements.label,
-        table.birth_heading_speed,
-        table.birth_known,
-        table.birth_unknown,
-        mean,
-        covariance,
-    )
-    return Poissons(
-        mean=mean,
-        covariance=covariance,
-        weight=weight,
-        label=measurements.label[rows],
-        auxiliary=measurements.auxiliary[rows],
-        born_ns=np.full(rows.shape[0], stamp_ns, np.int64),
-    )
+def adaptive_births(measurements: Measurements, hypotheses: Hypotheses, table: ClassTable) -> tuple[Index, Array]:
+    """Select lambda_b: the low-scored measurements M_low and their weights ``mu_b = mu_ab (1 - p_a)`` (eq. HABM).
 
-
-def adaptive_births(measurements: Measurements, hypotheses: Hypotheses, stamp_ns: int, table: ClassTable) -> Poissons:
-    """Make lambda_b of the low-scored measurements M_low, of weight ``mu_b = mu_ab (1 - p_a)`` (eq. HABM)."""
+    Returns:
+        (K,) measurements, and (K,) weights; a zero weight makes no component.
+    """
     low = (hypotheses.first_kind == CLUTTER).nonzero()[0]
-    if not low.size:
-        return Poissons.empty()
+    if not low.shape[0]:
+        return low, np.empty(0)
     weight = table.adaptive_birth_rate[measurements.label[low]] * (1.0 - hypotheses.association[low])
-    return announce(measurements, low, weight, stamp_ns, table)
+    return low[weight > 0.0], weight[weight > 0.0]
 
 
-def measurement_births(measurements: Measurements, stamp_ns: int, table: ClassTable) -> Poissons:
-    """Make a component of weight mu_ab of every measurement: GNN-PMB's birth model, the baseline of the ablation."""
-    every = np.arange(len(measurements))
-    return announce(measurements, every, table.adaptive_birth_rate[measurements.label], stamp_ns, table)
+def measurement_births(measurements: Measurements, table: ClassTable) -> tuple[Index, Array]:
+    """Select every measurement, with weight mu_ab: GNN-PMB's birth model, the baseline of the ablation."""
+    return np.arange(len(measurements)), table.adaptive_birth_rate[measurements.label]
+
+
+def with_births(
+    poisson: Poissons,
+    kept: Index,
+    weight: Array,
+    births: tuple[Index, Array],
+    measurements: Measurements,
+    stamp_ns: int,
+    table: ClassTable,
+) -> Poissons:
+    """Put the components that stay and those that are born together.
+
+    Args:
+        poisson: the components.
+        kept: (K,) which of them stay.
+        weight: (K,) their weights.
+        births: (B,) measurements that make a component each, and (B,) the weights.
+        measurements: Z_k.
+        stamp_ns: stamp of the frame.
+        table: parameters as columns.
+    """
+    rows, born_weight = births
+    old, count = kept.shape[0], kept.shape[0] + rows.shape[0]
+    if not count:
+        return Poissons.empty()
+    joined = Poissons(
+        mean=np.empty((count, STATE)),
+        covariance=np.empty((count, STATE, STATE)),
+        weight=np.empty(count),
+        label=np.empty(count, np.int64),
+        auxiliary=np.empty((count, 4)),
+        born_ns=np.empty(count, np.int64),
+    )
+    joined.weight[:old], joined.weight[old:] = weight, born_weight
+    fill_components(
+        kept,
+        poisson.mean,
+        poisson.covariance,
+        poisson.label,
+        poisson.auxiliary,
+        poisson.born_ns,
+        rows,
+        measurements.label,
+        measurements.auxiliary,
+        stamp_ns,
+        joined.mean,
+        joined.covariance,
+        joined.label,
+        joined.auxiliary,
+        joined.born_ns,
+    )
+    if old < count:
+        birth_states(
+            rows,
+            measurements.position,
+            measurements.yaw,
+            measurements.velocity,
+            measurements.label,
+            table.birth_heading_speed,
+            table.birth_known,
+            table.birth_unknown,
+            joined.mean[old:],
+            joined.covariance[old:],
+        )
+    return joined
+
+
+@kernel
+def fill_components(
+    kept: Index,
+    mean: Array,
+    covariance: Array,
+    label: Index,
+    auxiliary: Array,
+    born_ns: Index,
+    rows: Index,
+    measured_label: Index,
+    measured_auxiliary: Array,
+    stamp_ns: int,
+    mean_out: Array,
+    covariance_out: Array,
+    label_out: Index,
+    auxiliary_out: Array,
+    born_ns_out: Index,
+) -> None:
+    """Copy the components that stay, and behind them what the measurements in `rows` say of theirs but the state."""
+    for k in range(kept.shape[0]):
+        j = kept[k]
+        mean_out[k], covariance_out[k], auxiliary_out[k] = mean[j], covariance[j], auxiliary[j]
+        label_out[k], born_ns_out[k] = label[j], born_ns[j]
+    for b in range(rows.shape[0]):
+        k, m = kept.shape[0] + b, rows[b]
+        auxiliary_out[k] = measured_auxiliary[m]
+        label_out[k], born_ns_out[k] = measured_label[m], stamp_ns
 
 
 def first_detected_states(

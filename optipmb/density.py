@@ -37,7 +37,7 @@ NO_FRAME: Final = -1
 
 
 class _Rows:
-    """What Bernoullis and Poissons share: columns of equal length that are filtered and joined together."""
+    """What Bernoullis and Poissons share: columns of equal length that are filtered together."""
 
     __slots__ = ()
 
@@ -49,11 +49,6 @@ class _Rows:
     def take(self, rows: NDArray[np.generic]) -> Self:
         """Return the rows that an index array or a mask selects."""
         return type(self)(**{name: column[rows] for name, column in self.columns()})
-
-    def join(self, other: Self) -> Self:
-        """Return the rows of both, `other` last."""
-        pairs = zip(self.columns(), other.columns(), strict=True)
-        return type(self)(**{name: np.concatenate((mine, theirs)) for (name, mine), (_, theirs) in pairs})
 
 
 @dataclass(frozen=True, slots=True)

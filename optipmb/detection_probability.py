@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optipmb.density import PHI
-from optipmb.geometry import points_in_boxes
+from optipmb.points import points_in_boxes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optipmb.compiled import kernel
 from optipmb.errors import FrameError
 
 if TYPE_CHECKING:
@@ -48,8 +49,10 @@ class Pose:
     quaternion: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        translation = _floats("pose.translation", self.translation, (3,), MAX_COORDINATE)
-        quaternion = _floats("pose.quaternion", self.quaternion, (4,), 2.0)
+        translation = _shaped("pose.translation", self.translation, (3,))
+        quaternion = _shaped("pose.quaternion", self.quaternion, (4,))
+        _bounded("pose.translation", translation, MAX_COORDINATE)
+        _bounded("pose.quaternion", quaternion, 2.0)
         norm = float(np.sqrt(np.sum(quaternion * quaternion)))
         if abs(norm - 1.0) > UNIT_TOLERANCE:
             raise FrameError("pose.quaternion", "a unit quaternion (w, x, y, z)", f"norm {norm:.6g}")
@@ -165,14 +168,11 @@ def make_frame(
         raise FrameError("label", "(M,) integers", f"{which.shape} {which.dtype}")
     which = which.astype(np.int64)
     m = which.shape[0]
-    _all("label", (which >= 0) & (which < len(labels)), f"an index below {len(labels)}", which)
-    center = _floats("center", center, (m, 3), MAX_COORDINATE)
-    size = _floats("size", size, (m, 3), MAX_COORDINATE)
-    _all("size", size > 0, "a positive length", size)
-    yaw = _floats("yaw", yaw, (m,), MAX_COORDINATE)
-    score = _floats("score", score, (m,), 1.0)
-    _all("score", score > 0, "a score in (0, 1]", score)
-    velocity = _velocities(velocity, m)
+    center, size = _shaped("center", center, (m, 3)), _shaped("size", size, (m, 3))
+    yaw, score = _shaped("yaw", yaw, (m,)), _shaped("score", score, (m,))
+    velocity = np.full((m, 2), np.nan) if velocity is None else _shaped("velocity", velocity, (m, 2))
+    if not allowed(which, len(labels), center, size, yaw, score, velocity):
+        _refuse(which, len(labels), center, size, yaw, score, velocity)
 
     if pose is not None:
         rotation = pose.rotation
@@ -181,52 +181,79 @@ def make_frame(
         yaw = np.arctan2(heading[:, 1], heading[:, 0])
         velocity = velocity @ rotation[:2, :2].T
 
-    index = {name: i for i, name in enumerate(parameters.labels)}
-    class_of = np.array([index.get(name, -1) for name in labels], dtype=np.int64)
-    known = class_of[which] if m else which
-    source = np.flatnonzero(known >= 0)
-    frame = Frame(
-        stamp_ns=int(stamp_ns),
-        center=center[source],
-        size=size[source],
-        yaw=yaw[source],
-        velocity=velocity[source],
-        score=score[source],
-        label=known[source],
-        source=source.astype(np.int64),
-        cloud=cloud,
-    )
+    index = {name: i for i, name in enumerate(parameters.classes)}
+    known = np.array([index.get(name, -1) for name in labels], dtype=np.int64)[which] if m else which
+    source = (known >= 0).nonzero()[0]
+    if source.shape[0] < m:
+        center, size, yaw, velocity = center[source], size[source], yaw[source], velocity[source]
+        score, known = score[source], known[source]
+    frame = Frame(int(stamp_ns), center, size, yaw, velocity, score, known, source, cloud)
     return frame, m - source.shape[0]
 
 
-def _velocities(velocity: ArrayLike | None, m: int) -> NDArray[np.float64]:
-    if velocity is None:
-        return np.full((m, 2), np.nan)
-    values: NDArray[np.float64] = _array("velocity", velocity, np.float64)
-    if values.size == 0 == m:
-        values = values.reshape(0, 2)
-    if values.shape != (m, 2):
-        raise FrameError("velocity", f"shape {(m, 2)}", str(values.shape))
-    unknown = np.isnan(values).all(axis=1, keepdims=True)
+@kernel
+def allowed(
+    label: NDArray[np.int64],
+    n_labels: int,
+    center: NDArray[np.float64],
+    size: NDArray[np.float64],
+    yaw: NDArray[np.float64],
+    score: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+) -> bool:
+    """Tell whether all values are allowed; `_refuse` says which one is not."""
+    good = True
+    for m in range(label.shape[0]):  # NaN compares as not good
+        good &= 0 <= label[m] < n_labels
+        good &= abs(yaw[m]) <= MAX_COORDINATE
+        good &= 0.0 < score[m] <= 1.0
+        for s in range(3):
+            good &= abs(center[m, s]) <= MAX_COORDINATE
+            good &= 0.0 < size[m, s] <= MAX_COORDINATE
+        unknown = np.isnan(velocity[m, 0]) and np.isnan(velocity[m, 1])
+        good &= unknown or (abs(velocity[m, 0]) <= MAX_SPEED and abs(velocity[m, 1]) <= MAX_SPEED)
+    return good
+
+
+def _refuse(
+    label: NDArray[np.int64],
+    n_labels: int,
+    center: NDArray[np.float64],
+    size: NDArray[np.float64],
+    yaw: NDArray[np.float64],
+    score: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+) -> None:
+    """Raise for the first value that is not allowed."""
+    _all("label", (label >= 0) & (label < n_labels), f"an index below {n_labels}", label)
+    bounds = (("center", center, MAX_COORDINATE), ("size", size, MAX_COORDINATE), ("yaw", yaw, MAX_COORDINATE))
+    for path, values, bound in (*bounds, ("score", score, 1.0)):
+        _bounded(path, values, bound)
+    _all("size", size > 0, "a positive length", size)
+    _all("score", score > 0, "a score in (0, 1]", score)
+    unknown = np.isnan(velocity).all(axis=1, keepdims=True)
     expected = f"at most {MAX_SPEED:g} m/s, or a whole row of NaN"
-    _all("velocity", (np.abs(values) <= MAX_SPEED) | unknown, expected, values)
-    return values
+    _all("velocity", (np.abs(velocity) <= MAX_SPEED) | unknown, expected, velocity)
 
 
-def _floats(path: str, values: ArrayLike, shape: tuple[int, ...], bound: float) -> NDArray[np.float64]:
-    """Return `values` as finite float64 of exactly `shape`; an empty list stands for any shape with no rows."""
+def _shaped(path: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return a copy as float64 of exactly `shape`; an empty list stands for any shape with no rows."""
     array: NDArray[np.float64] = _array(path, values, np.float64)
     if array.shape != shape:
         if array.size or 0 not in shape:
             raise FrameError(path, f"shape {shape}", str(array.shape))
         array = array.reshape(shape)
-    _all(path, np.abs(array) <= bound, f"a finite number of size at most {bound:g}", array)
     return array
+
+
+def _bounded(path: str, values: NDArray[np.float64], bound: float) -> None:
+    _all(path, np.abs(values) <= bound, f"a finite number of size at most {bound:g}", values)
 
 
 def _array(path: str, values: ArrayLike, dtype: type[np.float64] | None) -> NDArray[Any]:
     try:
-        return np.asarray(values, dtype=dtype)
+        # A copy in one piece: a frame is its own, and there is one type for the kernels wherever the arrays come from.
+        return np.array(values, dtype=dtype, order="C")
     except (TypeError, ValueError) as error:
         raise FrameError(path, "an array of numbers", repr(values)[:80]) from error
 

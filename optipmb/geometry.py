@@ -1,7 +1,7 @@
-"""Overlap of boxes on the ground plane, and LiDAR points inside boxes.
+"""Overlap of boxes on the ground plane.
 
-A bird's-eye box is a row [x, y, length, width, yaw]; a box is the geometric centre, the size (length, width, height)
-and the yaw. Both computations first throw out what circles or grid cells show to be far apart.
+A bird's-eye box is a row [x, y, length, width, yaw]. What circles or parallel rectangles show to be far apart is never
+clipped.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from optipmb.compiled import kernel
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb.frame import PointCloud
-
     Array = NDArray[np.float64]
 
 MAX_CORNERS = 16
@@ -25,9 +23,6 @@ MAX_CORNERS = 16
 
 CERTAIN = 1.0 - 1e-9
 """A bound below this share of a threshold is below the threshold, whatever rounding did to either."""
-
-GRID_CELLS = 128
-"""Cells along one side of the grid that finds the boxes near a point."""
 
 
 @kernel
@@ -138,89 +133,3 @@ def bev_iou(first: Array, second: Array) -> Array:
         for m in range(second.shape[0]):
             result[n, m] = box_iou(first[n], second[m])
     return result
-
-
-def points_in_boxes(cloud: PointCloud, center: Array, size: Array, yaw: Array) -> NDArray[np.int64]:
-    """Count the points of a cloud in each box: PTS(x) of the adaptive detection probability (Section IV.F).
-
-    The boxes go to the points, not the points to the boxes: each box is turned into the sensor frame once.
-
-    Args:
-        cloud: the scan with its pose.
-        center: (N, 3) centres in the world frame, m.
-        size: (N, 3) length, width, height, m.
-        yaw: (N,) rad.
-
-    Returns:
-        (N,) int64; faces belong to the box.
-    """
-    counts = np.zeros(center.shape[0], np.int64)
-    if counts.size and cloud.xyz.shape[0]:
-        local = (center - cloud.pose.translation) @ cloud.pose.rotation
-        _count_points(cloud.xyz, local, 0.5 * size, yaw, cloud.pose.rotation, counts)
-    return counts
-
-
-@kernel
-def _count_points(
-    xyz: NDArray[np.float32], center: Array, half: Array, yaw: Array, rotation: Array, counts: NDArray[np.int64]
-) -> None:
-    n_boxes = center.shape[0]
-    # Box axes in the sensor frame (rows: along, across, up) and the reach of each box along the sensor's x and y.
-    axes = np.empty((n_boxes, 3, 3))
-    low = np.empty((n_boxes, 2))
-    high = np.empty((n_boxes, 2))
-    for n in range(n_boxes):
-        cos_yaw, sin_yaw = math.cos(yaw[n]), math.sin(yaw[n])
-        for s in range(3):
-            axes[n, 0, s] = cos_yaw * rotation[0, s] + sin_yaw * rotation[1, s]
-            axes[n, 1, s] = -sin_yaw * rotation[0, s] + cos_yaw * rotation[1, s]
-            axes[n, 2, s] = rotation[2, s]
-        for s in range(2):
-            reach = 0.0
-            for k in range(3):
-                reach += abs(axes[n, k, s]) * half[n, k]
-            reach += 1e-9 * (1.0 + abs(center[n, s]))  # rounding must not push a face out of its cell
-            low[n, s] = center[n, s] - reach
-            high[n, s] = center[n, s] + reach
-    x0, y0 = low[:, 0].min(), low[:, 1].min()
-    cell_x = max((high[:, 0].max() - x0) / GRID_CELLS, 1e-6)
-    cell_y = max((high[:, 1].max() - y0) / GRID_CELLS, 1e-6)
-
-    # The grid as one list of boxes sorted by cell: `start[c]` to `start[c + 1]` are the boxes that touch cell c.
-    first = np.empty((n_boxes, 2), np.int64)
-    last = np.empty((n_boxes, 2), np.int64)
-    start = np.zeros(GRID_CELLS * GRID_CELLS + 1, np.int64)
-    for n in range(n_boxes):
-        first[n, 0] = min(int((low[n, 0] - x0) / cell_x), GRID_CELLS - 1)
-        first[n, 1] = min(int((low[n, 1] - y0) / cell_y), GRID_CELLS - 1)
-        last[n, 0] = min(int((high[n, 0] - x0) / cell_x), GRID_CELLS - 1)
-        last[n, 1] = min(int((high[n, 1] - y0) / cell_y), GRID_CELLS - 1)
-        for i in range(first[n, 0], last[n, 0] + 1):
-            for j in range(first[n, 1], last[n, 1] + 1):
-                start[i * GRID_CELLS + j + 1] += 1
-    for c in range(GRID_CELLS * GRID_CELLS):
-        start[c + 1] += start[c]
-    boxes = np.empty(start[-1], np.int64)
-    fill = start[:-1].copy()
-    for n in range(n_boxes):
-        for i in range(first[n, 0], last[n, 0] + 1):
-            for j in range(first[n, 1], last[n, 1] + 1):
-                boxes[fill[i * GRID_CELLS + j]] = n
-                fill[i * GRID_CELLS + j] += 1
-
-    for p in range(xyz.shape[0]):
-        x, y, z = float(xyz[p, 0]), float(xyz[p, 1]), float(xyz[p, 2])
-        column, row = (x - x0) / cell_x, (y - y0) / cell_y
-        if not (0.0 <= column <= GRID_CELLS and 0.0 <= row <= GRID_CELLS):  # also false for NaN
-            continue
-        cell = min(int(column), GRID_CELLS - 1) * GRID_CELLS + min(int(row), GRID_CELLS - 1)
-        for k in range(start[cell], start[cell + 1]):
-            n = boxes[k]
-            dx, dy, dz = x - center[n, 0], y - center[n, 1], z - center[n, 2]
-            if (
-                abs(axes[n, 0, 0] * dx + axes[n, 0, 1] * dy + axes[n, 0, 2] * dz) <= half[n, 0]
-                and abs(axes[n, 1, 0] * dx + axes[n, 1, 1] * dy + axes[n, 1, 2] * dz) <= half[n, 1]
-                and abs(axes[n, 2, 0] * dx + axes[n, 2, 1] * dy + axes[n, 2, 2] * dz) <= half[n, 2]
-            ):
-                counts[n] += 1

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import sub
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from optipmb.association import UNASSIGNED, associate
-from optipmb.birth import adaptive_births, first_detected_states, measurement_births
+from optipmb.birth import adaptive_births, first_detected_states, measurement_births, with_births
 from optipmb.density import NO_FRAME, STATE, Density, Poissons
 from optipmb.detection_probability import detection_probability
 from optipmb.errors import FrameError
@@ -49,6 +49,10 @@ STAGES: Final = (
     "extract",
 )
 """The stages of a step, in their order, as `Diagnostics.stage_ns` has them."""
+
+
+NOTHING: Final = (np.empty(0, np.int64), np.empty(0))
+"""No births."""
 
 
 def _no_clock() -> int:
@@ -168,7 +172,8 @@ class Tracker:
         measurements, below_score, suppressed = preprocess(frame, table)
         n_predicted = len(poisson)
         if not modules.habm:
-            poisson = poisson.join(measurement_births(measurements, now, table))
+            births = measurement_births(measurements, table)
+            poisson = with_births(poisson, np.arange(n_predicted), poisson.weight, births, measurements, now, table)
         times.append(clock())
         cloud = frame.cloud if modules.adp else None
         p_d, p_d_poisson = self._detection_probabilities(bernoulli, poisson, cloud)
@@ -257,13 +262,6 @@ class Tracker:
         """Update the PPP, prune it and add the births that later frames may find (HABM)."""
         if not self.modules.rpp:
             return Poissons.empty()
-        undetected = poisson
-        if len(poisson):
-            kept, weight = surviving_components(poisson, p_d, n_predicted, hypotheses, now, self._table)
-            undetected = replace(poisson.take(kept), weight=weight)
-        if not self.modules.habm:
-            return undetected
-        born = adaptive_births(measurements, hypotheses, now, self._table)
-        if not len(undetected):
-            return born
-        return undetected.join(born) if len(born) else undetected
+        kept, weight = surviving_components(poisson, p_d, n_predicted, hypotheses, now, self._table)
+        births = adaptive_births(measurements, hypotheses, self._table) if self.modules.habm else NOTHING
+        return with_births(poisson, kept, weight, births, measurements, now, self._table)

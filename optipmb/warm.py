@@ -2,29 +2,102 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+from optipmb import (
+    association,
+    birth,
+    calibration,
+    density,
+    extract,
+    frame,
+    geometry,
+    hypotheses,
+    lightweight,
+    motion,
+    neighbours,
+    points,
+    predict,
+    preprocess,
+    prune,
+    update,
+)
 from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
-from optipmb.parameters import load_profile
+from optipmb.parameters import load_profile, parse_parameters
 from optipmb.tracker import Tracker
 
+MODULES = (
+    association,
+    birth,
+    calibration,
+    density,
+    extract,
+    frame,
+    geometry,
+    hypotheses,
+    lightweight,
+    motion,
+    neighbours,
+    points,
+    predict,
+    preprocess,
+    prune,
+    update,
+)
+"""All that have kernels."""
 
-def warm_up() -> None:
-    """Compile all kernels, or load them from the cache beside the source, by running a few frames through a tracker.
 
-    The first call after an installation compiles (tens of seconds); later processes load the machine code (under a
+def kernels() -> dict[str, Any]:
+    """Return the kernels by name: numba's dispatchers, whose `stats` and `signatures` say what was compiled."""
+    return {
+        f"{module.__name__}.{name}": value
+        for module in MODULES
+        for name, value in vars(module).items()
+        if isinstance(value, Dispatcher) and value.py_func.__module__ == module.__name__
+    }
+
+
+def compilations() -> int:
+    """Count what this process has compiled so far because it was not in the cache."""
+    return sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels().values())
+
+
+def warm_up() -> int:
+    """Compile all kernels, or load them from the cache, by running a few frames through a tracker.
+
+    The first call after an installation compiles (about a minute); later processes load the machine code (under a
     second). Call it before the first frame that is waited for.
+
+    Returns:
+        How many kernels had to be compiled; none in a prepared installation.
     """
-    parameters = load_profile("nuscenes")
+    before = compilations()
+    _run()
+    bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
+    return compilations() - before
+
+
+def _run() -> None:
+    curve = dict.fromkeys(("evidence", "existence", "along", "across"), (0.1, 0.9))
+    document = load_profile("nuscenes").model_dump()
+    document["classes"]["pedestrian"] |= {
+        "score_filter": 0.1,
+        "birth_score": 0.5,
+        "calibration": curve | {"memory": 0.5, "missed": 1.0},
+    }
+    parameters = parse_parameters(document)
     tracker = Tracker(parameters)
-    density = tracker.initial()
+    posterior = tracker.initial()
     pose = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     cloud = PointCloud(np.zeros((8, 3), np.float32), pose)
     # A low score announces, a second detection then starts a track from what was announced; two close objects make a
     # cluster.
     for k, score in enumerate((0.21, 0.21, 0.9, 0.9, 0.9)):
-        frame, _ = make_frame(
+        given, _ = make_frame(
             parameters,
             stamp_ns=k * 500_000_000,
             labels=("pedestrian",),
@@ -36,5 +109,4 @@ def warm_up() -> None:
             velocity=[[1.0, 0.0], [0.0, 0.0], [np.nan, np.nan]],
             cloud=cloud,
         )
-        density = tracker.step(density, frame).density
-    bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
+        posterior = tracker.step(posterior, given).density

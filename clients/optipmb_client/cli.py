@@ -22,6 +22,7 @@ from optipmb_client.commands.replay import replay
 from optipmb_client.commands.status import status
 from optipmb_client.commands.track import track
 from optipmb_client.commands.tune import tune
+from optipmb_client.commands.warm_up import warm_up
 from optipmb_client.datasets import DatasetError
 from optipmb_client.errors import ClientError, UsageError
 
@@ -38,7 +39,7 @@ _OptionError: Any = typer.BadParameter.__base__
 app = typer.Typer(
     name="optipmb", help="Track objects in 3D: offline, or through a tracking service.", add_completion=False
 )
-for command in (demo, track, replay, record, play, evaluate, tune, ablate, plot, status):
+for command in (demo, track, replay, record, play, evaluate, tune, ablate, plot, status, warm_up):
     app.command()(command)
 
 

@@ -25,7 +25,7 @@ from optipmb_client.errors import UsageError
 from optipmb_client.geometry import Floats, Ints
 from optipmb_client.recording import Latency, latency, selected_frames, write_results
 
-__all__ = ["NamedTracks", "TrackedSequence", "read_profile", "track", "track_sequence"]
+__all__ = ["NamedTracks", "TrackedSequence", "read_profile", "track", "track_sequence", "warm_up"]
 
 
 @dataclass(frozen=True)

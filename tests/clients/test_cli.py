@@ -156,10 +156,18 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.startswith("optipmb ")
     assert run([]) == 0
     text = capsys.readouterr().out
-    for command in ("demo", "track", "replay", "evaluate", "plot", "status"):
+    for command in ("demo", "track", "replay", "evaluate", "plot", "status", "warm-up"):
         assert command in text
         assert run([command, "--help"]) == 0
         assert "--json" in capsys.readouterr().out
+
+
+def test_a_warm_installation_has_nothing_to_compile() -> None:
+    """`optipmb warm-up` compiles what is missing; after it, it finds all kernels in their cache."""
+    assert optipmb("warm-up").returncode == 0
+    done = optipmb("warm-up", "--json")
+    result = json.loads(done.stdout)
+    assert (done.returncode, result["command"], result["compiled"]) == (0, "warm-up", 0)
 
 
 def test_help_does_not_load_the_tracker() -> None:

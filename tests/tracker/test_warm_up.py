@@ -1,0 +1,83 @@
+"""A prepared installation compiles nothing: counted in a fresh process, by what numba says of every kernel."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import optipmb
+from optipmb.warm import MODULES, kernels
+
+SUPPORT = Path(__file__).resolve().parents[1] / "support"
+
+# Everything that a stream may bring, after the warm-up: with and without clouds, velocities, poses, calibration and
+# modules; arrays from messages, which are read-only; a density that was stored.
+FRESH = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+import numpy as np
+import optipmb
+from optipmb.warm import compilations, kernels
+from scenes import Options, random_parameters, scene
+
+compiled = optipmb.warm_up()
+known = {name: len(kernel.signatures) for name, kernel in kernels().items()}
+
+def read_only(array):
+    return None if array is None else np.frombuffer(array.tobytes(), array.dtype).reshape(array.shape)
+
+here = optipmb.Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+baselines = (optipmb.Modules(**{name: False}) for name in ("adp", "habm", "rpp", "ote"))
+for seed, modules in enumerate([optipmb.Modules(), optipmb.Modules(), *baselines]):
+    parameters = optipmb.parse_parameters(random_parameters(seed, calibrated=seed % 2 == 0))
+    tracker = optipmb.Tracker(parameters, modules)
+    density = tracker.initial()
+    for given in scene(seed, Options(frames=25, objects=25)):
+        columns = given.columns()
+        for name in ("label", "center", "size", "yaw", "score", "velocity"):
+            columns[name] = read_only(columns[name])
+        cloud = None
+        if given.cloud is not None:
+            pose = optipmb.Pose(given.cloud.pose.translation, given.cloud.pose.quaternion)
+            cloud = optipmb.PointCloud(read_only(given.cloud.xyz), pose)
+        frame, _ = optipmb.make_frame(parameters, pose=here if seed else None, cloud=cloud, **columns)
+        density = tracker.step(density, frame).density
+    stored = {name: read_only(column) for name, column in optipmb.columns_of(density).items()}
+    density = optipmb.density_of(density.stamp_ns, density.next_id, stored, len(parameters.classes))
+    tracker.step(density, frame)
+grown = [name for name, kernel in kernels().items() if len(kernel.signatures) != known.get(name)]
+print(json.dumps({"compiled": compiled, "later": compilations() - compiled, "grown": grown}))
+"""
+
+
+def fresh() -> dict[str, Any]:
+    """What a new process had to compile."""
+    command = [sys.executable, "-c", FRESH, str(SUPPORT)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=True)
+    counts: dict[str, Any] = json.loads(done.stdout)
+    return counts
+
+
+@pytest.mark.timeout(290)
+def test_after_a_warm_up_nothing_is_compiled() -> None:
+    """The first process may prepare; the next one loads everything, and no frame brings a kernel anything new."""
+    optipmb.warm_up()
+    assert fresh() == {"compiled": 0, "later": 0, "grown": []}
+
+
+def test_all_kernels_are_counted() -> None:
+    """Every module that defines a kernel is among those that are looked at."""
+    folder = Path(optipmb.__file__).parent
+    defined = set()
+    for path in folder.glob("*.py"):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.FunctionDef) and any(ast.unparse(one) == "kernel" for one in node.decorator_list):
+                defined.add(f"optipmb.{path.stem}.{node.name}")
+    assert set(kernels()) == defined
+    assert len(MODULES) == len({name.rpartition(".")[0] for name in defined})
