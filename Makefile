@@ -3,10 +3,11 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test install lint types tests schemas wheel clean
+.PHONY: help demo test load install lint types tests schemas wheel clean
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    everything that CI runs: lint, types, tests, schemas, wheel, demo"
+	@echo "make load    measure what the service carries on this machine, as docs/performance.md has it"
 	@echo "make clean   remove the virtual environment and everything generated"
 
 # The stamp is newer than what it was made from, so a second call installs nothing.
@@ -22,6 +23,10 @@ demo: install
 	$(BIN)/optipmb demo --out out/demo
 
 test: lint types tests schemas wheel demo
+
+# For figures, nothing else should run on the machine. SERVICE holds options of the service, SECONDS how long a run takes.
+load: install
+	sh benchmarks/load.sh $(BIN)
 
 lint: install
 	$(BIN)/ruff check .
