@@ -7,7 +7,9 @@
 
 from optipmb_schemas.arrays import Array
 from optipmb_schemas.codec import MESSAGES, decode, encode, encode_json, encoding_of
+from optipmb_schemas.columns import pack_columns, read_columns
 from optipmb_schemas.control import (
+    MoveRequest,
     Problem,
     ResetRequest,
     ServiceStatus,
@@ -15,6 +17,7 @@ from optipmb_schemas.control import (
     SessionState,
     SessionSummary,
 )
+from optipmb_schemas.dump import STORED, Dump, DumpedFrame, decode_dump, encode_dump
 from optipmb_schemas.errors import CODES, Code, MessageError
 from optipmb_schemas.keys import PREFIX, Keys, Query, Topic
 from optipmb_schemas.limits import DEFAULT, Limits
@@ -26,14 +29,18 @@ __all__ = [
     "DEFAULT",
     "MESSAGES",
     "PREFIX",
+    "STORED",
     "Array",
     "Code",
     "Delivery",
     "Detections",
+    "Dump",
+    "DumpedFrame",
     "Keys",
     "Limits",
     "Message",
     "MessageError",
+    "MoveRequest",
     "Points",
     "Pose",
     "Problem",
@@ -46,7 +53,11 @@ __all__ = [
     "Topic",
     "Tracks",
     "decode",
+    "decode_dump",
     "encode",
+    "encode_dump",
     "encode_json",
     "encoding_of",
+    "pack_columns",
+    "read_columns",
 ]

@@ -12,7 +12,7 @@ import msgpack
 import numpy as np
 
 from optipmb_schemas.blocks import block_of, pack_large, read_array
-from optipmb_schemas.control import Problem, ResetRequest, ServiceStatus, SessionParameters, SessionState
+from optipmb_schemas.control import MoveRequest, Problem, ResetRequest, ServiceStatus, SessionParameters, SessionState
 from optipmb_schemas.errors import MessageError, show
 from optipmb_schemas.limits import DEFAULT, Limits
 from optipmb_schemas.messages import Detections, Points, Tracks
@@ -28,6 +28,7 @@ MESSAGES: Final[tuple[type[Message], ...]] = (
     SessionState,
     SessionParameters,
     ResetRequest,
+    MoveRequest,
     Problem,
     ServiceStatus,
 )

@@ -4,7 +4,7 @@
 <prefix>/<stream>/q/state | q/reset | q/parameters            queries
 <prefix>/owner/<stream>/<instance>                            liveliness: who tracks this stream
 <prefix>/service/<instance>/alive                             liveliness: which services are there
-<prefix>/service/<instance>/q/status | q/metrics              queries
+<prefix>/service/<instance>/q/status | q/metrics | q/move     queries
 """
 
 from collections.abc import Callable
@@ -65,6 +65,10 @@ class Keys:
     def metrics(self, instance: str) -> str:
         """Return the key of the metrics query of an instance."""
         return f"{self.prefix}/service/{_instance(instance)}/q/metrics"
+
+    def move(self, instance: str) -> str:
+        """Return the key of the query that moves a stream between the workers of an instance."""
+        return f"{self.prefix}/service/{_instance(instance)}/q/move"
 
     def all(self, topic: Topic) -> str:
         """Return the key expression of a topic of all streams."""

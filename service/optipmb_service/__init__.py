@@ -5,7 +5,8 @@
 From the outside in:
 
     cli, settings, logs     the command
-    service                 the control loop: start, signals, timers, end
+    supervisor, child, whole, worker, share    several processes as one instance
+    service, loops          the control loop: start, signals, timers, end
     vitals, metrics, figures, http, health    how it is, for those who ask from outside
     transport               Zenoh, behind the protocols of ports
     registry, queries       streams and questions, found and sorted

@@ -1,33 +1,41 @@
 """The state of a session as bytes and back: whole or not at all.
 
 The bytes are a head (magic, version, BLAKE2b digest of version and body) and a body, one msgpack map. Equal checkpoints
-give equal bytes. Reading is total and bounded: it returns a checkpoint or raises `CheckpointError`; the digest is
-compared before anything else is looked at. A service reads the versions that earlier ones wrote, and refuses later
-ones by number.
+give equal bytes. Reading is total and bounded: it returns a checkpoint or raises `CheckpointError`, and the digest is
+compared before anything else is looked at. A service reads the versions that earlier ones wrote, and refuses later ones
+by number.
+
+What depends on how messages were delivered (duplicates, the revisions of tracks that were corrected) is kept, but is no
+state: `state_bytes` leaves it out, so that two sessions that took the same frames can be compared.
 """
 
 from __future__ import annotations
 
 import hashlib
 from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
 import msgpack
-import numpy as np
+import optipmb_schemas as schemas
 
 import optipmb
-from optipmb_service.records import Counters
-from optipmb_service.timing import Mark, Timeline
+from optipmb_service.document import Document
+from optipmb_service.moments import Counts, Moment, Whereabouts
+from optipmb_service.records import Deliveries
+from optipmb_service.timing import WINDOW, Course, Mark, Seen
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from collections.abc import Callable
 
 VERSION: Final = 1
 MAGIC: Final = b"OPTIPMB\0"
 DIGEST: Final = 16
 HEAD: Final = len(MAGIC) + 2 + DIGEST
+MAX_BYTES: Final = 2**28
 
 _msgpack: Any = msgpack  # its type information is partial
+_SOFTWARE: Final = version("optipmb")
 
 
 class CheckpointError(ValueError):
@@ -35,39 +43,73 @@ class CheckpointError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
+class Recorded:
+    """A frame of the window.
+
+    Attributes:
+        message: its detections.
+        points: its cloud.
+        missed: whether it waited for a cloud in vain.
+        revision: of the tracks that were published last for it.
+    """
+
+    message: schemas.Detections
+    points: schemas.Points | None
+    missed: bool
+    revision: int
+
+    @property
+    def mark(self) -> Mark:
+        """Which frame it is."""
+        return Mark(self.message.epoch, self.message.seq, self.message.stamp_ns)
+
+
+@dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """What a session is made of, between two frames. Everything in it is immutable."""
+    """What a session is made of, between two frames. Nothing in it changes any more.
+
+    Attributes:
+        stream: `site/node/sensor`.
+        parameters: the profile.
+        cloud_wait_ns: the wait for clouds that was asked for, None where the service's own holds.
+        quarantine: the error for which frames are refused; empty while they are not.
+        epochs: which frames came.
+        base: the moment before the window.
+        window: the frames of the window.
+        head: the present moment.
+        deliveries: what was not tracked, and what was corrected.
+        newest_cloud_ns: stamp of the cloud that arrived last.
+        software: version of the service that wrote it.
+    """
 
     stream: str
-    session: str
-    starts: int
-    generation: int
-    tracks: int
     parameters: optipmb.Parameters
-    density: optipmb.Density
-    timeline: Timeline
-    last: Mark | None
-    counters: Counters
+    cloud_wait_ns: int | None
+    quarantine: str
+    epochs: tuple[Seen, ...]
+    base: Moment
+    window: tuple[Recorded, ...]
+    head: Moment
+    deliveries: Deliveries
+    newest_cloud_ns: int | None
+    software: str = _SOFTWARE
+
+    @property
+    def session(self) -> str:
+        """The id of the present life of the density."""
+        return self.head.session
 
 
 def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
     """Return the bytes of a checkpoint; equal ones give equal bytes."""
-    density = checkpoint.density
-    body = {
-        "stream": checkpoint.stream,
-        "session": checkpoint.session,
-        "starts": checkpoint.starts,
-        "generation": checkpoint.generation,
-        "tracks": checkpoint.tracks,
-        "parameters": checkpoint.parameters.model_dump(mode="json"),
-        "stamp_ns": density.stamp_ns,
-        "next_id": density.next_id,
-        "density": {name: _pack(column) for name, column in optipmb.columns_of(density).items()},
-        "timeline": asdict(checkpoint.timeline) | {"seen": checkpoint.timeline.seen.to_bytes(128, "big")},
-        "last": asdict(checkpoint.last) if checkpoint.last else None,
-        "counters": asdict(checkpoint.counters),
-    }
-    return seal(_msgpack.packb(body))
+    return seal(_msgpack.packb(_body(checkpoint)))
+
+
+def state_bytes(checkpoint: Checkpoint) -> bytes:
+    """Return the bytes of what does not depend on how messages were delivered."""
+    window = tuple(replace(one, revision=0) for one in checkpoint.window)
+    bare = replace(checkpoint, window=window, deliveries=Deliveries(), newest_cloud_ns=None, software="")
+    return encode_checkpoint(bare)
 
 
 def decode_checkpoint(data: bytes) -> Checkpoint:
@@ -76,27 +118,11 @@ def decode_checkpoint(data: bytes) -> Checkpoint:
     Raises:
         CheckpointError: torn, changed, of a later version, or not valid.
     """
-    body = _msgpack.unpackb(_open(data))
+    version_, body = _open(data)
     try:
-        parameters = optipmb.parse_parameters(body["parameters"])
-        columns = {name: _unpack(block) for name, block in body["density"].items()}
-        timeline = body["timeline"]
-        timeline |= {name: tuple(timeline[name]) if timeline[name] else None for name in ("floor", "processed")}
-        timeline |= {"seen": int.from_bytes(timeline["seen"], "big"), "retired": tuple(timeline["retired"])}
-        return Checkpoint(
-            body["stream"],
-            body["session"],
-            body["starts"],
-            body["generation"],
-            body["tracks"],
-            parameters,
-            optipmb.density_of(body["stamp_ns"], body["next_id"], columns, len(parameters.classes)),
-            Timeline(**timeline),
-            Mark(**body["last"]) if body["last"] else None,
-            Counters(**body["counters"]),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{type(error).__name__}: {error}") from error
+        return _READERS[version_](Document.of(body))
+    except (schemas.MessageError, optipmb.OptipmbError) as error:
+        raise CheckpointError(str(error)) from error
 
 
 def seal(body: bytes) -> bytes:
@@ -104,34 +130,155 @@ def seal(body: bytes) -> bytes:
     return b"".join((MAGIC, VERSION.to_bytes(2, "big"), _digest(VERSION, body), body))
 
 
-def _open(data: bytes) -> bytes:
+def _open(data: bytes) -> tuple[int, bytes]:
     if len(data) < HEAD or data[: len(MAGIC)] != MAGIC:
         raise CheckpointError("no checkpoint: its first bytes are others")
-    version = int.from_bytes(data[len(MAGIC) : len(MAGIC) + 2], "big")
-    if version > VERSION:
-        raise CheckpointError(f"version {version}: written by a newer service; this one reads versions up to {VERSION}")
+    if len(data) > MAX_BYTES:
+        raise CheckpointError(f"{len(data)} bytes: more than a checkpoint has")
+    version_ = int.from_bytes(data[len(MAGIC) : len(MAGIC) + 2], "big")
+    if version_ > VERSION:
+        raise CheckpointError(f"version {version_}: from a newer service; this one reads versions up to {VERSION}")
+    if version_ not in _READERS:
+        raise CheckpointError(f"version {version_}: there is none such")
     body = data[HEAD:]
-    if data[len(MAGIC) + 2 : HEAD] != _digest(version, body):
+    if data[len(MAGIC) + 2 : HEAD] != _digest(version_, body):
         raise CheckpointError("torn or changed: the digest is that of other bytes")
-    return body
+    return version_, body
 
 
-def _digest(version: int, body: bytes) -> bytes:
-    digest = hashlib.blake2b(version.to_bytes(2, "big"), digest_size=DIGEST, person=b"optipmb-check")
+def _digest(version_: int, body: bytes) -> bytes:
+    digest = hashlib.blake2b(version_.to_bytes(2, "big"), digest_size=DIGEST, person=b"optipmb-check")
     digest.update(body)
     return digest.digest()
 
 
-def _pack(column: NDArray[Any]) -> dict[str, Any]:
-    little = np.ascontiguousarray(column, column.dtype.newbyteorder("<"))
-    return {"dtype": little.dtype.str, "shape": list(column.shape), "data": little.tobytes()}
+# Writing
 
 
-def _unpack(block: dict[str, Any]) -> NDArray[Any]:
-    return np.frombuffer(block["data"], np.dtype(block["dtype"])).reshape(block["shape"])
+def _body(checkpoint: Checkpoint) -> dict[str, Any]:
+    parameters = checkpoint.parameters.model_dump(mode="json")
+    # Most sessions of a store have one of a few profiles; the order of the classes is that of their indices.
+    return {
+        "software": checkpoint.software,
+        "stream": checkpoint.stream,
+        "parameters": parameters,
+        "cloud_wait_ns": checkpoint.cloud_wait_ns,
+        "quarantine": checkpoint.quarantine,
+        "epochs": [[seen.epoch, seen.highest, _mask(seen.mask)] for seen in checkpoint.epochs],
+        "base": _moment(checkpoint.base),
+        "window": [
+            {
+                "detections": schemas.encode(one.message),
+                "points": None if one.points is None else schemas.encode(one.points),
+                "missed": one.missed,
+                "revision": one.revision,
+            }
+            for one in checkpoint.window
+        ],
+        # Without a window the present is its beginning.
+        "head": _moment(checkpoint.head) if checkpoint.window else None,
+        "deliveries": asdict(checkpoint.deliveries),
+        "newest_cloud_ns": checkpoint.newest_cloud_ns,
+    }
 
 
-def digest_of(checkpoint: Checkpoint) -> str:
-    """Return 32 hexadecimal digits over all that later tracks depend on, which the counters are no part of."""
-    plain = replace(checkpoint, counters=Counters())
-    return hashlib.blake2b(encode_checkpoint(plain), digest_size=DIGEST).hexdigest()
+def _mask(mask: int) -> bytes:
+    return mask.to_bytes((mask.bit_length() + 7) // 8, "big")
+
+
+def _moment(moment: Moment) -> dict[str, Any]:
+    density, course = moment.density, moment.course
+    return {
+        "stamp_ns": density.stamp_ns,
+        "next_id": density.next_id,
+        "density": schemas.pack_columns(optipmb.columns_of(density)),
+        "session": moment.session,
+        "starts": moment.starts,
+        "generation": moment.generation,
+        "course": [course.epoch, course.seq, course.era, course.generation, course.newest_ns, course.floor_ns],
+        "last": None if moment.last is None else [moment.last.epoch, moment.last.seq, moment.last.stamp_ns],
+        "tracked": None if moment.tracked is None else list(moment.tracked),
+        "tracks": moment.tracks,
+        "counts": asdict(moment.counts),
+        "reported": sorted(moment.reported),
+        "whereabouts": asdict(moment.whereabouts),
+    }
+
+
+# Reading version 1
+
+
+def _read_1(body: Document) -> Checkpoint:
+    parameters = optipmb.parse_parameters(body.map("parameters"))
+    base = _read_moment(body.document("base"), len(parameters.classes))
+    window = tuple(_read_recorded(one) for one in body.documents("window"))
+    if len({one.mark for one in window}) != len(window):
+        raise body.wrong("window", "every frame once", "one again")
+    head = _read_moment(body.document("head"), len(parameters.classes)) if window else base
+    return Checkpoint(
+        stream=body.stream("stream"),
+        parameters=parameters,
+        cloud_wait_ns=body.optional("cloud_wait_ns", body.whole),
+        quarantine=body.text("quarantine"),
+        epochs=tuple(_read_seen(one) for one in body.rows("epochs", 3)),
+        base=base,
+        window=window,
+        head=head,
+        deliveries=Deliveries(**body.document("deliveries").wholes(Deliveries.__slots__)),
+        newest_cloud_ns=body.optional("newest_cloud_ns", body.whole),
+        software=body.text("software"),
+    )
+
+
+def _read_seen(row: Document) -> Seen:
+    mask = int.from_bytes(row.binary("2"), "big")
+    if not 0 < mask.bit_length() <= WINDOW:
+        raise row.wrong("2", f"a mask of 1 to {WINDOW} bits", f"{mask.bit_length()} bits")
+    return Seen(row.epoch("0"), row.whole("1"), mask)
+
+
+def _read_recorded(one: Document) -> Recorded:
+    points = one.optional("points", one.binary)
+    return Recorded(
+        schemas.decode(one.binary("detections"), schemas.Detections, limits=schemas.STORED),
+        None if points is None else schemas.decode(points, schemas.Points, limits=schemas.STORED),
+        one.flag("missed"),
+        one.whole("revision"),
+    )
+
+
+def _read_moment(one: Document, classes: int) -> Moment:
+    columns = schemas.read_columns(one.map("density"))
+    course = one.row("course", 6)
+    last = None if one.absent("last") else one.row("last", 3)
+    tracked = None if one.absent("tracked") else one.row("tracked", 2)
+    where = one.document("whereabouts")
+    return Moment(
+        density=optipmb.density_of(one.whole("stamp_ns", low=-1), one.whole("next_id"), columns, classes),
+        session=one.text("session"),
+        starts=one.whole("starts"),
+        generation=one.whole("generation"),
+        course=Course(
+            course.optional("0", course.epoch),
+            course.whole("1"),
+            course.whole("2"),
+            course.whole("3"),
+            course.whole("4"),
+            course.optional("5", course.whole),
+        ),
+        last=None if last is None else Mark(last.epoch("0"), last.whole("1"), last.whole("2")),
+        tracked=None if tracked is None else (tracked.epoch("0"), tracked.whole("1")),
+        tracks=one.whole("tracks"),
+        counts=Counts(**one.document("counts").wholes(Counts.__slots__)),
+        reported=frozenset(one.texts("reported")),
+        whereabouts=Whereabouts(
+            stamp_ns=where.optional("stamp_ns", where.whole),
+            position=where.position("position"),
+            astray=where.whole("astray"),
+            astray_ns=where.whole("astray_ns"),
+            astray_position=where.position("astray_position"),
+        ),
+    )
+
+
+_READERS: Final[dict[int, Callable[[Document], Checkpoint]]] = {1: _read_1}

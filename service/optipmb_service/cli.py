@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 import typer
 from typer.main import get_command
 
-import optipmb
 from optipmb_service import __version__, health, logs
-from optipmb_service.profiles import Profiles
-from optipmb_service.service import leave, run
-from optipmb_service.settings import Loaded, SettingsInvalidError, load
+from optipmb_service.loops import leave
+from optipmb_service.router import route
+from optipmb_service.settings import Loaded, Settings, SettingsInvalidError, load
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -47,7 +46,11 @@ Instance = Annotated[str | None, typer.Option(metavar="NAME", help="Name of this
 Profile = Annotated[
     str | None, typer.Option(metavar="NAME|FILE", help="Profile of streams that no pattern in the settings names.")
 ]
+Workers = Annotated[int | None, typer.Option(metavar="N", help="Processes that track, each a share of the streams.")]
 Http = Annotated[str | None, typer.Option(metavar="ADDRESS", help="Serve health and metrics there; as 127.0.0.1:8080.")]
+ZenohConfig = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Zenoh configuration (JSON5): TLS, access control, limits.")
+]
 LogFormat = Annotated[str | None, typer.Option(metavar="console|json", help="Form of the log lines on stderr.")]
 LogLevel = Annotated[str | None, typer.Option(metavar="LEVEL", help="debug, info, warning or error.")]
 
@@ -59,8 +62,10 @@ def run_command(  # noqa: PLR0913 - one argument per option of the command
     router: Router = None,
     listen: Listen = None,
     connect: Connect = None,
+    zenoh_config: ZenohConfig = None,
     instance: Instance = None,
     profile: Profile = None,
+    workers: Workers = None,
     http: Http = None,
     log_format: LogFormat = None,
     log_level: LogLevel = None,
@@ -71,19 +76,17 @@ def run_command(  # noqa: PLR0913 - one argument per option of the command
         router=router,
         listen=listen or None,
         connect=connect or None,
+        zenoh_config=zenoh_config,
         instance=instance,
         profile=profile,
+        workers=workers,
         http=http,
         log_format=log_format,
         log_level=log_level,
     )
-    try:
-        profiles = Profiles.read(loaded.settings.profile, loaded.settings.profiles)
-    except optipmb.ParameterError as error:
-        _wrong(str(error))
     logs.configure(loaded.settings.log_format, loaded.settings.log_level)
     logs.unknown_environment(loaded.unknown)
-    leave(asyncio.run(run(loaded.settings, profiles)))
+    leave(_run_one(loaded.settings) if loaded.settings.workers == 1 else _run_many(loaded.settings))
 
 
 @app.command("config")
@@ -93,8 +96,10 @@ def config_command(  # noqa: PLR0913 - one argument per option of the command
     router: Router = None,
     listen: Listen = None,
     connect: Connect = None,
+    zenoh_config: ZenohConfig = None,
     instance: Instance = None,
     profile: Profile = None,
+    workers: Workers = None,
     http: Http = None,
     log_format: LogFormat = None,
     log_level: LogLevel = None,
@@ -106,8 +111,10 @@ def config_command(  # noqa: PLR0913 - one argument per option of the command
         router=router,
         listen=listen or None,
         connect=connect or None,
+        zenoh_config=zenoh_config,
         instance=instance,
         profile=profile,
+        workers=workers,
         http=http,
         log_format=log_format,
         log_level=log_level,
@@ -124,6 +131,35 @@ def config_command(  # noqa: PLR0913 - one argument per option of the command
         typer.echo(f"\n[{name}]  # {loaded.sources[name]}")
         for key, value in values[name].items():
             typer.echo(f"{_toml(key) if name == 'profiles' else key} = {_toml(value)}")
+
+
+@app.command("router")
+def router_command(
+    *,
+    settings: SettingsFile = None,
+    listen: Listen = None,
+    connect: Connect = None,
+    zenoh_config: ZenohConfig = None,
+    instance: Instance = None,
+    http: Http = None,
+    log_format: LogFormat = None,
+    log_level: LogLevel = None,
+) -> None:
+    """Run a Zenoh router alone, without tracking, until SIGINT or SIGTERM."""
+    loaded = _load(
+        settings,
+        router=True,
+        listen=listen or None,
+        connect=connect or None,
+        zenoh_config=zenoh_config,
+        instance=instance,
+        http=http,
+        log_format=log_format,
+        log_level=log_level,
+    )
+    logs.configure(loaded.settings.log_format, loaded.settings.log_level)
+    logs.unknown_environment(loaded.unknown)
+    leave(route(loaded.settings))
 
 
 @app.command("health")
@@ -161,6 +197,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         _wrong(describe())
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _run_one(settings: Settings) -> int:
+    # Imported here, for it takes the tracker along: 150 MB and seconds that neither a parent nor a question needs.
+    from optipmb_service.worker import run_alone  # noqa: PLC0415
+
+    return run_alone(settings)
+
+
+def _run_many(settings: Settings) -> int:
+    from optipmb_service.supervisor import supervise  # noqa: PLC0415 - a process that tracks needs none
+
+    return asyncio.run(supervise(settings))
 
 
 def _load(file: Path | None, **options: Any) -> Loaded:

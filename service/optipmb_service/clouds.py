@@ -1,4 +1,8 @@
-"""The point clouds of a stream that wait for their frames, or for which frames wait; found by their stamp."""
+"""The point clouds of a stream that wait for their frames, or for which frames wait; found by their stamp.
+
+A publisher sends its clouds under the epoch of its detections. Clouds of an epoch in which the stream has no detections
+come from a program of their own and belong to whatever frame has their stamp.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Clouds:
-    """A bounded shelf: one cloud per stamp, the newest arrival holds; when it is full the oldest arrival goes.
+    """A bounded shelf: one cloud per epoch and stamp, the newest arrival holds; when it is full the oldest goes.
 
     Args:
         most: number of clouds kept.
@@ -19,32 +23,38 @@ class Clouds:
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._by_stamp: dict[int, schemas.Points] = {}
+        self._kept: dict[tuple[bytes, int], schemas.Points] = {}
         self.newest_ns: int | None = None
         """Stamp of the cloud that arrived last."""
 
     def __len__(self) -> int:
-        return len(self._by_stamp)
+        return len(self._kept)
 
     def add(self, cloud: schemas.Points) -> None:
         """Keep a cloud."""
-        self._by_stamp.pop(cloud.stamp_ns, None)
-        self._by_stamp[cloud.stamp_ns] = cloud
+        key = cloud.epoch, cloud.stamp_ns
+        self._kept.pop(key, None)
+        self._kept[key] = cloud
         self.newest_ns = cloud.stamp_ns
-        while len(self._by_stamp) > self._most:
-            del self._by_stamp[next(iter(self._by_stamp))]
+        while len(self._kept) > self._most:
+            del self._kept[next(iter(self._kept))]
 
-    def get(self, stamp_ns: int) -> schemas.Points | None:
-        """Return the cloud of a stamp, None when it is not there."""
-        return self._by_stamp.get(stamp_ns)
+    def get(self, epoch: bytes, stamp_ns: int, publishers: Callable[[bytes], bool]) -> schemas.Points | None:
+        """Return the cloud of a frame, None when it is not there; what another publisher of detections sent is not.
 
-    def forget_until(self, stamp_ns: int, reach_ns: int) -> None:
-        """Drop the clouds up to the stamp of a processed frame; those further back belong to frames after a jump."""
-        self._keep(lambda cloud: not 0 <= stamp_ns - cloud.stamp_ns <= reach_ns)
+        Args:
+            epoch: of the frame.
+            stamp_ns: of the frame.
+            publishers: whether detections came in an epoch.
+        """
+        own = self._kept.get((epoch, stamp_ns))
+        if own is not None:
+            return own
+        others = (cloud for (whose, stamp), cloud in self._kept.items() if stamp == stamp_ns and not publishers(whose))
+        return next(others, None)
 
-    def forget_publisher(self, epoch: bytes) -> None:
-        """Drop what a stopped publisher left over: it must not be taken for its successor's."""
-        self._keep(lambda cloud: cloud.epoch != epoch)
-
-    def _keep(self, kept: Callable[[schemas.Points], bool]) -> None:
-        self._by_stamp = {stamp: cloud for stamp, cloud in self._by_stamp.items() if kept(cloud)}
+    def forget_before(self, stamp_ns: int, reach_ns: int) -> None:
+        """Drop the clouds before a stamp; those further back than `reach_ns` belong to frames after a jump."""
+        gone = [key for key in self._kept if 0 < stamp_ns - key[1] <= reach_ns]
+        for key in gone:
+            del self._kept[key]

@@ -43,10 +43,8 @@ def cloud_of(message: schemas.Points) -> optipmb.PointCloud:
     return optipmb.PointCloud(xyz=message.xyz, pose=pose_of(message) or IDENTITY)
 
 
-def frame_of(
-    parameters: optipmb.Parameters, message: schemas.Detections, points: schemas.Points | None
-) -> tuple[optipmb.Frame, int]:
-    """Return the frame, and how many objects were left out because the profile lacks their class.
+def frame_of(parameters: optipmb.Parameters, message: schemas.Detections) -> tuple[optipmb.Frame, int]:
+    """Return the frame without its cloud, and how many objects were left out because the profile lacks their class.
 
     Raises:
         optipmb.FrameError: wrong shapes or values; `path` names the field and the element.
@@ -62,7 +60,6 @@ def frame_of(
         score=message.score,
         velocity=message.velocity,
         pose=pose_of(message),
-        cloud=None if points is None else cloud_of(points),
     )
 
 
@@ -79,12 +76,13 @@ def unknown_labels(parameters: optipmb.Parameters, message: schemas.Detections) 
     return unknown
 
 
-def tracks_of(
+def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
     tracks: optipmb.Tracks,
     *,
     stream: str,
     mark: Mark,
     session: str,
+    revision: int,
     parameters: optipmb.Parameters,
     cloud_used: bool,
     gap: int,
@@ -97,7 +95,7 @@ def tracks_of(
         seq=mark.seq,
         stamp_ns=mark.stamp_ns,
         session=session,
-        revision=0,
+        revision=revision,
         profile=parameters.name,
         cloud_used=cloud_used,
         gap=gap,

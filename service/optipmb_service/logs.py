@@ -20,17 +20,11 @@ EVENTS: Final = {
     "peer_connected": "A node, router or service is linked to this process.",
     "peer_lost": "That link is gone. A client links again by itself and recovers what the caches still hold.",
     "session_opened": "A stream sent its first valid message, or parameters were set for it.",
-    "session_restored": "A stream's session goes on from its checkpoint; what it missed is asked of the publishers.",
     "session_begun": "A density began: `first` frame, `publisher` restarted with a jump, a `jump` of stamps, `reset`, "
-    "`parameters`. Repeated jumps: check the sensor's clock.",
-    "session_closed": "A session was freed: `idle` for long, by a `query`, or `superseded` by another instance.",
-    "checkpoint_torn": "A checkpoint cannot be read; it is set aside and the one before it is used.",
-    "checkpoint_refused": "Another instance has taken the stream over; this one's checkpoint was not written.",
-    "store_failed": "Checkpoints cannot be written (disk full, read-only?): tracking goes on, the state is `degraded`.",
-    "store_back": "Checkpoints are written again.",
-    "tenure_lapsed": "This process was frozen, starved or cut off: nothing is published until it has looked whether"
-    " another instance took over.",
-    "tenure_renewed": "It has looked; what is still its own goes on.",
+    "`parameters`, a `pose` far off, the end of a `quarantine`. Repeated jumps: check the sensor's clock.",
+    "session_quarantined": "Tracking a stream raised `error`: its frames are refused until a reset or another start of "
+    "the publisher. Its last frames are saved; report them.",
+    "session_closed": "A session was freed: `idle` for long, by a `query`, or `moved` to another worker.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames came again.",
     "problem": "Something was refused or lost; `count` equal ones since the last line. See the problems below.",
@@ -39,16 +33,29 @@ EVENTS: Final = {
     "reply_failed": "Who asked was gone before the answer.",
     "query": "A query was answered (level debug).",
     "internal_error": "A fault of the service, with its traceback: report it. The stream goes on.",
-    "stop_asked": "SIGINT or SIGTERM came; the service ends within two seconds.",
+    "worker_started": "The parent has started a worker process.",
+    "worker_ended": "A worker process has ended by itself, with this status (below 0: killed by this signal). It is"
+    " started again after `again_s`, and its streams come back; until then the state is `degraded`.",
+    "worker_killed": "A worker process did not end in time.",
+    "parent_gone": "A worker noticed that its parent has died, and ends.",
+    "stream_moved": "An operator gave the stream to another worker.",
+    "stop_asked": "SIGINT or SIGTERM came, or the parent ends its worker; it ends within two seconds.",
     "stop_asked_again": "Another signal came; it changes nothing.",
     "stopped": "The end. `drained` is false when a step was abandoned because it took too long.",
 }
 """Every event that is logged, and what an operator makes of it."""
 
 
-def configure(form: Literal["console", "json"], level: str) -> None:
-    """Send the log lines to stderr, as coloured text on a terminal, plain text elsewhere, or JSON."""
-    processors: list[Processor] = [
+def configure(form: Literal["console", "json"], level: str, worker: int | None = None) -> None:
+    """Send the log lines to stderr, as coloured text on a terminal, plain text elsewhere, or JSON.
+
+    Args:
+        form: text or JSON.
+        level: the least that is logged.
+        worker: number of the worker process, written into every line; None: it is none.
+    """
+    processors: list[Processor] = [] if worker is None else [lambda _logger, _name, event: {**event, "worker": worker}]
+    processors += [
         structlog.contextvars.merge_contextvars,
         structlog.processors.add_log_level,
         structlog.processors.TimeStamper(fmt="iso", utc=True),

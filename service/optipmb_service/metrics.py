@@ -116,7 +116,7 @@ class Metrics:
 
     def add(self, figures: Callable[[], Iterable[Value]]) -> None:
         """Have figures read whenever somebody asks."""
-        self._registry.register(_Read(figures))
+        self._registry.register(Read(figures))
 
     def text(self) -> bytes:
         """Return all figures in Prometheus' text format."""
@@ -127,13 +127,14 @@ class Metrics:
         return Counter(NAMESPACE + name, metric.meaning, metric.labels, registry=self._registry)
 
 
-class _Read:
+class Read:
     """Asks for figures at every collection."""
 
     def __init__(self, figures: Callable[[], Iterable[Value]]) -> None:
         self._figures = figures
 
     def collect(self) -> Iterator[Metric]:
+        """Read the figures now."""
         grouped: defaultdict[str, list[tuple[tuple[str, ...], float]]] = defaultdict(list)
         for name, labels, value in self._figures():
             grouped[name].append((labels, value))

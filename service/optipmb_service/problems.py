@@ -29,11 +29,25 @@ CODES: Final = {
         "Objects of a class that the profile lacks are left out; told once per session.",
         "Choose another profile, or send the names of its classes.",
     ),
-    "late": ("A later frame was tracked already.", "Publish in order; give frames one publisher."),
+    "late": (
+        "The frame came later than the window in which tracks are corrected.",
+        "Publish in order, or raise `rewind_s`.",
+    ),
     "duplicate_epoch": ("A publisher that another one has replaced still sends.", "Stop one of the two publishers."),
     "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or give more processors."),
     "refused": ("No room for another session, or a change that needs a restart.", "Raise `max_sessions`; see `path`."),
-    "internal": ("A fault of the service; the frame is skipped.", "Report it with the frame's `seq` and the log."),
+    "astray": (
+        "The sensor cannot have got there since its last frame; the frame is refused.",
+        "Check the localisation; if it is right, raise `max_speed`.",
+    ),
+    "internal": (
+        "A fault of the service; the session is quarantined, its last frames are saved.",
+        "Report it with the saved file; `optipmb track --dump` replays it.",
+    ),
+    "quarantined": (
+        "Tracking this stream failed, see `internal`; its frames are refused.",
+        "Reset the session, or restart the publisher.",
+    ),
 }
 """Every code of a problem: what it means, and what to do."""
 

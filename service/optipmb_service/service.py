@@ -12,13 +12,9 @@ close.
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import os
-import signal
 import sys
-import threading
 import time
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import optipmb_schemas as schemas
 import structlog
@@ -26,15 +22,15 @@ import structlog
 import optipmb
 from optipmb_service import __version__, figures
 from optipmb_service.inbox import Pool
-from optipmb_service.keeper import open_keeper
+from optipmb_service.loops import Asked, beat, say_ready, unless
 from optipmb_service.metrics import Metrics
 from optipmb_service.ports import HttpError, TransportError
 from optipmb_service.problems import Desk
 from optipmb_service.queries import Queries
 from optipmb_service.registry import Registry
-from optipmb_service.steward import Steward
+from optipmb_service.share import Share
 from optipmb_service.transport import Transport
-from optipmb_service.vitals import BEAT_S, Vitals
+from optipmb_service.vitals import Vitals, shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -43,11 +39,8 @@ if TYPE_CHECKING:
     from optipmb_service.metrics import Value
     from optipmb_service.profiles import Profiles
     from optipmb_service.settings import Settings
-    from optipmb_service.share import Share
 
 log = structlog.get_logger("optipmb_service")
-
-_T = TypeVar("_T")
 
 HOUSEKEEPING_S: Final = 0.5
 DRAIN_POLL_S: Final = 0.01
@@ -81,22 +74,19 @@ class Service:
         self._settings = settings
         self._started_ns = time.time_ns()
         self._began_ns = time.monotonic_ns()
-        self._state = "starting"
+        self.state = "starting"
+        """As in the status."""
         self._metrics = metrics or Metrics()
         self._transport = Transport(settings)
         self._desk = Desk(self._transport.publish_problem, _log_problem)
         self._pool = Pool(settings.thread_count)
-        self._steward = Steward(settings.instance, self._transport, settings.lease_s)
-        self._keeper = open_keeper(settings, self._steward.may_write)
         self._registry = Registry(
             settings,
             profiles,
-            outlet=self._transport,
-            desk=self._desk,
-            pool=self._pool,
-            steward=self._steward,
-            keeper=self._keeper,
-            arm=arm,
+            self._transport,
+            self._desk,
+            self._pool,
+            arm,
             metrics=self._metrics,
             tracker=tracker,
             share=share,
@@ -104,18 +94,14 @@ class Service:
         self._metrics.add(self._figures)
         self._queries = Queries(self._registry, self.status, self._metrics.text)
 
-    def start(self) -> None:
+    def start(self, *, announce: bool = True) -> None:
         """Receive, answer, and say so."""
         self._transport.watch()
-        self._transport.watch_owners(
-            lambda stream, instance, present: self._steward.told(stream, instance, present=present)
-        )
-        self._steward.start(self._registry.changed, self._registry.resume)
-        self._keeper.start(self._registry.keep)
         self._transport.subscribe(self._registry.frame, self._registry.cloud, self._registry.wants)
         self._transport.serve(self._queries.about_streams, self._queries.about_service)
-        self._state = "ready"
-        self._transport.announce()
+        self.state = "ready"
+        if announce:
+            self._transport.announce()
 
     def housekeeping(self) -> None:
         """Do what is due about once a second."""
@@ -125,31 +111,30 @@ class Service:
 
     def stop(self) -> bool:
         """Track what was received, within the grace, and close; False when a step would not end."""
-        self._state = "stopping"
+        self.state = "stopping"
         ends = time.monotonic() + self._settings.grace_s
         self._transport.stop(JOIN_S)
-        if not self._keeper.durable:
-            self._registry.finish()  # else what waits for its cloud comes again from the publishers' caches
+        self._registry.finish()
         while self._registry.busy and time.monotonic() < ends:
             time.sleep(DRAIN_POLL_S)
         ended = self._pool.close(JOIN_S)
-        if ended:
-            self._registry.keep_now()
-        self._keeper.close(JOIN_S)
-        self._steward.close(JOIN_S)
         self._desk.flush(time.monotonic_ns())
         self._transport.close()
         return ended
 
-    @property
-    def state(self) -> str:
-        """What the service is: starting, ready, degraded (it tracks, and cannot keep checkpoints) or stopping."""
-        return "degraded" if self._state == "ready" and self._keeper.failure else self._state
+    def give_up(self, stream: str, then: Callable[[], None]) -> bool:
+        """End the session of a stream after what was received, then call `then`; False when there is none."""
+
+        def end(lane: Lane) -> None:
+            lane.close_session("moved")
+            then()
+
+        return self._registry.lane(stream) is not None and self._registry.command(stream, end, urgent=False)
 
     def status(self) -> schemas.ServiceStatus:
         """Return the answer to `q/status`."""
         now_ns = time.monotonic_ns()
-        totals = self._registry.totals()
+        counters = self._registry.totals().counters
         return schemas.ServiceStatus(
             instance=self._settings.instance,
             version=__version__,
@@ -157,14 +142,8 @@ class Service:
             uptime_s=(now_ns - self._began_ns) / 1e9,
             state=self.state,
             sessions=self._summaries(now_ns),
-            standby=self._registry.standing_by,
-            received=totals.received,
-            frames=totals.frames,
-            duplicates=totals.duplicates,
-            late=totals.late,
-            refused=totals.refused,
-            shed=totals.shed,
-            clouds_refused=totals.clouds_refused,
+            frames=counters.frames,
+            refused=counters.refused,
             problems=self._desk.newest(),
         )
 
@@ -187,33 +166,75 @@ class Service:
         yield from figures.of_streams(sessions, self._settings.http_streams)
 
 
-async def run(settings: Settings, profiles: Profiles) -> int:
+class Household(Protocol):
+    """What a process that tracks is to the one that started it."""
+
+    @property
+    def share(self) -> Share:
+        """The streams that it tracks."""
+
+    @property
+    def announces(self) -> bool:
+        """Whether it is an instance of its own to the network."""
+
+    def begin(self, asked: Asked) -> None:
+        """Listen for orders; the end may be one."""
+
+    def warm_up(self) -> None:
+        """Have the kernels ready."""
+
+    def ready(self, service: Service) -> None:
+        """Say that streams are served."""
+
+
+class Alone:
+    """A process of its own: prints the ready line.
+
+    Args:
+        settings: what is in force.
+    """
+
+    announces: Final = True
+
+    def __init__(self, settings: Settings) -> None:
+        self.share = Share()
+        self._settings = settings
+
+    def begin(self, asked: Asked) -> None:
+        """Do nothing: signals are enough."""
+
+    def warm_up(self) -> None:
+        """Compile the kernels, or load them."""
+        optipmb.warm_up()
+
+    def ready(self, service: Service) -> None:
+        """Print the line that starters wait for."""
+        del service
+        say_ready(self._settings)
+
+
+async def run(settings: Settings, profiles: Profiles, household: Household | None = None) -> int:
     """Run the service until SIGINT or SIGTERM.
+
+    Args:
+        settings: what is in force.
+        profiles: the parameters that can be had.
+        household: the parent and the share of a worker process; default: this process is alone and tracks all streams.
 
     Returns:
         The exit status: 0, or 1 when the network could not be used.
     """
+    household = household or Alone(settings)
     loop = asyncio.get_running_loop()
-    asked = asyncio.Event()
-
-    def ask(name: str) -> None:
-        log.info("stop_asked" if not asked.is_set() else "stop_asked_again", signal=name)
-        asked.set()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ask, number.name)
-
-    def arm(lane: Lane, at_ns: int) -> None:
-        # The loop's time and the deadlines are one clock, the monotonic one.
-        loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, lane.wake)
-
+    asked = Asked()
+    household.begin(asked)
     log.info("starting", instance=settings.instance, version=__version__, profiles=profiles.names)
     vitals = Vitals(settings.instance)
     try:
-        with _http(settings, vitals):
-            beating = loop.create_task(_beat(vitals))
+        with shown(settings, vitals):
+            beating = loop.create_task(beat(vitals))
             try:
-                return await _serve(settings, profiles, asked, arm, vitals)
+                return await _serve(settings, profiles, asked, vitals, household)
             finally:
                 beating.cancel()
     except (TransportError, HttpError) as error:
@@ -221,111 +242,39 @@ async def run(settings: Settings, profiles: Profiles) -> int:
         return 1
 
 
-async def _serve(
-    settings: Settings, profiles: Profiles, asked: asyncio.Event, arm: Callable[[Lane, int], None], vitals: Vitals
-) -> int:
+async def _serve(settings: Settings, profiles: Profiles, asked: Asked, vitals: Vitals, household: Household) -> int:
     """Run the service until the end is asked for.
 
     Raises:
         TransportError: the network cannot be used.
     """
-    await _unless(asked, optipmb.warm_up)
+    loop = asyncio.get_running_loop()
+
+    def arm(lane: Lane, at_ns: int) -> None:
+        # The loop's time and the deadlines are one clock, the monotonic one.
+        loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, lane.wake)
+
+    await unless(asked, household.warm_up)
     if asked.is_set():
         return 0
     if not settings.is_router:
         log.info("connecting", endpoints=settings.connect)
-    service = await _unless(asked, lambda: Service(settings, profiles, arm, metrics=vitals.metrics))
+    service = await unless(
+        asked, lambda: Service(settings, profiles, arm, metrics=vitals.metrics, share=household.share)
+    )
     if service is None:
         return 0
-    service.start()
-    vitals.serve(service)
-    endpoints = ",".join((*settings.endpoints, *settings.connect))
-    print(f"ready instance={settings.instance} endpoints={endpoints}", flush=True)  # noqa: T201 - what starters wait for
+    service.start(announce=household.announces)
+    vitals.report(service)
+    household.ready(service)
     log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
     while not asked.is_set():
-        await _passed(asked, HOUSEKEEPING_S)
+        await asked.wait(HOUSEKEEPING_S)
         service.housekeeping()
     vitals.ends()
     ended = await asyncio.to_thread(service.stop)
     log.info("stopped", drained=ended)
     return 0
-
-
-def leave(status: int) -> None:
-    """End the process; at once where a thread is stuck in machine code, which would crash an orderly end."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    if any(thread.daemon and thread.is_alive() for thread in threading.enumerate()):
-        os._exit(status)
-    sys.exit(status)
-
-
-async def _beat(vitals: Vitals) -> None:
-    while True:
-        vitals.beat()
-        await asyncio.sleep(BEAT_S)
-
-
-@contextlib.contextmanager
-def _http(settings: Settings, vitals: Vitals) -> Iterator[None]:
-    """Answer over HTTP, where that is asked for.
-
-    Raises:
-        HttpError: the address cannot be listened on.
-    """
-    if not settings.http:
-        yield
-        return
-    # A third of a second that only this needs.
-    from optipmb_service.http import Server, application, page  # noqa: PLC0415
-
-    server = Server(application(vitals, page(vitals)), settings.http)
-    log.info("http", address=server.address)
-    try:
-        yield
-    finally:
-        server.close()
-
-
-async def _passed(event: asyncio.Event, seconds: float) -> None:
-    """Wait for the event, at most so long."""
-    with contextlib.suppress(TimeoutError):
-        await asyncio.wait_for(event.wait(), seconds)
-
-
-async def _unless(asked: asyncio.Event, work: Callable[[], _T]) -> _T | None:
-    """Do blocking work on a thread; None when the end was asked for before it was done, the work is then abandoned."""
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[_T] = loop.create_future()
-
-    def settle(value: _T | None, error: BaseException | None) -> None:
-        if done.cancelled():
-            return
-        if error is not None:
-            done.set_exception(error)
-        else:
-            done.set_result(value)  # type: ignore[arg-type]  # without an error there is a value
-
-    def call() -> None:
-        value: _T | None = None
-        error: BaseException | None = None
-        try:
-            value = work()
-        except BaseException as raised:  # noqa: BLE001 - handed to whoever awaits it
-            error = raised
-        with contextlib.suppress(RuntimeError):  # the loop has ended: the work was abandoned
-            loop.call_soon_threadsafe(settle, value, error)
-
-    # A daemon: neither compiling nor waiting for a router can be interrupted, and neither may keep the process.
-    threading.Thread(target=call, name="start", daemon=True).start()
-    stop = loop.create_task(asked.wait())
-    waits: set[asyncio.Future[Any]] = {done, stop}
-    await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-    stop.cancel()
-    if not done.done():
-        done.cancel()
-        return None
-    return done.result()
 
 
 def _log_problem(problem: schemas.Problem, count: int) -> None:

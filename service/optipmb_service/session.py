@@ -1,66 +1,70 @@
-"""One session: the density of one stream and what decides about it. No I/O, no threads, no clock of its own.
+"""One session: what decides about a stream's messages. No I/O, no threads, no clock of its own.
 
-Conventions: `now_ns` is the local monotonic clock, handed in by the caller and used for nothing but waiting for point
-clouds; everything else follows from the messages. So the same messages in the same order give the same tracks, byte for
-byte. Frames are processed one by one in the order that `timing` gives them; a frame that cannot be processed changes
-nothing but the counters.
+Conventions: `now_ns` is the local monotonic clock, handed in by the caller and used for nothing but waiting, for point
+clouds and, after a restore, for frames that were missed; everything else follows from the messages. So the same
+messages give the same tracks, byte for byte, and those of the window give the same state in whatever order they come.
 
-A session id names one life of the density. It is derived from the stream, the frame at which that life began and the
-parameters, so that a repeated run gives it again, and a service that was restarted and went on with another frame does
-not.
+The parts: `timing` says where a frame belongs, `history` holds the window and goes over it again when it must,
+`stepping` takes one frame through the tracker. What is here is what happens around them: holding frames until they are
+ready, commands, the state to be written down, and what is done when a step fails.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from bisect import insort
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final, Self
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import optipmb_schemas as schemas
 
 import optipmb
 from optipmb_service import convert
-from optipmb_service.checkpoint import Checkpoint
+from optipmb_service.checkpoint import Checkpoint, CheckpointError, Recorded
 from optipmb_service.clouds import Clouds
-from optipmb_service.problems import problem_of
-from optipmb_service.records import SECOND, Begun, Counters, Life, Output, Policy, RefusedError, Steps, Tracked
+from optipmb_service.complaints import Complaints
+from optipmb_service.history import History
+from optipmb_service.moments import Entry, Moment, Whereabouts, weigh
+from optipmb_service.quarantine import dump_of
+from optipmb_service.records import (
+    SECOND,
+    Begun,
+    Counters,
+    Deliveries,
+    Life,
+    Output,
+    Policy,
+    Quarantined,
+    RefusedError,
+    Tracked,
+)
+from optipmb_service.stepping import Outcome, Stepper, empty
 from optipmb_service.timing import Decision, Mark, Timeline, Verdict, hold_until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from optipmb_service.records import Steps
+
 MAX_HELD: Final = 64
 """Frames held for their clouds at once; beyond it the oldest goes on without."""
 
-MAX_LABELS: Final = 256
-"""Unknown class names remembered as reported."""
+MAX_ERROR: Final = 400
+"""Characters kept of an error."""
+
+MAX_RECOVERING: Final = 1024
+"""Frames held for missed ones at once; beyond it they go on with a gap."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Held:
     message: schemas.Detections
     mark: Mark
-    decision: Decision
+    order: tuple[int, int, int]
+    frame: optipmb.Frame
+    ignored: int
     deadline_ns: int | None
     ticket: Any
-
-    @property
-    def order(self) -> tuple[int, int, int]:
-        return self.decision.era, self.mark.stamp_ns, self.mark.seq
-
-
-@dataclass(slots=True)
-class _Cell:
-    """The parts that a restart replaces together."""
-
-    density: optipmb.Density
-    session: str
-    generation: int
-    tracks: int = 0
-    reported: set[str] = field(default_factory=set)
 
 
 class Session:
@@ -69,7 +73,7 @@ class Session:
     Args:
         stream: `site/node/sensor`.
         parameters: the profile to track with.
-        policy: waiting and restarting.
+        policy: waiting, restarting, going back.
         instance: name of the service, for problems.
         life: what an earlier session of the stream left behind.
         tracker: makes the tracker; tests put their own here.
@@ -82,26 +86,27 @@ class Session:
         parameters: optipmb.Parameters,
         policy: Policy | None = None,
         *,
-        instance: str = "",
+        instance: str = "session",
         life: Life | None = None,
         tracker: Callable[[optipmb.Parameters], Steps] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> None:
         self.stream = stream
-        self.counters = Counters()
+        self._deliveries = Deliveries()
         self._policy = policy or Policy()
-        self._instance = instance
+        self._cloud_wait_ns: int | None = None
+        self._complain = Complaints(stream, instance)
         self._clock = clock
         self._make = tracker
-        self._timeline = Timeline(self._policy.gap_limit_ns)
+        self._stepper = Stepper(stream, parameters, tracker(parameters))
+        life = life or Life()
+        self._history = History(empty(self._stepper, None, life.next_id, life.starts), self._step)
+        self._done = Timeline(self._policy.gap_limit_ns)
+        self._arrived = self._done
         self._held: list[_Held] = []
         self._clouds = Clouds(self._policy.clouds)
-        self._last: Mark | None = None
         self._recovery_ns: int | None = None
-        life = life or Life()
-        self._starts = life.starts
-        self._use(parameters)
-        self._cell = _Cell(optipmb.Density.empty(life.next_id), self._name(None, life.starts), generation=0)
+        self._quarantine = ""
 
     # What arrives
 
@@ -114,17 +119,25 @@ class Session:
             message: the frame.
             now_ns: monotonic time.
             arrived_ns: when the frame arrived, if before now: its wait for a cloud began then.
-            ticket: comes back with the tracks of the frame.
+            ticket: comes back with the tracks of the frame, and with those that it corrects.
         """
         mark = Mark(message.epoch, message.seq, message.stamp_ns)
-        before = self._timeline
-        decision, self._timeline = before.judge(mark)
+        outputs: list[Output] = []
+        if self._quarantine:
+            if self._done.knows(mark.epoch):
+                self._deliveries.refused += 1
+                return [self._complain.quarantined(mark, self._quarantine)]
+            outputs += self.reset("quarantine")
+        decision, arrived = self._arrived.judge(mark)
         if not decision.verdict.admitted:
-            return self._refuse(mark, decision)
-        if decision.verdict in (Verdict.NEW_EPOCH, Verdict.RESTART):
-            self.counters.new_epochs += 1
-            if mark.epoch != before.epoch:
-                self._clouds.forget_publisher(before.epoch or b"")
+            return [*outputs, *self._refuse(mark, decision)]
+        try:
+            frame, ignored = convert.frame_of(self.parameters, message)
+        except optipmb.FrameError as error:
+            self._deliveries.refused += 1
+            self._done, self._arrived = self._done.note(mark), self._arrived.note(mark)
+            return [*outputs, self._complain.invalid(mark, error)]
+        self._arrived = arrived
         deadline_ns = hold_until(
             has_points=message.has_points,
             stamp_ns=mark.stamp_ns,
@@ -133,13 +146,26 @@ class Session:
             cloud_wait_ns=self._policy.cloud_wait_ns,
             cloud_memory_ns=self._policy.cloud_memory_ns,
         )
-        insort(self._held, _Held(message, mark, decision, deadline_ns, ticket), key=lambda held: held.order)
-        return self._advance(now_ns)
+        held = _Held(message, mark, decision.place.order(mark), frame, ignored, deadline_ns, ticket)
+        insort(self._held, held, key=lambda one: one.order)
+        return [*outputs, *self._advance(now_ns)]
 
-    def on_points(self, message: schemas.Points, now_ns: int) -> list[Output]:
-        """Take a cloud; returns what waited for it."""
+    def on_points(self, message: schemas.Points, now_ns: int, *, ticket: Any = None) -> list[Output]:
+        """Take a cloud; returns what waited for it and, by setting, what it corrects.
+
+        Args:
+            message: the cloud.
+            now_ns: monotonic time.
+            ticket: comes back with the tracks that the cloud corrects.
+        """
+        try:
+            convert.cloud_of(message)
+        except optipmb.FrameError as error:
+            self._deliveries.refused += 1
+            return [self._complain.invalid(Mark(message.epoch, message.seq, message.stamp_ns), error)]
         self._clouds.add(message)
-        return self._advance(now_ns)
+        outputs = self._amend(message, ticket) if self._policy.late_clouds and not self._quarantine else []
+        return [*outputs, *self._advance(now_ns)]
 
     def on_tick(self, now_ns: int) -> list[Output]:
         """Return what need not wait any longer."""
@@ -148,26 +174,43 @@ class Session:
     @property
     def deadline_ns(self) -> int | None:
         """When `on_tick` is due (monotonic, ns); None while nothing is held."""
-        return self._held[0].deadline_ns if self._held else None
+        if not self._held:
+            return None
+        return self._recovery_ns if self._incomplete(self._held[0]) else self._held[0].deadline_ns
 
     @property
     def held(self) -> int:
-        """Frames waiting for their clouds."""
+        """Frames waiting, for their clouds or for frames that were missed."""
         return len(self._held)
+
+    def refuse(self) -> None:
+        """Count a message of the stream that was none."""
+        self._deliveries.refused += 1
 
     # Commands
 
     def flush(self) -> list[Output]:
-        """Process what is held, without waiting for its clouds any longer."""
+        """Process what is held, without waiting any longer."""
         return self._advance(None)
 
     def reset(self, reason: str = "reset") -> list[Output]:
-        """Forget the density and begin anew; frames seen before stay seen, track ids go on."""
+        """Forget the density and begin anew; frames seen before stay seen, track ids go on, a quarantine ends."""
         outputs = self.flush()
-        self._starts += 1
-        empty = optipmb.Density.empty(self._cell.density.next_id)
-        self._cell = _Cell(empty, self._name(self._last, self._starts), self._cell.generation)
-        return [*outputs, Begun(self._cell.session, reason)]
+        self._quarantine = ""
+        head = self._history.head
+        starts = head.starts + 1
+        self._begin(
+            replace(
+                head,
+                density=optipmb.Density.empty(head.density.next_id),
+                session=self._stepper.name(head.last, starts),
+                starts=starts,
+                tracks=0,
+                reported=frozenset(),
+                whereabouts=Whereabouts(),
+            )
+        )
+        return [*outputs, Begun(self.session, reason)]
 
     def configure(
         self, parameters: optipmb.Parameters | None, cloud_wait_s: float | None, *, restart: bool
@@ -186,54 +229,37 @@ class Session:
             )
         outputs = self.flush() if changes else []
         if cloud_wait_s is not None:
-            self._policy = replace(self._policy, cloud_wait_ns=round(cloud_wait_s * SECOND))
+            self._wait(round(cloud_wait_s * SECOND))
         if parameters is not None and changes:
-            self._use(parameters)
+            # Frames are given to the tracker by the classes of the old profile: they cannot be gone over again.
+            self._begin(self._history.head)
+            self._stepper = Stepper(self.stream, parameters, self._make(parameters))
         if restart:
             outputs += self.reset("parameters")
         elif changes:
-            self._cell.session = self._name(None, self._starts)
+            head = self._history.head
+            self._begin(replace(head, session=self._stepper.name(None, head.starts)))
         return outputs
 
-    # What it is
-
-    @property
-    def session(self) -> str:
-        """The id of the present life of the density."""
-        return self._cell.session
-
-    @property
-    def density(self) -> optipmb.Density:
-        """The density after the last frame."""
-        return self._cell.density
-
-    @property
-    def cloud_wait_s(self) -> float:
-        """The longest wait for a cloud."""
-        return self._policy.cloud_wait_ns / SECOND
-
-    @property
-    def life(self) -> Life:
-        """What a later session of the stream has to know."""
-        return Life(self._starts, self._cell.density.next_id)
+    # To be written down and taken up again
 
     def snapshot(self) -> Checkpoint:
         """Return the state between two frames, as references to values that never change: cheap, to be encoded later.
 
         Frames that are held are not in it: they come again from the publisher's cache.
         """
-        cell = self._cell
+        base, entries = self._history.portable(self._policy.checkpoint_bytes)
         return Checkpoint(
-            self.stream,
-            cell.session,
-            self._starts,
-            cell.generation,
-            cell.tracks,
-            self.parameters,
-            cell.density,
-            self._timeline,
-            self._last,
-            replace(self.counters, received=self.counters.received - len(self._held)),
+            stream=self.stream,
+            parameters=self.parameters,
+            cloud_wait_ns=self._cloud_wait_ns,
+            quarantine=self._quarantine,
+            epochs=self._done.epochs,
+            base=base,
+            window=tuple(Recorded(one.message, one.points, one.missed, one.revision) for one in entries),
+            head=self._history.head,
+            deliveries=replace(self._deliveries),
+            newest_cloud_ns=self._clouds.newest_ns,
         )
 
     @classmethod
@@ -243,25 +269,25 @@ class Session:
         now_ns: int,
         policy: Policy | None = None,
         *,
-        instance: str = "",
+        instance: str = "session",
         tracker: Callable[[optipmb.Parameters], Steps] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> Self:
-        """Return the session that a checkpoint was taken of. It is `recovering` until `recovered` is called.
+        """Return the session that a checkpoint was taken of. It is `recovering` for a while.
 
         Args:
-            checkpoint: its state.
+            checkpoint: its state; its profile goes on too.
             now_ns: monotonic time; the waiting for missed frames begins now.
-            policy: waiting and restarting.
+            policy: waiting, restarting, going back.
             instance: name of the service, for problems.
             tracker: makes the tracker.
             clock: measures how long a step takes, ns.
+
+        Raises:
+            CheckpointError: its frames do not fit together.
         """
         session = cls(checkpoint.stream, checkpoint.parameters, policy, instance=instance, tracker=tracker, clock=clock)
-        session._starts, session._timeline, session._last = checkpoint.starts, checkpoint.timeline, checkpoint.last
-        session._cell = _Cell(checkpoint.density, checkpoint.session, checkpoint.generation, checkpoint.tracks)
-        session.counters = replace(checkpoint.counters)
-        session._recovery_ns = now_ns + session._policy.recovery_wait_ns
+        session._resume(checkpoint, now_ns)
         return session
 
     @property
@@ -274,29 +300,81 @@ class Session:
         self._recovery_ns = None
         return self._advance(now_ns)
 
+    # What it is
+
+    @property
+    def parameters(self) -> optipmb.Parameters:
+        """The profile."""
+        return self._stepper.parameters
+
+    @property
+    def session(self) -> str:
+        """The id of the present life of the density."""
+        return self._history.head.session
+
+    @property
+    def density(self) -> optipmb.Density:
+        """The density after the last frame."""
+        return self._history.head.density
+
+    @property
+    def counters(self) -> Counters:
+        """What happened to the messages so far."""
+        deliveries, counts = self._deliveries, self._history.head.counts
+        return Counters(
+            frames=counts.frames,
+            duplicates=deliveries.duplicates,
+            late=deliveries.late,
+            inserted=deliveries.inserted,
+            corrected=deliveries.corrected,
+            refused=deliveries.refused + counts.astray,
+            gaps=counts.gaps,
+            new_epochs=counts.new_epochs,
+            clouds_used=counts.clouds_used,
+            clouds_missed=counts.clouds_missed,
+            repaired=counts.repaired,
+        )
+
+    @property
+    def quarantine(self) -> str:
+        """The error for which frames are refused; empty while they are not."""
+        return self._quarantine
+
+    @property
+    def cloud_wait_s(self) -> float:
+        """The longest wait for a cloud."""
+        return self._policy.cloud_wait_ns / SECOND
+
+    @property
+    def life(self) -> Life:
+        """What a later session of the stream has to know."""
+        head = self._history.head
+        return Life(head.starts, head.density.next_id)
+
     def state(self, *, shed: int = 0, queue: int = 0, closed: bool = False) -> schemas.SessionState:
         """Return the state as the message that answers a query."""
-        counters, density, last = self.counters, self._cell.density, self._last
+        head, counters = self._history.head, self.counters
+        density, last = head.density, head.last
+        state: Literal["new", "running", "recovering", "quarantined", "closed"] = "running"
+        if closed:
+            state = "closed"
+        elif self._quarantine:
+            state = "quarantined"
+        elif self.recovering:
+            state = "recovering"
+        elif not counters.frames:
+            state = "new"
         return schemas.SessionState(
             stream=self.stream,
-            session=self._cell.session,
-            state="closed" if closed else "running" if counters.frames else "new",
+            session=head.session,
+            state=state,
             profile=self.parameters.name,
             epoch=last.epoch if last else None,
             seq=last.seq if last else None,
             stamp_ns=last.stamp_ns if last else None,
-            received=counters.received + shed + queue,
-            frames=counters.frames,
-            duplicates=counters.duplicates,
-            late=counters.late,
-            refused=counters.refused,
-            shed=counters.shed + shed,
-            gaps=counters.gaps,
-            new_epochs=counters.new_epochs,
-            clouds_used=counters.clouds_used,
-            clouds_missed=counters.clouds_missed,
-            clouds_refused=counters.clouds_refused,
-            tracks=self._cell.tracks,
+            shed=shed,
+            **{field.name: getattr(counters, field.name) for field in fields(Counters)},
+            tracks=head.tracks,
             bernoullis=len(density.bernoulli),
             poissons=len(density.poisson),
             next_id=density.next_id,
@@ -308,109 +386,148 @@ class Session:
     def _advance(self, now_ns: int | None) -> list[Output]:
         """Process the frames that are ready, in order; None: all of them."""
         outputs: list[Output] = []
+        if now_ns is not None and self._recovery_ns is not None and now_ns >= self._recovery_ns:
+            self._recovery_ns = None
         while self._held:
             head = self._held[0]
-            points = None if head.message.has_points is False else self._clouds.get(head.mark.stamp_ns)
+            if now_ns is not None and len(self._held) <= MAX_RECOVERING and self._incomplete(head):
+                break
+            points = self._cloud(head)
             waits = points is None and head.deadline_ns is not None
-            if waits and now_ns is not None and now_ns < (head.deadline_ns or 0) and len(self._held) <= MAX_HELD:
+            many = len(self._held) > MAX_HELD and not self.recovering
+            if waits and now_ns is not None and now_ns < (head.deadline_ns or 0) and not many:
                 break
             del self._held[0]
-            self.counters.clouds_missed += waits
-            outputs += self._process(head, points)
+            outputs += self._process(head, points, missed=waits)
         return outputs
 
-    def _process(self, held: _Held, points: schemas.Points | None) -> list[Output]:
-        """Step the density by one frame; whatever fails leaves everything but the counters as it was."""
+    def _incomplete(self, held: _Held) -> bool:
+        """Whether a frame is to be held because frames before it may still come."""
+        return self.recovering and not self._done.complete_until(held.mark, self._history.head.tracked)
+
+    def _cloud(self, held: _Held) -> schemas.Points | None:
+        if held.message.has_points is False:
+            return None
+        return self._clouds.get(held.mark.epoch, held.mark.stamp_ns, self._arrived.knows)
+
+    def _process(self, held: _Held, points: schemas.Points | None, *, missed: bool) -> list[Output]:
+        """Put a frame in its place; when a step raises, the session is quarantined as it was before."""
         began_ns = self._clock()
-        mark, old = held.mark, self._cell
-        self._clouds.forget_until(mark.stamp_ns, self._policy.gap_limit_ns)
-        gap, timeline = self._timeline.release(mark, held.decision.era)
-        anew = held.decision.generation != old.generation
-        begins = anew or self._last is None
-        density = optipmb.Density.empty(old.density.next_id) if anew else old.density
-        session = self._name(mark, self._starts + 1) if begins else old.session
+        mark = held.mark
+        decision, done = self._done.judge(mark)
+        if not decision.verdict.admitted:
+            return self._refuse(mark, decision)
+        weight = weigh(held.message, points)
+        entry = Entry(mark, decision.place, held.message, points, missed, 0, held.frame, held.ignored, weight)
+        placed = [*self._history.entries, entry] if decision.last else self._history.inserted(entry, done.places())
+        before = self.session
         try:
-            frame, ignored = convert.frame_of(self.parameters, held.message, points)
-            result = self._tracker.step(density, frame)
-            used = bool(result.diagnostics.cloud_used)
-            tracks = convert.tracks_of(
-                result.tracks,
-                stream=self.stream,
-                mark=mark,
-                session=session,
-                parameters=self.parameters,
-                cloud_used=used,
-                gap=gap,
-                ignored=ignored,
-            )
-        except optipmb.FrameError as error:
-            self.counters.refused += 1
-            return [self._problem("invalid_value", error.path, error.expected, error.received, mark)]
+            outcomes = self._history.append(entry) if decision.last else self._history.redo(placed)
         except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
-            self.counters.refused += 1
-            received = f"{type(error).__name__}: {error}"
-            return [self._problem("internal", "", "a step of the tracker without an error", received, mark)]
+            return self._fail(error, placed, mark)
+        self._settle(done)
+        self._deliveries.inserted += not decision.last
+        return self._report(outcomes, before, held.ticket, began_ns)
+
+    def _amend(self, message: schemas.Points, ticket: Any) -> list[Output]:
+        """Put a cloud that came after its frame into the window."""
+        began_ns, before = self._clock(), self.session
+        placed = self._history.amended(message, self._done.knows)
+        if all(new is old for new, old in zip(placed, self._history.entries, strict=True)):
+            return []
+        try:
+            outcomes = self._history.redo(placed)
+        except Exception as error:  # noqa: BLE001 - as above
+            return self._fail(error, placed, Mark(message.epoch, message.seq, message.stamp_ns))
+        self._settle(self._done)
+        self._deliveries.inserted += 1
+        return self._report(outcomes, before, ticket, began_ns)
+
+    def _report(self, outcomes: list[Outcome], before: str, ticket: Any, began_ns: int) -> list[Output]:
+        """Return what is to be told of frames that were gone through."""
         outputs: list[Output] = []
-        if begins:
-            reason = "first" if self._last is None else "publisher" if mark.epoch != self._last.epoch else "jump"
-            outputs.append(Begun(session, reason, held.decision.jump_ns))
-            self._starts += 1
-            self._cell = _Cell(result.density, session, held.decision.generation)
-        self._timeline, self._last = timeline, mark
-        self._cell.density, self._cell.tracks = result.density, len(tracks.id)
-        self.counters.frames += 1
-        self.counters.gaps += gap
-        self.counters.clouds_used += used
-        outputs += self._unknown(held) if ignored else ()
-        outputs.append(Tracked(tracks, held.ticket, self._clock() - began_ns))
+        begins = next((one.begins for one in reversed(outcomes) if one.begins), None)
+        if begins is not None and self.session != before:
+            outputs.append(Begun(self.session, begins.reason, begins.jump_ns))
+        step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
+        for one in outcomes:
+            if one.entry.revision == 0:
+                outputs += self._complain.unknown(one.entry.mark, one.unknown, self.parameters)
+                if one.tracks is None:
+                    outputs.append(self._complain.astray(one.entry, self._policy))
+            if one.tracks is not None:
+                self._deliveries.corrected += one.entry.revision > 0
+                outputs.append(Tracked(one.tracks, ticket, step_ns))
         return outputs
-
-    def _use(self, parameters: optipmb.Parameters) -> None:
-        self.parameters = parameters
-        self._tracker = self._make(parameters)
-        values = json.dumps(parameters.model_dump(mode="json"))
-        self._digest = hashlib.blake2b(values.encode(), digest_size=16).digest()
-
-    def _name(self, mark: Mark | None, starts: int) -> str:
-        digest = hashlib.blake2b(self._digest, digest_size=16, person=b"optipmb-session")
-        where = (mark.epoch.hex(), mark.seq, mark.stamp_ns) if mark else ()
-        digest.update(json.dumps([self.stream, starts, *where]).encode())
-        return digest.hexdigest()
-
-    # Problems
 
     def _refuse(self, mark: Mark, decision: Decision) -> list[Output]:
         if decision.verdict is Verdict.DUPLICATE:
-            self.counters.duplicates += 1
+            self._deliveries.duplicates += 1
             return []
         if decision.verdict is Verdict.RETIRED:
-            self.counters.refused += 1
-            expected = "the newest publisher of the stream; an earlier one still sends"
-            return [self._problem("duplicate_epoch", "epoch", expected, mark.epoch.hex(), mark)]
-        self.counters.late += 1
-        expected = "a frame after the last one processed"
-        return [self._problem("late", "stamp_ns", expected, f"{decision.jump_ns / SECOND:+.3f} s", mark)]
+            self._deliveries.refused += 1
+            return [self._complain.retired(mark)]
+        self._deliveries.late += 1
+        return [self._complain.late(mark, decision.place.jump_ns)]
 
-    def _unknown(self, held: _Held) -> list[Output]:
-        problems: list[Output] = []
-        for label, count in convert.unknown_labels(self.parameters, held.message).items():
-            if label in self._cell.reported or len(self._cell.reported) >= MAX_LABELS:
-                continue
-            self._cell.reported.add(label)
-            expected = f"one of {', '.join(self.parameters.classes)} (profile {self.parameters.name})"
-            problem = self._problem("unknown_class", "labels", expected, repr(label), held.mark)
-            problems.append(problem.model_copy(update={"count": count}))
-        return problems
+    def _fail(self, error: Exception, placed: list[Entry], mark: Mark) -> list[Output]:
+        """Take no more frames; the one that failed and what is held go, unprocessed."""
+        self._quarantine = f"{type(error).__name__}: {error}"[:MAX_ERROR]
+        self._deliveries.refused += 1 + len(self._held)
+        self._held.clear()
+        self._done = self._arrived = self._done.note(mark)
+        dump = dump_of(self._stepper, self._history.base, placed, self._policy, error)
+        return [self._complain.failed(mark, self._quarantine), Quarantined(self._quarantine, dump)]
 
-    def _problem(self, code: str, path: str, expected: str, received: str, mark: Mark) -> schemas.Problem:
-        return problem_of(
-            code,
-            stream=self.stream,
-            instance=self._instance,
-            path=path,
-            expected=expected,
-            received=received,
-            message=f"Frame {mark.seq}: {path or 'tracker'}: expected {expected}, received {received}.",
-            seq=mark.seq,
-            stamp_ns=mark.stamp_ns,
+    def _settle(self, done: Timeline) -> None:
+        """Take over the timeline with a frame, and let go what the window does not hold any more."""
+        gone = self._history.trim(self._policy)
+        base = self._history.base
+        if gone:
+            done = done.settle(base.course, base.last, gone)
+            self._arrived = self._arrived.settle(base.course, base.last, gone)
+            if base.last is not None:
+                self._clouds.forget_before(base.last.stamp_ns, self._policy.gap_limit_ns)
+        self._done = done
+        if not self._held:
+            self._arrived = done
+
+    def _begin(self, moment: Moment) -> None:
+        """Go on from a moment without a way back behind it."""
+        self._history = History(moment, self._step)
+        self._done = self._done.settle(moment.course, moment.last, frozenset(self._done.marks))
+        self._arrived = self._done
+
+    def _resume(self, checkpoint: Checkpoint, now_ns: int) -> None:
+        if checkpoint.cloud_wait_ns is not None:
+            self._wait(checkpoint.cloud_wait_ns)
+        self._quarantine = checkpoint.quarantine
+        self._deliveries = replace(checkpoint.deliveries)
+        self._clouds.newest_ns = checkpoint.newest_cloud_ns
+        self._recovery_ns = now_ns + self._policy.recovery_wait_ns
+        base = checkpoint.base
+        by_mark = {one.mark: one for one in checkpoint.window}
+        self._done = Timeline.resume(
+            self._policy.gap_limit_ns, checkpoint.epochs, base.course, base.last, frozenset(by_mark)
         )
+        self._arrived = self._done
+        places = self._done.places()
+        entries: list[Entry] = []
+        for mark, one in by_mark.items():
+            try:
+                frame, ignored = convert.frame_of(self.parameters, one.message)
+            except optipmb.FrameError as error:
+                raise CheckpointError(f"window: {error}") from error
+            weight = weigh(one.message, one.points)
+            entries.append(
+                Entry(mark, places[mark], one.message, one.points, one.missed, one.revision, frame, ignored, weight)
+            )
+        entries.sort(key=lambda one: one.order)
+        self._history = History(base, self._step, entries, checkpoint.head)
+
+    def _wait(self, cloud_wait_ns: int) -> None:
+        self._cloud_wait_ns = cloud_wait_ns
+        self._policy = replace(self._policy, cloud_wait_ns=cloud_wait_ns)
+
+    def _step(self, before: Moment, entry: Entry) -> tuple[Moment, Outcome]:
+        return self._stepper.step(before, entry, self._policy)

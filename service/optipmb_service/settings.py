@@ -13,7 +13,7 @@ import re
 import socket
 import tomllib
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path  # noqa: TC003 - pydantic reads the annotation
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from optipmb_schemas import DEFAULT, Limits
@@ -120,6 +120,11 @@ class Settings(BaseSettings):
         default=None, description=f"endpoints to listen on; default: `{DEFAULT_LISTEN}` as a router, none as a client"
     )
     connect: Endpoints = Field(default=(), description="endpoints of the routers to connect to; retried for ever")
+    zenoh_config: Path | None = Field(
+        default=None,
+        description="Zenoh configuration file (JSON5) for what has no setting here: TLS, access control, limits of a"
+        " router; the settings hold over it",
+    )
     shared_memory: bool = Field(
         default=False,
         description="Zenoh's implicit shared memory; faster for clouds on one host, but it may lose messages and leaves"
@@ -142,50 +147,41 @@ class Settings(BaseSettings):
     gap_limit_s: float = Field(
         default=5.0, gt=0, le=86400, description="a larger step of the stamps, ahead or back, starts the session anew"
     )
+    rewind_s: float = Field(
+        default=1.0,
+        ge=0,
+        le=60,
+        description="sensor time within which a late frame is put in its place and tracks are corrected; 0: refused",
+    )
+    late_clouds: bool = Field(
+        default=False, description="whether a cloud that comes after its frame was tracked corrects the tracks too"
+    )
+    recovery_wait_s: float = Field(
+        default=2.0, ge=0, le=60, description="after a restart, longest wait of frames behind a gap for those missing"
+    )
+    max_speed: float = Field(
+        default=100.0,
+        ge=0,
+        le=1e6,
+        description="fastest that a sensor moves, m/s; frames whose pose lies beyond are refused; 0: any pose is taken",
+    )
     queue_frames: int = Field(
         default=256, ge=1, le=65536, description="frames waiting per stream; the oldest is shed beyond it"
     )
     queue_clouds: int = Field(
         default=16, ge=1, le=1024, description="point clouds kept per stream; the oldest is shed beyond it"
     )
-    threads: int = Field(default=0, ge=0, le=256, description="threads that track; 0: one per processor, at most 8")
+    workers: int = Field(
+        default=1, ge=1, le=64, description="processes that track, each a share of the streams; 1: this process itself"
+    )
+    threads: int = Field(
+        default=0, ge=0, le=256, description="threads that track, per worker; 0: one per processor, at most 8"
+    )
     max_sessions: int = Field(
         default=1000, ge=1, le=100_000, description="streams tracked at once; further ones are refused"
     )
     idle_s: float = Field(
         default=600.0, gt=0, description="a session without a message for this long is closed and freed"
-    )
-    store: str = Field(
-        default="",
-        description="folder of the checkpoints and of quarantined sessions; `none`: nothing is kept, a restart begins"
-        " anew; default: a folder named after prefix and endpoint in `$STATE_DIRECTORY`, else in `optipmb` under"
-        " `$XDG_STATE_HOME` or `~/.local/state`",
-    )
-    checkpoint_s: float = Field(
-        default=1.0, ge=0.05, le=3600, description="time between two checkpoints of a session that changed"
-    )
-    recovery_wait_s: float = Field(
-        default=2.0,
-        ge=0,
-        le=60,
-        description="after a restart, longest wait for frames that publishers may still have; what is missing then is"
-        " counted as a gap",
-    )
-    lease_s: float = Field(
-        default=3.0,
-        ge=0.5,
-        le=60,
-        description="an instance that is frozen, or cut off, for this long loses its streams to one that stands by",
-    )
-    standby_s: float = Field(
-        default=10.0,
-        ge=0,
-        le=600,
-        description="how much of a stream that another instance tracks is kept for a takeover; longer than `lease_s`"
-        " and `checkpoint_s` together",
-    )
-    standby_mb: int = Field(
-        default=256, ge=1, le=65536, description="megabytes kept for takeovers, over all streams; clouds go first"
     )
     stale_s: float = Field(default=2.0, gt=0, description="a stream without a frame for this long is logged as stale")
     grace_s: float = Field(default=1.0, ge=0, le=60, description="at the end, time for the frames already received")
@@ -218,19 +214,6 @@ class Settings(BaseSettings):
     def thread_count(self) -> int:
         """Number of threads that track, of one process."""
         return self.threads or min(8, os.cpu_count() or 1)
-
-    @property
-    def folder(self) -> Path | None:
-        """Where state is kept; None: nowhere."""
-        if self.store == "none":
-            return None
-        if self.store:
-            return Path(self.store).expanduser()
-        state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-        home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-        # Instances on one network share the state, other networks of the same host have their own.
-        where = re.sub(r"[^A-Za-z0-9_.]+", "-", f"{self.prefix} {(*self.connect, *self.endpoints)[0]}")
-        return Path(state or Path(home) / "optipmb") / where
 
     @classmethod
     def settings_customise_sources(
@@ -289,6 +272,11 @@ def load(file: Path | None = None, options: Mapping[str, Any] | None = None) -> 
         raise SettingsInvalidError(f"setting {path}{where}: {message}") from error
     if not settings.endpoints and not settings.connect:
         raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
+    if settings.workers > 1 and settings.zenoh_config is not None and settings.is_router:
+        # Its access control would be deaf to the workers, which come over a socket and without a certificate.
+        raise SettingsInvalidError(
+            "setting workers: with zenoh_config, a router of its own: start `optipmb-service router` and connect to it"
+        )
     known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields}
     unknown = (name for name in os.environ if name.startswith(PREFIX) and name.split("__")[0] not in known)
     return Loaded(settings, sources, tuple(sorted(unknown)))

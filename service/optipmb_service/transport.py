@@ -31,6 +31,7 @@ from optipmb_service.ports import Packet, TransportError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
+    from pathlib import Path
 
     from optipmb_service.ports import Request
     from optipmb_service.settings import Settings
@@ -46,15 +47,6 @@ TRACKS_CACHE: Final = 128
 
 HEARTBEAT_S: Final = 0.2
 """How long the loss of the newest tracks may stay unnoticed."""
-
-CLAIM: Final = "/claim"
-"""Ending of the liveliness keys by which instances settle who may have a stream, before one says that it has."""
-
-TOKENS: Final = 2**20
-"""More tokens than there are."""
-
-OWNERS_S: Final = 1.0
-"""How long the network may take to say who owns a stream; it takes less than a millisecond."""
 
 WAIT_BEFORE_DROP_US: Final = 50_000
 WAIT_BEFORE_DROP_FRAGMENTS_US: Final = 500_000
@@ -91,7 +83,7 @@ def configuration(settings: Settings) -> zenoh.Config:
     """Return Zenoh's configuration for the settings.
 
     Raises:
-        TransportError: an endpoint that Zenoh cannot use.
+        TransportError: an endpoint or a file that Zenoh cannot use.
     """
     values: dict[str, object] = {
         "mode": "router" if settings.is_router else "client",
@@ -103,20 +95,50 @@ def configuration(settings: Settings) -> zenoh.Config:
         "scouting/delay": 0,
         "timestamping/enabled": True,
         "transport/shared_memory/enabled": settings.shared_memory,
-        "transport/link/tx/lease": round(settings.lease_s * 1e3),
         "transport/link/rx/max_message_size": MESSAGE_HEADROOM * settings.limits.max_bytes,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
         "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": WAIT_BEFORE_DROP_FRAGMENTS_US,
     }
     if settings.is_router:
         values["connect/exit_on_failure"] = False  # a router starts without the routers that it looks for
-    config = zenoh.Config()
+    config = _base(settings.zenoh_config)
     for key, value in values.items():
         try:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
             raise TransportError(f"setting {key}: {_line(error)}") from error
     return config
+
+
+def _base(file: Path | None) -> zenoh.Config:
+    """Return what the settings are laid over."""
+    try:
+        return zenoh.Config() if file is None else zenoh.Config.from_file(file)
+    except (zenoh.ZError, OSError) as error:
+        reason = _line(error) if isinstance(error, zenoh.ZError) else str(error)
+        raise TransportError(f"Zenoh configuration {file}: {reason}") from error
+
+
+class Router:
+    """A Zenoh router and nothing else.
+
+    Args:
+        settings: endpoints, and the file with everything else.
+
+    Raises:
+        TransportError: an endpoint is in use or unusable, or the file is.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        try:
+            self._session = zenoh.open(configuration(settings))
+        except zenoh.ZError as error:
+            raise TransportError(_opening(settings, error)) from error
+
+    def close(self) -> None:
+        """Close the router; who is linked to it looks for another one."""
+        with contextlib.suppress(zenoh.ZError):
+            cast("_Closed", self._session).close()
 
 
 class Transport:
@@ -134,7 +156,6 @@ class Transport:
         self._prefix = settings.prefix
         self._instance = settings.instance
         self._max_bytes = settings.limits.max_bytes
-        self._is_router = settings.is_router
         try:
             self._session = zenoh.open(configuration(settings))
         except zenoh.ZError as error:
@@ -163,12 +184,24 @@ class Transport:
 
     def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""
-        for key, answer in (
-            (f"{self._prefix}/*/*/*/q/*", about_streams),
-            (f"{self._prefix}/service/{self._instance}/q/*", about_service),
-        ):
-            queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(CHANNEL // 16))
-            self._read("queries", queryable, queryable.handler, _answering(answer))
+        self._serve(f"{self._prefix}/*/*/*/q/*", about_streams)
+        self.serve_service(about_service)
+
+    def serve_service(self, about_service: Callable[[Request], None]) -> None:
+        """Hand over the queries about this instance alone, on a thread of its own."""
+        self._serve(f"{self._prefix}/service/{self._instance}/q/*", about_service)
+
+    def ask(self, key: str, timeout: float) -> bytes | None:
+        """Ask at a key and return the first answer; None when none comes in time (s)."""
+        with contextlib.suppress(zenoh.ZError):  # the session is closed
+            for reply in self._session.get(key, timeout=timeout):
+                if (sample := reply.ok) is not None:
+                    return bytes(sample.payload.to_bytes())
+        return None
+
+    def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
+        queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(CHANNEL // 16))
+        self._read("queries", queryable, queryable.handler, _answering(answer))
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
         """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
@@ -239,7 +272,7 @@ class Transport:
         self._alive = self._session.liveliness().declare_token(self._keys.alive(self._instance))
 
     def claim(self, stream: str) -> Claim:
-        """Open the publisher of a stream's tracks; to be called by the owner of the stream.
+        """Become the owner of a stream.
 
         Raises:
             TransportError: the session is closed.
@@ -256,9 +289,10 @@ class Transport:
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
                 publisher_detection=True,
             )
+            token = self._session.liveliness().declare_token(self._keys.owner(stream, self._instance))
         except zenoh.ZError as error:
             raise TransportError(_line(error)) from error
-        claim = Claim(publisher, self._forget)
+        claim = Claim(publisher, token, self._forget)
         with self._lock:
             self._claims.add(claim)
         return claim
@@ -275,59 +309,6 @@ class Transport:
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.DATA_LOW,
             )
-
-    # Owners
-
-    def linked(self) -> bool:
-        """Whether this session is part of a network: a router always is, a client while it has a router."""
-        return self._is_router or bool(self._session.info.routers_zid())
-
-    def watch_owners(self, told: Callable[[str, str, bool], None]) -> None:
-        """Tell which instance claims which stream, or does so no longer (False), from now on."""
-        tokens = self._session.liveliness().declare_subscriber(
-            self._keys.all_owners(), zenoh.handlers.FifoChannel(CHANNEL), history=True
-        )
-
-        def receive(sample: zenoh.Sample) -> None:
-            key = str(sample.key_expr)
-            told(self._keys.stream_of(key), self._keys.instance_of(key), sample.kind == zenoh.SampleKind.PUT)
-
-        self._read("owners", tokens, tokens.handler, receive)
-
-    def declare_claim(self, stream: str) -> Token | None:
-        """Say that this instance wants a stream; None at the end, when the session is closed."""
-        return self._declare(f"{self._keys.owner(stream, self._instance)}{CLAIM}")
-
-    def declare_owner(self, stream: str) -> Token | None:
-        """Say that this instance tracks a stream; None at the end, when the session is closed."""
-        return self._declare(self._keys.owner(stream, self._instance))
-
-    def claimants(self, streams: Iterable[str] | None) -> dict[str, set[str]] | None:
-        """Return which instances want or have some streams, or any; None when it cannot be found out.
-
-        Whoever declares a claim and then asks, and whoever does the same at the same time: at least one sees the other.
-        That holds only for tokens that this session does not watch: of those that it watches Zenoh answers at once
-        from what it has been told so far.
-        """
-        owners = [self._keys.all_owners()] if streams is None else [self._keys.owners(stream) for stream in streams]
-        claimants: dict[str, set[str]] = {}
-        try:
-            for pattern in owners:
-                # Its own tokens are put into the channel before anybody reads it: it must not fill up.
-                channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(TOKENS)
-                for reply in self._session.liveliness().get(f"{pattern}{CLAIM}", channel, timeout=OWNERS_S):
-                    if (sample := reply.ok) is None:
-                        return None  # the timeout: nobody can say who else is there
-                    key = str(sample.key_expr).removesuffix(CLAIM)
-                    claimants.setdefault(self._keys.stream_of(key), set()).add(self._keys.instance_of(key))
-        except (zenoh.ZError, schemas.MessageError):
-            return None
-        return claimants
-
-    def _declare(self, key: str) -> Token | None:
-        with contextlib.suppress(zenoh.ZError):
-            return Token(self._session.liveliness().declare_token(key))
-        return None
 
     # The end
 
@@ -358,10 +339,11 @@ class Transport:
 
 
 class Claim:
-    """The publisher of a stream's tracks."""
+    """A stream that this instance tracks."""
 
-    def __init__(self, publisher: _Publisher, forget: Callable[[Claim], None]) -> None:
+    def __init__(self, publisher: _Publisher, token: _Undeclared, forget: Callable[[Claim], None]) -> None:
         self._publisher = publisher
+        self._token = token
         self._forget = forget
 
     def publish(self, payload: bytes) -> None:
@@ -376,20 +358,10 @@ class Claim:
             raise TransportError(_line(error)) from error
 
     def release(self) -> None:
-        """Withdraw the publisher."""
+        """Withdraw the publisher and the token."""
+        _undeclare(self._token)
         _undeclare(self._publisher)
         self._forget(self)
-
-
-class Token:
-    """A liveliness token; it vanishes with its process and its link too."""
-
-    def __init__(self, declared: _Undeclared) -> None:
-        self._declared = declared
-
-    def withdraw(self) -> None:
-        """Take it back."""
-        _undeclare(self._declared)
 
 
 class Question:

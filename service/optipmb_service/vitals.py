@@ -8,23 +8,48 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING, Final
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
+
+import structlog
 
 from optipmb_service import figures
 from optipmb_service.metrics import Metrics
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     import optipmb_schemas as schemas
 
-    from optipmb_service.service import Service
+    from optipmb_service.http.app import Source
+    from optipmb_service.settings import Settings
+
+log = structlog.get_logger("optipmb_service")
 
 BEAT_S: Final = 0.5
 STUCK_S: Final = 10.0
 """A loop that has not turned for so long is taken for stuck."""
 
 USABLE: Final = frozenset({"ready", "degraded"})
+
+
+class Reporter(Protocol):
+    """What works, seen from here."""
+
+    @property
+    def state(self) -> str:
+        """How it is, as in the status."""
+
+    def status(self) -> schemas.ServiceStatus | None:
+        """Return its report; None when it makes none."""
+
+
+@runtime_checkable
+class Tapped(Protocol):
+    """What has streams that can be looked at."""
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
+        """Hand over what comes on a stream to a viewer, until the result is called."""
 
 
 class Vitals:
@@ -36,7 +61,7 @@ class Vitals:
 
     def __init__(self, instance: str) -> None:
         self.metrics = Metrics()
-        self._service: Service | None = None
+        self._service: Reporter | None = None
         self._state = "starting"
         self._lock = threading.Lock()
         self._beat_ns = time.monotonic_ns()
@@ -46,8 +71,8 @@ class Vitals:
         """Say that the control loop turns."""
         self._beat_ns = time.monotonic_ns()
 
-    def serve(self, service: Service) -> None:
-        """Report what this service says from now on."""
+    def report(self, service: Reporter) -> None:
+        """Say what this one says, from now on."""
         with self._lock:
             self._service = service
 
@@ -80,8 +105,30 @@ class Vitals:
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
         """Hand over what comes on a stream to a viewer, until the result is called; None while the service starts."""
         service = self._service
-        return None if service is None else service.tap(stream, receive)
+        return service.tap(stream, receive) if isinstance(service, Tapped) else None
 
     def text(self) -> bytes:
         """Return the metrics in Prometheus' text format."""
         return self.metrics.text()
+
+
+@contextmanager
+def shown(settings: Settings, source: Source) -> Iterator[None]:
+    """Answer over HTTP, where that is asked for.
+
+    Raises:
+        HttpError: the address cannot be listened on.
+    """
+    if not settings.http:
+        yield
+        return
+    # A third of a second that only this needs.
+    from optipmb_service.http import Server, application, page  # noqa: PLC0415
+
+    # Only a process that tracks can show streams as they come.
+    server = Server(application(source, page(source) if isinstance(source, Vitals) else ()), settings.http)
+    log.info("http", address=server.address)
+    try:
+        yield
+    finally:
+        server.close()

@@ -6,6 +6,7 @@ from optipmb_schemas import (
     Delivery,
     Detections,
     Message,
+    MoveRequest,
     Points,
     Pose,
     Problem,
@@ -104,7 +105,17 @@ def _examples() -> list[Message]:
         refused=4,
         problems=(problem,),
     )
-    return [detections, points, tracks, state, parameters, ResetRequest(close=True), problem, status]
+    return [
+        detections,
+        points,
+        tracks,
+        state,
+        parameters,
+        ResetRequest(close=True),
+        MoveRequest(stream="a/b/c", worker=1),
+        problem,
+        status,
+    ]
 
 
 @pytest.fixture(scope="session")

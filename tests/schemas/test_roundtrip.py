@@ -13,6 +13,7 @@ from optipmb_schemas import (
     Delivery,
     Detections,
     Message,
+    MoveRequest,
     Points,
     Pose,
     Problem,
@@ -194,6 +195,7 @@ messages: dict[type[Message], st.SearchStrategy[Message]] = {
         values=st.none() | values,
     ),
     ResetRequest: st.builds(ResetRequest, close=st.booleans()),
+    MoveRequest: st.builds(MoveRequest, stream=stream, worker=st.integers(0, 63)),
     Problem: problems,
     ServiceStatus: st.builds(
         ServiceStatus,

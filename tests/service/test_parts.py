@@ -219,17 +219,27 @@ def test_figures_of_a_stream() -> None:
 
 
 def test_clouds_are_found_by_stamp_and_bounded() -> None:
-    """The newest clouds stay; those up to a processed frame go, those of a jump away stay."""
+    """The newest clouds stay; those before a stamp go, those of a jump away stay."""
     clouds = Clouds(3)
+
+    def found(seq: int, publishers: bytes = b"") -> bool:
+        return clouds.get(SENSOR.epoch, SENSOR.stamp_ns(seq), lambda epoch: epoch == publishers) is not None
+
     for seq in range(5):
         clouds.add(SENSOR.points(seq))
-    assert [clouds.get(SENSOR.stamp_ns(seq)) is not None for seq in range(5)] == [False, False, True, True, True]
-    clouds.forget_until(SENSOR.stamp_ns(3), SECOND)
+    assert [found(seq) for seq in range(5)] == [False, False, True, True, True]
+    clouds.forget_before(SENSOR.stamp_ns(4), SECOND)
     assert len(clouds) == 1
-    clouds.forget_until(SENSOR.stamp_ns(4) + 2 * SECOND, SECOND)
+    clouds.forget_before(SENSOR.stamp_ns(4) + 2 * SECOND, SECOND)
     assert len(clouds) == 1
-    clouds.forget_publisher(SENSOR.epoch)
-    assert len(clouds) == 0
+
+
+def test_clouds_of_other_publishers() -> None:
+    """A cloud of an epoch with detections belongs to them alone; one of a program of its own to any frame."""
+    clouds = Clouds(3)
+    clouds.add(SENSOR.points(0, epoch=b"f" * 16))
+    assert clouds.get(SENSOR.epoch, SENSOR.stamp_ns(0), lambda _: True) is None
+    assert clouds.get(SENSOR.epoch, SENSOR.stamp_ns(0), lambda _: False) is not None
 
 
 # Settings and profiles

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from optipmb_schemas import Problem, Tracks
-from optipmb_service.records import Begun, Life, Output, Policy, RefusedError, Tracked
+import sessions
+from optipmb_service.records import Life, Output, Policy, RefusedError
 from optipmb_service.session import Session
 from router import SECOND, Sensor, plain
+from sessions import begun, problems, tracks
 
 import optipmb
 
@@ -21,43 +20,14 @@ WAIT_NS = Policy().cloud_wait_ns
 SENSOR = Sensor()
 
 
-class Failing:
-    """A tracker that raises whenever a frame has a given number of detections."""
-
-    def __init__(self, parameters: optipmb.Parameters, count: int = 7) -> None:
-        self._tracker = optipmb.Tracker(parameters)
-        self._count = count
-
-    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
-        """Step, or raise."""
-        if len(frame.score) == self._count:
-            raise ZeroDivisionError("seven")
-        return self._tracker.step(density, frame)
-
-
 def session(**changes: Any) -> Session:
     """A session of the sensor's stream."""
     return Session(SENSOR.stream, NUSCENES, instance="test", **changes)
 
 
-def tracks(outputs: list[Output]) -> list[Tracks]:
-    """The tracks among outputs."""
-    return [output.tracks for output in outputs if isinstance(output, Tracked)]
-
-
-def problems(outputs: list[Output]) -> list[Problem]:
-    """The problems among outputs."""
-    return [output for output in outputs if isinstance(output, Problem)]
-
-
-def begun(outputs: list[Output]) -> list[str]:
-    """Why sessions began anew."""
-    return [output.reason for output in outputs if isinstance(output, Begun)]
-
-
 def feed(one: Session, seqs: Any, sensor: Sensor = SENSOR, **changes: Any) -> list[Output]:
     """Give frames to a session at time zero."""
-    return [output for seq in seqs for output in one.on_detections(sensor.detections(seq, **changes), 0)]
+    return sessions.feed(one, seqs, sensor, **changes)
 
 
 def test_the_same_messages_give_the_same_bytes() -> None:
@@ -136,8 +106,8 @@ def test_gaps_are_counted_and_told() -> None:
 
 
 def test_late_frames_are_refused_with_a_problem() -> None:
-    """A frame behind a processed one changes nothing and is reported."""
-    one = session()
+    """A frame later than the window changes nothing and is reported."""
+    one = session(policy=Policy(rewind_ns=0))
     feed(one, [0, 1, 3])
     density = one.density
     found = problems(feed(one, [2]))
@@ -239,35 +209,6 @@ def test_frames_that_overtook_each_other_while_held_are_put_in_order() -> None:
     assert [plain(a) for a in ours] == [plain(b) for b in theirs]
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.permutations([*range(8), *range(100, 108)]))
-def test_clouds_and_frames_may_come_in_any_order(order: list[int]) -> None:
-    """However clouds and the frames they belong to overtake each other within the wait, the same tracks come out."""
-    one = session()
-    outputs = []
-    for item in order:
-        if item < 100:
-            outputs += one.on_detections(SENSOR.detections(item, has_points=True), 0)
-        else:
-            outputs += one.on_points(SENSOR.points(item - 100), 0)
-    got = tracks([*outputs, *one.on_tick(WAIT_NS)])
-    if one.counters.late == 0:
-        assert [message.seq for message in got] == list(range(8))
-        assert all(message.cloud_used for message in got)
-        assert b"".join(map(plain, got)) == in_order()
-    else:
-        assert one.counters.frames + one.counters.late == 8
-
-
-def in_order() -> bytes:
-    """The tracks of eight frames, each after its cloud."""
-    one, outputs = session(), []
-    for seq in range(8):
-        outputs += one.on_points(SENSOR.points(seq), 0)
-        outputs += one.on_detections(SENSOR.detections(seq, has_points=True), 0)
-    return b"".join(map(plain, tracks(outputs)))
-
-
 def test_the_clouds_of_a_stopped_publisher_are_not_used() -> None:
     """A cloud left over from a replay is not taken for the next replay's cloud of the same stamp."""
     one = session()
@@ -298,31 +239,6 @@ def test_unknown_classes_are_left_out_and_told_once() -> None:
         ("unknown_class", "'cat'", 1),
     ]
     assert len(problems(one.reset() and feed(one, [3], labels=labels, label=np.array([0, 1, 2])))) == 2
-
-
-def test_a_failing_step_leaves_the_density_alone() -> None:
-    """An exception in the tracker costs that frame and nothing else: the others come out as if it had not been sent."""
-    one, other = session(tracker=Failing), session(tracker=Failing)
-    got = feed(one, range(3))
-    density = one.density
-    failed = one.on_detections(SENSOR.detections(3, objects=7), 0)
-    assert [(p.code, p.seq) for p in problems(failed)] == [("internal", 3)]
-    assert tracks(failed) == []
-    assert one.density is density
-    got += feed(one, [4, 5])
-    expected = feed(other, [0, 1, 2, 4, 5])
-    assert [plain(a) for a in tracks(got)] == [plain(b) for b in tracks(expected)]
-    assert tracks(got)[3].gap == 1
-
-
-def test_a_failing_first_frame_still_begins_a_session_later() -> None:
-    """If the frame that would restart the session fails, the next one restarts it."""
-    one = session(tracker=Failing)
-    before = tracks(feed(one, range(3)))[-1].session
-    far = replace(SENSOR, epoch=b"b" * 16, start_s=0)
-    assert begun(one.on_detections(far.detections(0, objects=7), 0)) == []
-    assert one.session == before
-    assert begun(feed(one, [1], far)) == ["publisher"]
 
 
 def test_reset_forgets_tracks_but_not_frames() -> None:
@@ -371,10 +287,11 @@ def test_state_counts() -> None:
     """The state adds up what happened."""
     one = session()
     assert one.state().state == "new"
-    feed(one, [0, 1, 1, 4, 3])
+    feed(one, [0, 1, 1, 20, 22, 21, 40, 5])
     state = one.state(shed=2, queue=3)
-    assert (state.state, state.frames, state.duplicates, state.late, state.gaps) == ("running", 3, 1, 1, 2)
-    assert (state.seq, state.stamp_ns, state.epoch) == (4, SENSOR.stamp_ns(4), SENSOR.epoch)
+    assert (state.state, state.frames, state.duplicates, state.late, state.gaps) == ("running", 6, 1, 1, 35)
+    assert (state.inserted, state.corrected) == (1, 1)
+    assert (state.seq, state.stamp_ns, state.epoch) == (40, SENSOR.stamp_ns(40), SENSOR.epoch)
     assert (state.shed, state.queue) == (2, 3)
     assert state.next_id > 0
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.timing import WINDOW, Decision, Mark, Timeline, Verdict, hold_until
+from optipmb_service.timing import WINDOW, Course, Decision, Mark, Timeline, Verdict, hold_until
 
 SECOND = 1_000_000_000
 LIMIT = 5 * SECOND
+JUMPS = [0] * 4 + [3600] * 3 + [3607] * 5
 A, B, C = (bytes([letter]) * 16 for letter in b"abc")
 
 
@@ -16,21 +19,21 @@ def mark(seq: int, seconds: float, epoch: bytes = A) -> Mark:
     return Mark(epoch, seq, round(seconds * SECOND))
 
 
-def judge_all(marks: list[Mark]) -> tuple[list[Decision], list[int], Timeline]:
-    """Judge frames and process each admitted one at once; returns decisions, gaps of the admitted ones, timeline."""
-    timeline, decisions, gaps = Timeline(LIMIT), [], []
+def judge_all(marks: list[Mark], *, window: bool = False) -> tuple[list[Decision], Timeline]:
+    """Judge frames; without a window none can be gone behind."""
+    timeline, decisions, course, floor = Timeline(LIMIT), [], Course(), None
     for one in marks:
         decision, timeline = timeline.judge(one)
         decisions.append(decision)
-        if decision.verdict.admitted:
-            gap, timeline = timeline.release(one, decision.era)
-            gaps.append(gap)
-    return decisions, gaps, timeline
+        if decision.verdict.admitted and not window:
+            course, floor = course.after(one, decision.place), one
+            timeline = timeline.settle(course, floor, frozenset(timeline.marks))
+    return decisions, timeline
 
 
-def verdicts(marks: list[Mark]) -> list[Verdict]:
+def verdicts(marks: list[Mark], *, window: bool = False) -> list[Verdict]:
     """The verdicts on frames."""
-    return [decision.verdict for decision in judge_all(marks)[0]]
+    return [decision.verdict for decision in judge_all(marks, window=window)[0]]
 
 
 marks = st.builds(
@@ -42,10 +45,10 @@ marks = st.builds(
 
 
 @settings(deadline=None)
-@given(st.lists(marks, max_size=60))
-def test_no_frame_is_admitted_twice(arrived: list[Mark]) -> None:
+@given(st.lists(marks, max_size=60), st.booleans())
+def test_no_frame_is_admitted_twice(arrived: list[Mark], window: bool) -> None:  # noqa: FBT001 - drawn
     """Whatever arrives in whatever order, an (epoch, seq) is admitted at most once."""
-    decisions, _, _ = judge_all(arrived)
+    decisions, _ = judge_all(arrived, window=window)
     admitted = [(m.epoch, m.seq) for m, d in zip(arrived, decisions, strict=True) if d.verdict.admitted]
     assert len(admitted) == len(set(admitted))
 
@@ -53,24 +56,55 @@ def test_no_frame_is_admitted_twice(arrived: list[Mark]) -> None:
 @settings(deadline=None)
 @given(st.lists(marks, max_size=60))
 def test_time_never_goes_back_in_a_generation(arrived: list[Mark]) -> None:
-    """Within one life of a density stamps never fall, and (stamp, seq) rises within one era."""
-    decisions, _, _ = judge_all(arrived)
+    """Without a window, stamps never fall in one life of a density, and (stamp, seq) rises in an era."""
+    decisions, _ = judge_all(arrived)
     stamps: dict[int, int] = {}
     places: dict[int, tuple[int, int]] = {}
     for one, decision in zip(arrived, decisions, strict=True):
         if decision.verdict.admitted:
-            assert one.stamp_ns >= stamps.get(decision.generation, 0)
-            assert (one.stamp_ns, one.seq) > places.get(decision.era, (-1, -1))
-            stamps[decision.generation] = one.stamp_ns
-            places[decision.era] = (one.stamp_ns, one.seq)
+            era, generation = decision.place.era, decision.place.generation
+            assert one.stamp_ns >= stamps.get(generation, 0)
+            assert (one.stamp_ns, one.seq) > places.get(era, (-1, -1))
+            stamps[generation] = one.stamp_ns
+            places[era] = (one.stamp_ns, one.seq)
 
 
 @settings(deadline=None)
 @given(st.lists(marks, max_size=60))
-def test_memory_is_bounded(arrived: list[Mark]) -> None:
+def test_time_never_goes_back_in_the_window(arrived: list[Mark]) -> None:
+    """In the order of processing, whatever came when, stamps never fall in one life of a density."""
+    _, timeline = judge_all(arrived, window=True)
+    placed = sorted((place.order(one), place.generation) for one, place in timeline.places().items())
+    for (before, first), (after, second) in itertools.pairwise(placed):
+        assert first < second or (first == second and before[1] <= after[1])
+
+
+@settings(deadline=None)
+@given(st.permutations([mark(seq, seq / 10 + jump) for seq, jump in zip(range(12), JUMPS, strict=True)]))
+def test_places_do_not_depend_on_arrival(order: list[Mark]) -> None:
+    """Every frame of the window gets the place that it has in order, also across jumps of the clock."""
+    decisions, timeline = judge_all(order, window=True)
+    assert all(decision.verdict.admitted for decision in decisions)
+    expected = judge_all(sorted(order, key=lambda one: one.seq), window=True)[1].places()
+    assert timeline.places() == expected
+    assert sorted({(place.era, place.generation) for place in expected.values()}) == [(1, 0), (2, 1), (3, 2)]
+
+
+def test_the_frame_between_undoes_a_jump() -> None:
+    """Frames that were lost between others made a jump of them; when they come after all there was none."""
+    late = [mark(0, 0), mark(2, 8), mark(1, 4)]
+    assert verdicts(late, window=True) == [Verdict.FIRST, Verdict.RESTART, Verdict.INSERTED]
+    _, timeline = judge_all(late, window=True)
+    assert {place.generation for place in timeline.places().values()} == {0}
+
+
+@settings(deadline=None)
+@given(st.lists(marks, max_size=60), st.booleans())
+def test_memory_is_bounded(arrived: list[Mark], window: bool) -> None:  # noqa: FBT001 - drawn
     """Sequence numbers may leap by 2^62 without the memory of them growing beyond its window."""
-    _, _, timeline = judge_all(arrived)
-    assert timeline.seen.bit_length() <= WINDOW
+    _, timeline = judge_all(arrived, window=window)
+    assert all(0 < seen.mask.bit_length() <= WINDOW for seen in timeline.epochs)
+    assert window or not timeline.marks
 
 
 @settings(deadline=None)
@@ -81,35 +115,19 @@ def test_repeats_change_nothing(seqs: set[int], data: st.DataObject) -> None:
     repeated = []
     for index, one in enumerate(stream):
         repeated += [one, *data.draw(st.lists(st.sampled_from(stream[: index + 1]), max_size=3))]
-    decisions, gaps, _ = judge_all(repeated)
-    kept = [d for d in decisions if d.verdict is not Verdict.DUPLICATE]
-    assert (kept, gaps) == judge_all(stream)[:2]
+    decisions, _ = judge_all(repeated)
+    assert [d for d in decisions if d.verdict is not Verdict.DUPLICATE] == judge_all(stream)[0]
 
 
-@settings(deadline=None)
-@given(st.lists(st.booleans(), min_size=1, max_size=300))
-def test_gaps_add_up(lost: list[bool]) -> None:
-    """Of a stream that loses frames, those admitted and the gaps before them make the whole again."""
-    stream = [mark(seq, seq / 100) for seq, gone in enumerate(lost) if not gone]
-    _, gaps, _ = judge_all(stream)
-    assert sum(gaps) + len(stream) == (stream[-1].seq - stream[0].seq + 1 if stream else 0)
-
-
-@settings(deadline=None)
-@given(st.permutations(range(12)))
-def test_frames_held_together_come_out_in_order(order: list[int]) -> None:
-    """Frames that overtook each other before any was processed are all admitted and put in order without gaps."""
-    timeline, held = Timeline(LIMIT), []
-    for seq in order:
-        one = mark(seq, seq / 10)
-        decision, timeline = timeline.judge(one)
-        held.append((decision.era, one.stamp_ns, one.seq, one))
-    gaps = []
-    for era, _, _, one in sorted(held):
-        gap, timeline = timeline.release(one, era)
-        gaps.append(gap)
-    assert [place[2] for place in sorted(held)] == list(range(12))
-    assert gaps == [0] * 12
+def test_what_is_missing_is_known() -> None:
+    """A frame is complete when all between it and the last processed came, processed or refused."""
+    _, timeline = judge_all([mark(0, 0), mark(1, 0.1), mark(3, 0.3)])
+    assert timeline.complete_until(mark(2, 0.2), (A, 1))
+    assert not timeline.complete_until(mark(3, 0.3), (A, 1))
+    assert timeline.note(mark(2, 0.2)).complete_until(mark(4, 0.4), (A, 1))
+    assert not timeline.complete_until(mark(2**60, 9), (A, 3))
+    assert timeline.complete_until(mark(0, 1, B), (A, 3))
+    assert not timeline.complete_until(mark(1, 1, B), (A, 3))
 
 
 def test_equal_stamps_are_ordered_by_sequence() -> None:
@@ -127,9 +145,9 @@ def test_a_frame_behind_a_processed_one_is_late() -> None:
 def test_a_jump_restarts_the_session() -> None:
     """A clock set by an hour, ahead or back, begins a new generation; small steps back are late frames."""
     for to in (3600, -3600):
-        decisions, _, _ = judge_all([mark(0, 7200), mark(1, 7200.1), mark(2, 7200.2 + to), mark(3, 7200.3 + to)])
+        decisions, _ = judge_all([mark(0, 7200), mark(1, 7200.1), mark(2, 7200.2 + to), mark(3, 7200.3 + to)])
         assert [d.verdict for d in decisions] == [Verdict.FIRST, Verdict.NEXT, Verdict.RESTART, Verdict.NEXT]
-        assert [d.generation for d in decisions] == [0, 0, 1, 1]
+        assert [d.place.generation for d in decisions] == [0, 0, 1, 1]
     assert verdicts([mark(0, 10), mark(1, 10.1), mark(2, 9), mark(3, 10.2)])[2:] == [Verdict.LATE, Verdict.NEXT]
 
 
@@ -150,29 +168,27 @@ def test_an_old_frame_is_no_jump() -> None:
     assert verdicts([*arrived, mark(1, 2)])[-1] is Verdict.LATE
 
 
-def test_what_was_sent_before_a_jump_does_not_come_after_it() -> None:
-    """A straggler from before a jump is late even while nothing of the new era is processed."""
-    timeline, found = Timeline(LIMIT), []
-    for one in (mark(0, 0), mark(5, 6), mark(4, 1.5)):
-        decision, timeline = timeline.judge(one)
-        found.append(decision.verdict)
-    assert found == [Verdict.FIRST, Verdict.RESTART, Verdict.LATE]
+def test_what_was_sent_before_a_jump_goes_before_it() -> None:
+    """A straggler from before a jump belongs to the era before it, as long as the window reaches there."""
+    _, timeline = judge_all([mark(0, 0), mark(5, 6), mark(4, 1.5)], window=True)
+    assert [place.era for place in timeline.places().values()] == [1, 1, 1]
+    _, timeline = judge_all([mark(0, 0), mark(5, 60), mark(4, 1.5)], window=True)
+    assert [place.era for place in timeline.places().values()] == [1, 1, 2]
 
 
 def test_a_restarted_publisher_continues_the_density() -> None:
     """A new epoch whose stamps go on keeps the generation and begins its numbers anew."""
-    decisions, gaps, _ = judge_all([mark(0, 0), mark(7, 0.7), mark(0, 2, B), mark(1, 2.1, B)])
+    decisions, _ = judge_all([mark(0, 0), mark(7, 0.7), mark(0, 2, B), mark(1, 2.1, B)])
     assert [d.verdict for d in decisions][2:] == [Verdict.NEW_EPOCH, Verdict.NEXT]
-    assert {d.generation for d in decisions} == {0}
-    assert gaps == [0, 6, 0, 0]
+    assert {d.place.generation for d in decisions} == {0}
 
 
 def test_a_replay_restarts_the_session() -> None:
     """A new epoch whose stamps go back or far ahead begins a new generation."""
     for seconds in (0, 1, 100):
-        decisions, _, _ = judge_all([mark(0, 0), mark(1, 1), mark(0, seconds, B)])
+        decisions, _ = judge_all([mark(0, 0), mark(1, 1), mark(0, seconds, B)])
         assert decisions[-1].verdict is Verdict.RESTART
-        assert decisions[-1].generation == 1
+        assert decisions[-1].place.generation == 1
 
 
 def test_a_succeeded_publisher_does_not_come_back() -> None:
@@ -184,13 +200,19 @@ def test_a_succeeded_publisher_does_not_come_back() -> None:
 
 
 def test_a_continuing_epoch_does_not_reach_back() -> None:
-    """After a publisher's restart, frames stamped before its predecessor's last are late, released or not."""
-    timeline = Timeline(LIMIT)
-    for one in (mark(0, 0), mark(1, 1)):
-        _, timeline = timeline.judge(one)
-    first, timeline = timeline.judge(mark(1, 1.5, B))
-    second, timeline = timeline.judge(mark(0, 0.9, B))
-    assert (first.verdict, second.verdict) == (Verdict.NEW_EPOCH, Verdict.LATE)
+    """After a publisher's restart, frames stamped before its predecessor's last are late."""
+    assert verdicts([mark(0, 0), mark(1, 1), mark(1, 1.5, B), mark(2, 0.9, B)], window=True)[2:] == [
+        Verdict.NEW_EPOCH,
+        Verdict.LATE,
+    ]
+
+
+def test_a_publisher_s_last_frame_may_be_overtaken_by_its_successor_s_first() -> None:
+    """Inside the window it goes where it belongs; what a stopped publisher sends on does not."""
+    arrived = [mark(0, 0), mark(0, 0.3, B), mark(1, 0.2), mark(2, 0.4)]
+    found = [Verdict.FIRST, Verdict.NEW_EPOCH, Verdict.INSERTED, Verdict.RETIRED]
+    assert verdicts(arrived, window=True) == found
+    assert verdicts(arrived)[2:] == [Verdict.RETIRED, Verdict.RETIRED]
 
 
 @settings(deadline=None)

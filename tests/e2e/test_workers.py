@@ -1,0 +1,145 @@
+"""A service of several worker processes: one instance to the network, and none of them is missed for long."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+from optipmb_schemas import Keys, ServiceStatus, Tracks, decode
+from optipmb_service.records import Tracked
+from optipmb_service.session import Session
+from optipmb_service.share import worker_of
+from processes import descendants, wait_until_ended
+from router import Node, Sensor, plain
+from service_process import ServiceProcess
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+KEYS = Keys()
+NUSCENES = optipmb.load_profile("nuscenes")
+STREAMS = [f"yard/node-{number}/lidar" for number in range(6)]
+VICTIMS = {worker_of(f"kill/{name}/lidar", 2): f"kill/{name}/lidar" for name in "abcd"}
+FRAMES = 12
+DEADLINE_S = 60.0
+END_S = 4.0
+OPTIONS = ("--workers", "2", "--instance", "pair")
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
+    """A service of two workers, which must end in order when the tests are done: all processes, status 0, in time."""
+    store = {"OPTIPMB_STORE": str(tmp_path_factory.mktemp("store"))}
+    with ServiceProcess(*OPTIONS, environment=store) as process:
+        assert process.wait_ready() == f"ready instance=pair endpoints={process.endpoint}"
+        children = descendants(process.process.pid)
+        yield process
+        assert len(children) == 2
+        status, seconds = process.end(signal.SIGTERM)
+        assert wait_until_ended(children, 0.0) == set()
+        assert (status, process.output) == (0, [])
+        assert seconds < END_S
+        assert "worker_killed" not in process.errors
+
+
+def status_when(node: Node, reached: Callable[[ServiceStatus], bool], instance: str = "pair") -> ServiceStatus:
+    """The status, as soon as it is as wanted."""
+    ends = time.monotonic() + DEADLINE_S
+    while True:
+        status = node.ask(KEYS.status(instance), ServiceStatus)
+        if reached(status):
+            return status
+        assert time.monotonic() < ends, status
+
+
+def arrived(node: Node, stream: str, seq: int) -> None:
+    """Wait for the tracks of a frame."""
+    key = KEYS.tracks(stream)
+    node.tracks_seen.wait(
+        lambda items: any(at == key and decode(payload, Tracks).seq == seq for at, payload, _ in items),
+        f"tracks of frame {seq} of {stream}",
+    )
+
+
+def workers_of(status: ServiceStatus) -> dict[str, int | None]:
+    """Which worker has which stream."""
+    return {session.stream: session.worker for session in status.sessions}
+
+
+def pid_of(service: ServiceProcess, worker: int) -> int:
+    """The newest process of a worker, by the log."""
+    line = [line for line in service.errors.splitlines() if "worker_started" in line and f"worker={worker}" in line][-1]
+    return int(line.partition("pid=")[2].split()[0])
+
+
+def alone(sensor: Sensor, frames: int) -> list[bytes]:
+    """What a session alone makes of the frames."""
+    session = Session(sensor.stream, NUSCENES)
+    outputs = [output for seq in range(frames) for output in session.on_detections(sensor.detections(seq), 0)]
+    return [plain(output.tracks) for output in outputs if isinstance(output, Tracked)]
+
+
+def test_workers_share_the_streams(service: ServiceProcess) -> None:
+    """Every stream is tracked by the one worker that the hash names, with the bytes that one process would give.
+
+    The instance has one token, and its status all streams.
+    """
+    sensors = [Sensor(stream=stream) for stream in STREAMS]
+    with Node(service.endpoint) as node:
+        for seq in range(FRAMES):
+            node.send(*(sensor.detections(seq) for sensor in sensors))
+        for sensor in sensors:
+            assert [plain(message) for message in node.tracks(sensor.stream, FRAMES)] == alone(sensor, FRAMES)
+        status = status_when(node, lambda status: status.frames >= FRAMES * len(STREAMS))
+        assert status.state == "ready"
+        parts = [node.ask(KEYS.status(f"pair-w{index}"), ServiceStatus) for index in range(2)]
+        streams = sorted(session.stream for part in parts for session in part.sessions)
+        assert [stream for stream in streams if stream in STREAMS] == STREAMS
+        shares = workers_of(status)
+        assert {stream: shares[stream] for stream in STREAMS} == {stream: worker_of(stream, 2) for stream in STREAMS}
+        assert node.alive(KEYS.all_alive()) == [KEYS.alive("pair")]
+
+
+def test_a_killed_worker_comes_back(service: ServiceProcess) -> None:
+    """After kill -9 of a worker the other goes on, and the streams of the dead one go on as soon as it is back."""
+    sensors = {worker: Sensor(stream=stream) for worker, stream in VICTIMS.items()}
+    with Node(service.endpoint) as node:
+        node.send(*(sensor.detections(0) for sensor in sensors.values()))
+        for sensor in sensors.values():
+            node.tracks(sensor.stream, 1)
+        first = pid_of(service, 1)
+        os.kill(first, signal.SIGKILL)
+        service.wait_log("worker_ended")
+        node.send(sensors[0].detections(1))
+        node.tracks(sensors[0].stream, 2)
+        assert node.ask(KEYS.status("pair"), ServiceStatus).state == "degraded"
+        status_when(node, lambda status: status.state == "ready")
+        assert pid_of(service, 1) != first
+        node.send(sensors[1].detections(1))
+        arrived(node, sensors[1].stream, 1)
+        shares = workers_of(node.ask(KEYS.status("pair"), ServiceStatus))
+        assert all(shares[stream] == worker for worker, stream in VICTIMS.items())
+
+
+def test_workers_end_with_their_parent() -> None:
+    """Kill -9 of the parent, which can tell nobody, leaves no worker behind."""
+    with ServiceProcess(*OPTIONS) as service:
+        service.wait_ready()
+        children = descendants(service.process.pid)
+        assert len(children) == 2
+        service.process.kill()
+        assert wait_until_ended(children, 15.0) == set()
+
+
+def test_what_cannot_start_says_so_once() -> None:
+    """A profile that does not exist ends the start with status 2 and a line that names it."""
+    with ServiceProcess(*OPTIONS, "--log-level", "error", "--profile", "none.toml") as service:
+        assert service.wait_end(DEADLINE_S) == 2
+        assert service.output == []
+        assert service.errors.count("\n") == 1
+        assert "none.toml" in service.errors

@@ -1,0 +1,149 @@
+"""What tests of sessions share: a cheap tracker, outputs merged as a user sees them, trackers that fail."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from optipmb_schemas import Problem, Tracks, encode
+from optipmb_service.records import Begun, Output, Quarantined, Tracked
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from optipmb_service.session import Session
+    from router import Sensor
+
+
+def tracks(outputs: Iterable[Output]) -> list[Tracks]:
+    """The tracks among outputs."""
+    return [output.tracks for output in outputs if isinstance(output, Tracked)]
+
+
+def problems(outputs: Iterable[Output]) -> list[Problem]:
+    """The problems among outputs."""
+    return [output for output in outputs if isinstance(output, Problem)]
+
+
+def begun(outputs: Iterable[Output]) -> list[str]:
+    """Why sessions began anew."""
+    return [output.reason for output in outputs if isinstance(output, Begun)]
+
+
+def dumps(outputs: Iterable[Output]) -> list[Quarantined]:
+    """What was saved of failures."""
+    return [output for output in outputs if isinstance(output, Quarantined)]
+
+
+def feed(one: Session, seqs: Iterable[int], sensor: Sensor, **changes: Any) -> list[Output]:
+    """Give frames to a session at time zero."""
+    return [output for seq in seqs for output in one.on_detections(sensor.detections(seq, **changes), 0)]
+
+
+class Merged:
+    """The tracks as a user has them in the end: the latest revision of each frame, repetitions dropped."""
+
+    def __init__(self) -> None:
+        self.newest: dict[tuple[bytes, int], Tracks] = {}
+        self.repeated = 0
+
+    def take(self, outputs: Iterable[Output]) -> None:
+        """Add what a session gave out."""
+        for message in tracks(outputs):
+            key = message.epoch, message.seq
+            old = self.newest.get(key)
+            if old is not None and old.revision == message.revision:
+                self.repeated += 1
+                assert plain(old) == plain(message), f"another message of revision {message.revision} for {key}"
+            if old is None or message.revision > old.revision:
+                self.newest[key] = message
+
+    def plain(self) -> dict[tuple[bytes, int], bytes]:
+        """The bytes of the tracks but for revision and delivery."""
+        return {key: plain(message) for key, message in self.newest.items()}
+
+
+def plain(message: Tracks) -> bytes:
+    """The bytes of tracks that must be those of the run in order."""
+    return encode(message.model_copy(update={"delivery": None, "revision": 0}))
+
+
+class Failing:
+    """A tracker that raises whenever a frame has a given number of detections."""
+
+    def __init__(self, parameters: optipmb.Parameters, count: int = 7) -> None:
+        self._tracker = optipmb.Tracker(parameters)
+        self._count = count
+
+    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+        """Step, or raise."""
+        if len(frame.score) == self._count:
+            raise ZeroDivisionError("seven")
+        return self._tracker.step(density, frame)
+
+
+@dataclass
+class Chained:
+    """A tracker that costs nothing and forgets nothing: one object whose numbers are a hash of all frames so far.
+
+    Any frame too many, too few, or in another order gives another density for ever after.
+    """
+
+    parameters: optipmb.Parameters
+
+    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+        """Hash the density and the frame into the next density."""
+        if density.stamp_ns != -1 and frame.stamp_ns < density.stamp_ns:
+            raise optipmb.FrameError("stamp_ns", f"a stamp from {density.stamp_ns} on", str(frame.stamp_ns))
+        digest = hashlib.blake2b(digest_size=48)
+        digest.update(f"{density.stamp_ns} {density.next_id} {frame.stamp_ns}".encode())
+        digest.update(density.bernoulli.mean.tobytes())
+        digest.update(frame.center.tobytes())
+        if frame.cloud is not None:
+            digest.update(frame.cloud.xyz.tobytes())
+        numbers = np.frombuffer(digest.digest(), np.uint8).astype(np.float64)
+        born = len(frame.score) > len(density.bernoulli)
+        known = density.bernoulli
+        # Whatever else a Bernoulli has is one.
+        ones = {name: np.ones((1, *column.shape[1:]), column.dtype) for name, column in known.columns()}
+        rows = replace(
+            optipmb.Bernoullis(**ones),
+            mean=numbers.reshape(8, 6)[:1] / 100.0,
+            covariance=np.eye(6)[None],
+            label=np.zeros(1, np.int64),
+            id=known.id if len(known) else np.array([density.next_id]),
+            born_ns=known.born_ns if len(known) else np.array([frame.stamp_ns]),
+            seen_ns=np.array([frame.stamp_ns]),
+        )
+        after = optipmb.Density(frame.stamp_ns, density.next_id + born, rows, density.poisson)
+        found = optipmb.Tracks(
+            id=rows.id,
+            label=rows.label,
+            center=numbers[None, :3],
+            size=np.ones((1, 3)),
+            yaw=np.zeros(1),
+            velocity=numbers[None, 3:5],
+            yaw_rate=np.zeros(1),
+            acceleration=np.zeros(1),
+            existence=rows.existence,
+            score=rows.score,
+            covariance=rows.covariance,
+            age=np.maximum(0.0, (frame.stamp_ns - rows.born_ns) * 1e-9),
+            time_since_detection=np.zeros(1),
+            detection=np.array([-1]),
+        )
+        return optipmb.StepResult(after, found, optipmb.Diagnostics(frame.cloud is not None, 0, 0, 0, 0, int(born), 0))
+
+
+def chained(parameters: optipmb.Parameters) -> Chained:
+    """Make the cheap tracker."""
+    return Chained(parameters)
+
+
+def delayed(sensor: Sensor, seconds: float) -> Sensor:
+    """The sensor with its clock set."""
+    return replace(sensor, start_s=sensor.start_s + seconds)
