@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
 
-SURE: Final = 7.0
-"""Log odds of the surest detection and of the least sure one: what scores say beyond 0.999 they do not know."""
+SURE: Final = 14.0
+"""Log odds of the surest detection, and minus those of the least sure one: a score of one in a million from certain."""
 
 
 @kernel

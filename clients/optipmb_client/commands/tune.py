@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from optipmb_client.tuning import Estimate, Figures, Refined
 
 SHOWN = ("sAMOTA", "AMOTA", "MOTA", "MOTP", "HOTA", "IDS", "FP", "FN", "GT")
-METRICS = ("combination", "samota", "amota", "mota", "hota")
+LEAST_SHOWN = 100
+"""Boxes of tracks from which a tenth of the probabilities is shown."""
+METRICS = ("combination", "samota", "amota", "mota", "hota", "both")
 
 
 def tune(  # noqa: PLR0913  these are the command's options
@@ -44,6 +46,7 @@ def tune(  # noqa: PLR0913  these are the command's options
     profile: Profile = None,
     classes: Classes = None,
     out: Out = Path("out/tune"),
+    name: Annotated[str | None, typer.Option(help="Name of the new profile.", show_default=False)] = None,
     estimate_only: Annotated[
         bool, typer.Option("--estimate-only", help="Only what the data say by themselves.")
     ] = False,
@@ -92,7 +95,7 @@ def tune(  # noqa: PLR0913  these are the command's options
         jobs=jobs,
     )
     with tuning.TrialDisplay() as display:
-        tuned = tuning.tune_all(source, parameters, plan, out, display)
+        tuned = tuning.tune_all(source, parameters, plan, out, display, name)
     if as_json:
         results: Mapping[str, Any] = {name: one.to_json() for name, one in tuned.classes.items()}
         print_json({"command": "tune", "profile": tuned.profile, "classes": results})
@@ -144,7 +147,30 @@ def _report(refined: "Refined") -> Group:
     for one in refined.evidence:
         gains = f"{one.positive} of {one.groups}"
         evidence.add_row(one.path, str(one.start), str(one.value), f"{one.gain:.5f}", f"{one.error:.5f}", gains)
-    return Group(figures, Text(), evidence, Text(_objective(refined)), Text())
+    ranking = Table(box=None, pad_edge=False)
+    for column in ("tracks ranked by", refined.plan.metric, "gain", "+-", "sAMOTA", "AMOTA", "MOTA"):
+        ranking.add_column(column, justify="left" if column == "tracks ranked by" else "right")
+    for score in refined.ranking:
+        values = score.figures.to_json()
+        shown = (score.value, score.gain, score.error, *(values[name] for name in ("sAMOTA", "AMOTA", "MOTA")))
+        ranking.add_row(score.score, *(f"{value:.4f}" if value is not None else "-" for value in shown))
+    return Group(
+        figures, Text(), evidence, Text(_objective(refined)), Text(), ranking, Text(_calibration(refined)), Text()
+    )
+
+
+def _calibration(refined: "Refined") -> str:
+    """Say how well tracks know themselves."""
+    found = refined.calibration
+    low, high = found.interval
+    told = "  ".join(
+        f"{one.predicted:.2f} -> {one.observed:.2f} ({one.count})" for one in found.deciles if one.count >= LEAST_SHOWN
+    )
+    whose = "left out" if refined.folds else "that chose the calibration"
+    return (
+        f"sequences {whose}: NEES {found.mean:.2f} ({low:.2f} to {high:.2f}, objects being independent), "
+        f"{100.0 * found.coverage:.1f} % of errors in the 95 % ellipse; existence told -> true: {told}"
+    )
 
 
 def _objective(refined: "Refined") -> str:

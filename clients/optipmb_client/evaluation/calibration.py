@@ -169,8 +169,22 @@ def evaluate_calibration(
     return total
 
 
-def calibration(truth: Truth, tracks: ResultTable, full: FullTable, name: str, rules: Rules) -> CalibrationResult:
-    """Return the figures of one class in one sequence; arguments as for `evaluate_calibration`."""
+@dataclass(frozen=True)
+class Sample:
+    """The tracks of one sequence that count, and the objects that they are of."""
+
+    row: Ints
+    """(K,) in the tracks with all columns."""
+    true: Bools
+    """(K,) whether the track is matched to an object."""
+    offset: Floats
+    """(K, 2) centre of the track minus that of its object, metres; NaN where it has none."""
+    owner: Ints
+    """(K,) id of the object, -1 where it has none."""
+
+
+def sample(truth: Truth, tracks: ResultTable, full: FullTable, name: str, rules: Rules) -> Sample:
+    """Match the tracks of one class in one sequence; arguments and errors as for `evaluate_calibration`."""
     case = counted(prepare(truth, tracks, name, rules), rules)
     taken = assign_frames(case.truth_frame[case.truth_row], case.truth_row, case.track_row, case.cost, most_pairs)
     truth_row, track_row = case.truth_row[taken], case.track_row[taken]
@@ -178,17 +192,25 @@ def calibration(truth: Truth, tracks: ResultTable, full: FullTable, name: str, r
     if (known < 0).any():
         raise DatasetError("the tracks with all columns", "the same tracks as in the result file", "others")
     place = _rows(truth.frame, truth.id, case.truth_frame[truth_row], case.truth_id[truth_row])
-    offset = full.center[known[track_row], :2] - truth.center[place, :2]
-    covariance = full.covariance[known[track_row], :2, :2]
-    true = np.zeros(len(known), dtype=np.bool_)
-    true[track_row] = True
+    offset = np.full((len(known), 2), np.nan)
+    offset[track_row] = full.center[known[track_row], :2] - truth.center[place, :2]
+    owner = np.full(len(known), -1, dtype=np.int64)
+    owner[track_row] = case.truth_id[truth_row]
+    return Sample(known, owner >= 0, offset, owner)
+
+
+def calibration(truth: Truth, tracks: ResultTable, full: FullTable, name: str, rules: Rules) -> CalibrationResult:
+    """Return the figures of one class in one sequence; arguments as for `evaluate_calibration`."""
+    found = sample(truth, tracks, full, name, rules)
+    offset = found.offset[found.true]
+    covariance = full.covariance[found.row[found.true], :2, :2]
     return CalibrationResult(
         nees=_nees(offset, covariance),
-        owner=np.unique(case.truth_id[truth_row], return_inverse=True)[1].astype(np.int64),
+        owner=np.unique(found.owner[found.true], return_inverse=True)[1].astype(np.int64),
         error=np.asarray(np.linalg.norm(offset, axis=1), dtype=np.float64),
         spread=np.sqrt(np.trace(covariance, axis1=1, axis2=2)),
-        existence=full.existence[known],
-        true=true,
+        existence=full.existence[found.row],
+        true=found.true,
     )
 
 

@@ -37,6 +37,8 @@ class Figures:
     gt: float
     threshold: float
     """Lowest mean score of the tracks that the single figures are of."""
+    hota_all: float
+    """HOTA of all tracks, whatever their score."""
 
     def to_json(self) -> dict[str, float | None]:
         """Return the figures by their usual names; None for those that are not defined."""
@@ -57,6 +59,7 @@ _NAMES = {
     "fp": "FP",
     "fn": "FN",
     "gt": "GT",
+    "hota_all": "HOTA, all",
 }
 
 
@@ -94,6 +97,7 @@ def ab3dmot_figures(cases: Sequence[Case], near: Sequence[Case], rules: Rules, n
         fn=best.missed,
         gt=best.truth,
         threshold=found.threshold,
+        hota_all=_hota(near, near_rules, -math.inf).hota,
     )
 
 
@@ -122,6 +126,7 @@ def distance_figures(near: Sequence[Case], rules: Rules) -> Figures:
         fn=best.missed,
         gt=best.truth,
         threshold=found.threshold,
+        hota_all=_hota(near, rules, -math.inf).hota,
     )
 
 

@@ -4,8 +4,9 @@ Conventions: frames are in the world frame, made once by `optipmb.make_frame`; s
 the sensor frame of each row's frame, where KITTI compares, and in the world frame.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,10 +17,11 @@ from optipmb_client.errors import UsageError
 from optipmb_client.evaluation import Rules
 from optipmb_client.geometry import Floats, Ints, stack_poses, to_sensor
 from optipmb_client.results import ResultTable
+from optipmb_client.results.full import FullTable
 from optipmb_client.results.kitti import LEAST_SHOWN
 from optipmb_client.results.rows import empty_table
 
-__all__ = ["Clip", "load", "of_class", "prepare_frames", "track_clip"]
+__all__ = ["Clip", "load", "of_class", "prepare_frames", "track_clip", "track_fully"]
 
 
 @dataclass(frozen=True)
@@ -132,10 +134,29 @@ def track_clip(
         every_frame: also step through frames in which nothing can happen; the tracks are the same.
 
     """
+    return _table(clip, parameters, list(_steps(clip, parameters, modules, every_frame=every_frame)))
+
+
+def track_fully(clip: Clip, parameters: Parameters) -> tuple[ResultTable, FullTable]:
+    """Return the tracks of a clip as `track_clip` does, and everything known of them."""
+    found = list(_steps(clip, parameters, None, every_frame=False))
+    table = _table(clip, parameters, found)
+    columns: dict[str, Any] = {
+        key: np.concatenate([np.empty((0, *_SHAPES.get(key, ()))), *(getattr(tracks, key) for _, tracks in found)])
+        for key in _KNOWN
+    }
+    columns["detection"] = np.concatenate([np.empty(0, dtype=np.int64), *(tracks.detection for _, tracks in found)])
+    columns |= {key: getattr(table, key) for key in _SHARED}
+    return table, FullTable(**columns)
+
+
+def _steps(
+    clip: Clip, parameters: Parameters, modules: Modules | None, *, every_frame: bool
+) -> Iterator[tuple[int, Tracks]]:
+    """Yield the tracks of each frame that has any."""
     tracker = Tracker(parameters, modules)
     least = min(one.score_filter for one in parameters.classes.values())
     density = tracker.initial()
-    found: list[tuple[int, Tracks]] = []
     for index, frame in enumerate(clip.frames):
         # Nothing there and nothing new: the step would give the same density with another stamp, which nothing reads.
         empty = not len(density.bernoulli) and not len(density.poisson)
@@ -144,7 +165,10 @@ def track_clip(
         result = tracker.step(density, frame)
         density = result.density
         if len(result.tracks.id):
-            found.append((index, result.tracks))
+            yield index, result.tracks
+
+
+def _table(clip: Clip, parameters: Parameters, found: Sequence[tuple[int, Tracks]]) -> ResultTable:
     if not found:
         return empty_table(parameters.labels)
     when: Ints = np.repeat([index for index, _ in found], [len(tracks.id) for _, tracks in found]).astype(np.int64)
@@ -168,3 +192,6 @@ def track_clip(
 
 
 _BOX = ("center", "size", "yaw")
+_SHARED = ("labels", "frame", "id", "label", "center", "size", "yaw", "score")
+_KNOWN = ("velocity", "yaw_rate", "acceleration", "existence", "covariance", "age", "time_since_detection")
+_SHAPES: dict[str, tuple[int, ...]] = {"velocity": (2,), "covariance": (6, 6)}

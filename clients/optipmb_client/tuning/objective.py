@@ -25,6 +25,7 @@ METRICS: Mapping[str, str] = {
     "amota": "AMOTA",
     "mota": "MOTA at the best threshold",
     "hota": "HOTA of centres at that threshold",
+    "both": "mean of AMOTA and of the HOTA of all tracks, less a tenth of the switches per object",
 }
 _SWITCH = 0.1
 _REMEMBERED = 6
@@ -33,7 +34,9 @@ _REMEMBERED = 6
 def metric(name: str, figures: Figures, objects: int) -> float:
     """Return one of `METRICS`; figures that are not defined count zero."""
     values = {"samota": figures.samota, "amota": figures.amota, "mota": figures.mota, "hota": figures.hota}
-    if name != "combination":
+    if name == "both":
+        values = {"amota": figures.amota, "hota": figures.hota_all}
+    elif name != "combination":
         return _defined(values[name])
     mean = sum(_defined(value) for value in values.values()) / len(values)
     return mean - _SWITCH * _defined(figures.ids) / max(1, objects)

@@ -100,8 +100,10 @@ def estimate_all(source: Source, parameters: Parameters, out: Path) -> dict[str,
     return found
 
 
-def tune_all(source: Source, parameters: Parameters, plan: Plan, out: Path, watch: Watch) -> Tuned:
-    """Tune every class, and write `report.json` and `tuned.toml`.
+def tune_all(
+    source: Source, parameters: Parameters, plan: Plan, out: Path, watch: Watch, name: str | None = None
+) -> Tuned:
+    """Tune every class, and write `report.json` and `tuned.toml`, a profile with a name of one's own or the old one's.
 
     Raises:
         UsageError: the folder has trials of other data or options.
@@ -109,15 +111,15 @@ def tune_all(source: Source, parameters: Parameters, plan: Plan, out: Path, watc
     """
     out.mkdir(parents=True, exist_ok=True)
     results = {}
-    for name in source.classes:
-        scorer = scorer_of(source.dataset, name, source.sequences)
+    for label in source.classes:
+        scorer = scorer_of(source.dataset, label, source.sequences)
         context = {
             "version": version("optipmb"),
             "dataset": source.dataset,
             "detections": source.detections,
-            "detected": _sum(source.of_class(name)),
+            "detected": _sum(source.of_class(label)),
         }
-        results[name] = refine(source.of_class(name), scorer, parameters, plan, out / "trials.db", context, watch)
+        results[label] = refine(source.of_class(label), scorer, parameters, plan, out / "trials.db", context, watch)
     _write_json(out / "report.json", {name: one.to_json() for name, one in results.items()})
     scope = "all parameters" if plan.everything else "noise, birth spread, area, forgetting"
     judged = f"{plan.folds} groups left out in turn" if any(one.folds for one in results.values()) else "none left out"
@@ -128,7 +130,7 @@ def tune_all(source: Source, parameters: Parameters, plan: Plan, out: Path, watc
     )
     tables = {name: one.parameters for name, one in results.items()}
     profile = out / "tuned.toml"
-    write_profile(profile, with_classes(parameters, tables, _named(parameters, "tuned"), provenance))
+    write_profile(profile, with_classes(parameters, tables, name or _named(parameters, "tuned"), provenance))
     return Tuned(profile, results)
 
 

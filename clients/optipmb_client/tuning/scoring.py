@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
+
 from optipmb_client.datasets import DataSequence
 from optipmb_client.datasets.nuscenes import NuScenesSequence
 from optipmb_client.evaluation import Case, Rules, default_rules
@@ -17,7 +19,7 @@ from optipmb_client.evaluation.figures import CENTRE_DISTANCE
 from optipmb_client.evaluation.nuscenes_figures import evaluate_class
 from optipmb_client.evaluation.nuscenes_matching import Pairing, pair
 from optipmb_client.evaluation.nuscenes_scene import NuScenesConfig, NuScenesScene, prepare_scene
-from optipmb_client.geometry import to_sensor
+from optipmb_client.geometry import Bools, to_sensor
 from optipmb_client.results import ResultTable
 from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
 from optipmb_client.tuning.figures import Figures, ab3dmot_figures, distance_figures
@@ -47,6 +49,12 @@ class Scorer(Protocol):
     @property
     def rules(self) -> Rules: ...  # noqa: D102 - what is ignored, and what is excused
 
+    @property
+    def near(self) -> Rules: ...  # noqa: D102 - by the distance of centres
+
+    def counts(self, clip: Clip, tracks: ResultTable) -> Bools:
+        """Return which of the tracks of a clip (R,), in the world frame, the benchmark looks at."""
+
     def measure(self, clip: Clip, tracks: ResultTable) -> Measured:
         """Compare the tracks of a clip, in the world frame, with its truth."""
 
@@ -62,6 +70,10 @@ class BoxScorer:
     rules: Rules
     near: Rules
     """By the distance of centres, for HOTA; the same where the rules are so themselves."""
+
+    def counts(self, clip: Clip, tracks: ResultTable) -> Bools:  # noqa: ARG002  part of the protocol
+        """Return which tracks (R,) the benchmark looks at: all."""
+        return np.ones(len(tracks), dtype=np.bool_)
 
     def measure(self, clip: Clip, tracks: ResultTable) -> Measured:
         """Compare the tracks of a clip, in the world frame, with its truth."""
@@ -99,6 +111,17 @@ class NuScenesScorer:
         """What is ignored, and what is excused."""
         return self.boxes.rules
 
+    @property
+    def near(self) -> Rules:
+        """By the distance of centres."""
+        return self.boxes.near
+
+    def counts(self, clip: Clip, tracks: ResultTable) -> Bools:
+        """Return which tracks (R,) are within the range of the class."""
+        ego = self.scenes[clip.name].ego[tracks.frame]
+        distance = np.linalg.norm(tracks.center[:, :2] - ego, axis=1)
+        return np.asarray(distance < self.config.class_range[self.name], dtype=np.bool_)
+
     def measure(self, clip: Clip, tracks: ResultTable) -> Measured:
         """Compare the tracks of a clip, in the world frame, with its truth."""
         scene = self.scenes[clip.name]
@@ -110,7 +133,7 @@ class NuScenesScorer:
             len(scene.stamp_us),
             self.config.match_distance,
         )
-        return replace(self.boxes.measure(clip, tracks), official=found)
+        return replace(self.boxes.measure(clip, tracks.take(self.counts(clip, tracks))), official=found)
 
     def figures(self, measured: Sequence[Measured]) -> Figures:
         """Return the figures of some sequences together."""

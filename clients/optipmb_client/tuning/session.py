@@ -9,12 +9,16 @@ import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import reduce
+from operator import add
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from optipmb import Parameters
+from optipmb_client.evaluation.calibration import CalibrationResult
+from optipmb_client.tuning.calibrate import calibrate, judge_calibration
 from optipmb_client.tuning.caution import Jury
 from optipmb_client.tuning.degrade import Degradation, degrade
 from optipmb_client.tuning.estimate import estimate
@@ -23,10 +27,11 @@ from optipmb_client.tuning.figures import Figures
 from optipmb_client.tuning.folds import deal
 from optipmb_client.tuning.material import Clip
 from optipmb_client.tuning.objective import Bench
+from optipmb_client.tuning.ranking import Ranking, rank
 from optipmb_client.tuning.scoring import Measured, Scorer
 from optipmb_client.tuning.search import Outcome, Search
 from optipmb_client.tuning.space import Dimension, dimensions, penalty, repaired
-from optipmb_client.tuning.values import Value, only, value_of, with_values
+from optipmb_client.tuning.values import Value, only, value_of, with_calibration, with_values
 from optipmb_client.tuning.watch import Quiet, Watch
 
 __all__ = ["FoldResult", "Plan", "Refined", "refine"]
@@ -66,6 +71,8 @@ class FoldResult:
     after: tuple[Figures, ...]
     value_before: float
     value_after: float
+    calibration: CalibrationResult
+    """Of the tracks with what was found."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,10 @@ class Refined:
     value_before: float
     value_after: float
     value_crossed: float | None
+    calibration: CalibrationResult
+    """Of all sequences, each with what was found without it; without folds, with what they chose."""
+    ranking: tuple[Ranking, ...]
+    """Scores that tracks could be ranked by; empty without a calibration."""
     trials: int
 
     def to_json(self) -> dict[str, Any]:
@@ -124,6 +135,8 @@ class Refined:
                 for fold in self.folds
             ],
             "evidence": [asdict(one) for one in self.evidence],
+            "calibration": {"held out": bool(self.folds), **self.calibration.summary()},
+            "ranking": [{**asdict(one), "figures": one.figures.to_json()} for one in self.ranking],
         }
 
 
@@ -180,6 +193,8 @@ def refine(
         before, value_before = work.figures(base, everyone)
         after, value_after = work.figures(found, everyone)
         together = work.together(crossed, everyone) if crossed else ()
+        watch.note(f"calibrating {name}")
+        known = value_of(found, name, "calibration") is not None
         return Refined(
             name=name,
             plan=plan,
@@ -193,6 +208,10 @@ def refine(
             value_before=value_before,
             value_after=value_after,
             value_crossed=bench.value(together, everyone) if together else None,
+            calibration=reduce(add, [fold.calibration for fold in folds])
+            if folds
+            else judge_calibration(clips, scorer, found),
+            ranking=rank(clips, scorer, found, plan.metric) if known else (),
             trials=trials,
         )
 
@@ -228,7 +247,7 @@ class _Work:
         plain = [self.bench.variants[0][i] for i in clips]
         estimated = estimate(plain, self.name, self.base, self.bench.scorer.rules).values
         seen = {path: value for path, value in estimated.items() if path in _SEEN}
-        base = with_values(self.base, self.name, seen)
+        base = self._told(with_values(self.base, self.name, seen), clips)
         space = dimensions(base, self.name, estimated, plain, everything=self.plan.everything)
         plan = asdict(self.plan)
         settings = {
@@ -267,7 +286,28 @@ class _Work:
         found = search.run(trials, score, heard).values
         start = {one.path: value_of(base, self.name, one.path) for one in space}
         values = prune(jury, made, start, repaired(found, base, self.name), self.plan.caution, self.watch)
-        return _Choice(jury, made, start, values, made(values))
+        return _Choice(jury, made, start, values, self._calibrated(made(values), clips))
+
+    def _calibrated(self, parameters: Parameters, clips: tuple[int, ...]) -> Parameters:
+        """Return the parameters with the calibration that sequences give; memory and score stay if there is one."""
+        plain = [self.bench.variants[0][i] for i in clips]
+        before = parameters.classes[self.name].calibration
+        found = calibrate(plain, self.bench.scorer, parameters, before.memory if before else None)
+        if found and before:
+            found = found.model_copy(update={"score_of_evidence": before.score_of_evidence})
+        return with_calibration(parameters, self.name, found)
+
+    def _told(self, base: Parameters, clips: tuple[int, ...]) -> Parameters:
+        """Return the parameters with a calibration of their own, and with the score that ranks tracks better.
+
+        It is one choice of two, and neither was made to fit: no caution is needed as for the best of a hundred trials.
+        """
+        self.watch.note("calibrating")
+        plain = self._calibrated(with_calibration(base, self.name, None), clips)
+        if plain.classes[self.name].calibration is None:
+            return plain
+        other = with_values(plain, self.name, {"calibration.score_of_evidence": True})
+        return other if Jury(self.bench, clips, plain).gain(other).gain > 0.0 else plain
 
     def _behind(self, parameters: Parameters, rival: Parameters, clips: tuple[int, ...]) -> float | None:
         """Return by how much parameters lose to the best so far where that shows early; None where it does not.
@@ -298,7 +338,8 @@ class _Work:
         for place, clip in enumerate(group):
             crossed[clip] = [variant[place] for variant in measured]
         names = tuple(self.bench.names[i] for i in group)
-        return FoldResult(names, found, before, after, value_before, value_after)
+        told = judge_calibration([self.bench.variants[0][i] for i in group], self.bench.scorer, found)
+        return FoldResult(names, found, before, after, value_before, value_after, told)
 
     def together(self, crossed: Mapping[int, list[Measured]], clips: tuple[int, ...]) -> tuple[Figures, ...]:
         """Return the figures of all sequences, each with the parameters found without it.

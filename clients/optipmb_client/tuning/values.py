@@ -8,11 +8,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from optipmb import OptipmbError, Parameters, parse_parameters
+from optipmb import Calibration, OptipmbError, Parameters, parse_parameters
 from optipmb_client.errors import UsageError
 from optipmb_client.files import AtomicText
 
-__all__ = ["DIGITS", "Value", "only", "rounded", "value_of", "with_classes", "with_values", "write_profile"]
+__all__ = [
+    "DIGITS",
+    "Value",
+    "only",
+    "rounded",
+    "value_of",
+    "with_calibration",
+    "with_classes",
+    "with_values",
+    "write_profile",
+]
 
 DIGITS = 3
 Value = float | int | bool
@@ -49,6 +59,13 @@ def with_values(parameters: Parameters, name: str, values: Mapping[str, Value]) 
     return _parsed(document)
 
 
+def with_calibration(parameters: Parameters, name: str, calibration: Calibration | None) -> Parameters:
+    """Return the parameters with another calibration of one class."""
+    document = parameters.model_dump()
+    document["classes"][name]["calibration"] = calibration.model_dump() if calibration else None
+    return _parsed(document)
+
+
 def only(parameters: Parameters, name: str) -> Parameters:
     """Return the parameters with one class only."""
     document = parameters.model_dump()
@@ -77,7 +94,7 @@ def profile_text(parameters: Parameters) -> str:
     lines = [f"{key} = {_toml(value)}" for key, value in document.items()]
     for name, table in classes.items():
         lines += ["", f"[classes.{name if name.isidentifier() else _toml(name)}]"]
-        lines += [f"{key} = {_toml(value)}" for key, value in table.items()]
+        lines += [f"{key} = {_toml(value)}" for key, value in table.items() if value is not None]
     return "\n".join(lines) + "\n"
 
 
@@ -99,7 +116,9 @@ def _toml(value: Any) -> str:
             return '"""\n' + "\n".join(_escaped(line) for line in value.split("\n")) + '"""'
         return f'"{_escaped(value)}"'
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items() if item is not None) + " }"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
     return repr(value)
 
 
