@@ -60,7 +60,10 @@ def test_the_profile_loads_and_says_where_it_comes_from(tmp_path: Path, capsys: 
     changed = {one["path"] for one in car["evidence"]}
     table, other = (profile.model_dump()["classes"]["Car"] for profile in (before, after))
     flat = {key for key in table if table[key] != other[key] and not isinstance(table[key], dict)}
-    assert flat <= changed
+    assert flat <= changed | {"calibration"}
+    assert other["calibration"] is not None
+    assert car["calibration"]["held out"]
+    assert car["ranking"][0]["score"] == "x_s"
     assert run(["track", *SCENE, "--profile", report["profile"], "--out", str(tmp_path / "tracks")]) == 0
 
 

@@ -42,6 +42,8 @@ _EDGES = (0.0, 0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 1.0)
 _LEAST_KNOT = 30
 """Boxes of tracks that a knot stands on."""
 _FIFTHS = 5
+_CERTAIN = (0.001, 0.999)
+"""Beyond these no share that was measured is known."""
 _WIDEST, _MOST = 10.0, 1.5
 _NEES = 2.0
 _SCALE = 28.0
@@ -179,16 +181,16 @@ def _fitted(rows: _Rows, memory: float, widening: float) -> Calibration:
     existence, lasting = _existence(rows), _lasting(rows) * (1.0, widening, widening)
     bends = sorted({rounded(x) for x in (*existence[:, 0].tolist(), *lasting[:, 0].tolist())})
 
-    def column(knots: Floats, place: int) -> tuple[float, ...]:
-        return tuple(rounded(float(y)) for y in np.interp(bends, knots[:, 0], knots[:, place]))
+    def column(knots: Floats, place: int) -> list[float]:
+        return [rounded(float(y)) for y in np.interp(bends, knots[:, 0], knots[:, place])]
 
     return Calibration(
         memory=memory,
         missed=MISSED,
         evidence=tuple(bends),
-        existence=tuple(np.maximum.accumulate(column(existence, 1)).tolist()),
-        along=column(lasting, 1),
-        across=column(lasting, 2),
+        existence=tuple(np.clip(column(existence, 1), *_CERTAIN).tolist()),
+        along=tuple(column(lasting, 1)),
+        across=tuple(column(lasting, 2)),
     )
 
 
@@ -199,7 +201,6 @@ def _existence(rows: _Rows) -> Floats:
     if not len(true):
         return np.array([[0.0, 0.5]])
     level = np.asarray(isotonic_regression(true).x, dtype=np.float64)
-    # A tie in evidence must not stand on two levels; neither may a knot stand on a handful of boxes.
     cuts = [0, *(int(np.searchsorted(level, edge)) for edge in _EDGES[1:-1]), len(level)]
     knots: list[tuple[float, float]] = []
     begin = 0
