@@ -180,7 +180,9 @@ def refine(
         groups = deal([bench.boxes(i) for i in everyone], plan.folds)
         trials = len(groups) * plan.fold_trials + plan.trials
         watch.begin(name, trials)
-        work = _Work(bench, base, plan, storage, dict(context), watch)
+        watch.note(f"calibrating {name}")
+        first = calibrate(clips, scorer, base)
+        work = _Work(bench, base, plan, storage, dict(context), watch, first.memory if first else None)
         folds: list[FoldResult] = []
         crossed: dict[int, list[Measured]] = {}
         for number, group in enumerate(groups):
@@ -237,6 +239,8 @@ class _Work:
     storage: Path
     context: dict[str, Any]
     watch: Watch
+    memory: float | None
+    """Of the evidence, for all searches; None where there is too little to calibrate."""
 
     @property
     def name(self) -> str:
@@ -289,10 +293,10 @@ class _Work:
         return _Choice(jury, made, start, values, self._calibrated(made(values), clips))
 
     def _calibrated(self, parameters: Parameters, clips: tuple[int, ...]) -> Parameters:
-        """Return the parameters with the calibration that sequences give; memory and score stay if there is one."""
-        plain = [self.bench.variants[0][i] for i in clips]
+        """Return the parameters with the calibration that sequences give; what ranks tracks stays if there is one."""
         before = parameters.classes[self.name].calibration
-        found = calibrate(plain, self.bench.scorer, parameters, before.memory if before else None)
+        plain = [self.bench.variants[0][i] for i in clips]
+        found = calibrate(plain, self.bench.scorer, parameters, self.memory) if self.memory else None
         if found and before:
             found = found.model_copy(update={"score_of_evidence": before.score_of_evidence})
         return with_calibration(parameters, self.name, found)
