@@ -1,6 +1,18 @@
-"""``python -m optipmb_service`` is ``optipmb-service``."""
+"""The entry of `optipmb-service` and of `python -m optipmb_service`."""
 
-from optipmb_service.cli import main
+import sys
+
+from optipmb_service import health
+
+
+def main() -> None:
+    """Run the command line; `health` without loading anything of the tracker: containers ask every few seconds."""
+    if sys.argv[1:2] == ["health"]:
+        sys.exit(health.main(sys.argv[2:]))
+    from optipmb_service import cli  # noqa: PLC0415 - a second that `health` can do without
+
+    cli.main()
+
 
 if __name__ == "__main__":
     main()

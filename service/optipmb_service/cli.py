@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 WRONG_USE: Final = 2
+PASSED_ON: Final = {"allow_extra_args": True, "ignore_unknown_options": True}
 
 app = typer.Typer(
     add_completion=False,
@@ -162,22 +163,10 @@ def router_command(
     leave(route(loaded.settings))
 
 
-@app.command("health")
-def health_command(
-    settings: SettingsFile = None,
-    http: Http = None,
-    *,
-    ready: Annotated[
-        bool, typer.Option("--ready", help="Ask whether it can be used, not whether it is alive.")
-    ] = False,
-) -> None:
-    """Ask a running service how it is, at the `http` address of the settings; status 0 when well, else 1."""
-    address = _load(settings, http=http).settings.http
-    if not address:
-        _wrong("setting http: there is no address to ask at")
-    well, text = health.ask(address, ready=ready)
-    typer.echo(text)
-    raise typer.Exit(0 if well else 1)
+@app.command("health", add_help_option=False, context_settings=PASSED_ON)
+def health_command(context: typer.Context) -> None:
+    """Ask a running service how it is; status 0 when well, else 1. See `health --help`."""
+    raise typer.Exit(health.main(context.args))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,9 +1,19 @@
-"""Asks a running service how it is, as container engines do: one question, one answer, a few seconds at most."""
+"""`optipmb-service health` asks a running service how it is, as container engines do.
+
+One question, one answer, a few seconds at most. It loads nothing of the service unless a settings file is given.
+"""
 
 from __future__ import annotations
 
+import argparse
 import http.client
-from typing import Final
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 TIMEOUT_S: Final = 3.0
 
@@ -30,3 +40,39 @@ def ask(address: str, *, ready: bool) -> tuple[bool, str]:
         return False, f"no answer at {address}: {error}"
     finally:
         connection.close()
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command; returns the exit status: 0 when the service is well, 1 when not, 2 for a wrong use."""
+    parser = argparse.ArgumentParser(
+        prog="optipmb-service health",
+        description="Ask a running service, or router, whether it is alive. Status 0: yes, 1: no.",
+    )
+    parser.add_argument("--http", metavar="ADDRESS", help="where it answers; default: OPTIPMB_HTTP, or the settings")
+    parser.add_argument("--settings", metavar="FILE", type=Path, help="settings of the service, a TOML file")
+    parser.add_argument("--ready", action="store_true", help="ask whether it can be used, not only alive")
+    given = parser.parse_args(arguments)
+    try:
+        address = _address(given.http, given.settings)
+    except ValueError as error:
+        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a wrong use
+        return 2
+    well, text = ask(address, ready=given.ready)
+    print(text)  # noqa: T201 - the answer
+    return 0 if well else 1
+
+
+def _address(option: str | None, file: Path | None) -> str:
+    """Return where to ask.
+
+    Raises:
+        ValueError: nothing says where.
+    """
+    address = option or os.environ.get("OPTIPMB_HTTP", "")
+    if file is not None and not address:
+        from optipmb_service.settings import load  # noqa: PLC0415 - only this needs the libraries behind it
+
+        address = load(file).settings.http
+    if not address.rpartition(":")[2].isdecimal():
+        raise ValueError(f"setting http: expected where to ask, as 127.0.0.1:8080, received {address!r}")
+    return address
