@@ -386,9 +386,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--renew", action="store_true", help="new certificates, also where the present ones hold")
     try:
         for line in make(parser.parse_args(arguments)):
-            print(line)  # noqa: T201 - what the command says
+            print(line)
     except MakeError as error:
-        print(f"make.py: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failure
+        print(f"make.py: {error}", file=sys.stderr)
         return 2
     return 0
 
