@@ -3,11 +3,12 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test load install lint types tests schemas wheel clean
+.PHONY: help demo test load stack install lint types tests schemas wheel clean
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    everything that CI runs: lint, types, tests, schemas, wheel, demo"
 	@echo "make load    measure what the service carries on this machine, as docs/performance.md has it"
+	@echo "make stack   run the compose file's stack as processes and show that it works (needs Debian's prometheus)"
 	@echo "make clean   remove the virtual environment and everything generated"
 
 # The stamp is newer than what it was made from, so a second call installs nothing.
@@ -21,6 +22,9 @@ install: $(VENV)/.installed
 
 demo: install
 	$(BIN)/optipmb demo --out out/demo
+
+stack: install
+	$(BIN)/python docker/stack.py --work out/stack
 
 test: lint types tests schemas wheel demo
 
