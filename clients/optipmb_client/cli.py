@@ -24,6 +24,7 @@ from optipmb_client.commands.status import status
 from optipmb_client.commands.track import track
 from optipmb_client.commands.tune import tune
 from optipmb_client.commands.warm_up import warm_up
+from optipmb_client.commands.watch import watch
 from optipmb_client.datasets import DatasetError
 from optipmb_client.errors import ClientError, UsageError
 
@@ -40,7 +41,7 @@ _OptionError: Any = typer.BadParameter.__base__
 app = typer.Typer(
     name="optipmb", help="Track objects in 3D: offline, or through a tracking service.", add_completion=False
 )
-for command in (demo, track, replay, record, play, evaluate, tune, ablate, plot, status, load, warm_up):
+for command in (demo, track, replay, record, play, watch, evaluate, tune, ablate, plot, status, load, warm_up):
     app.command()(command)
 
 
