@@ -52,7 +52,9 @@ class Merged:
         self.repeated = 0
 
     def take(self, outputs: Iterable[Output]) -> None:
-        """Add what a session gave out."""
+        """Add what a session gave out; it must not have failed."""
+        outputs = list(outputs)
+        assert not dumps(outputs), dumps(outputs)[0].error
         for message in tracks(outputs):
             key = message.epoch, message.seq
             old = self.newest.get(key)
@@ -84,6 +86,19 @@ class Failing:
         if len(frame.score) == self._count:
             raise ZeroDivisionError("seven")
         return self._tracker.step(density, frame)
+
+
+NOTHING = (
+    optipmb.Tracker(optipmb.load_profile("nuscenes"))
+    .step(
+        optipmb.Density.empty(),
+        optipmb.make_frame(
+            optipmb.load_profile("nuscenes"), stamp_ns=0, labels=(), label=[], center=[], size=[], yaw=[], score=[]
+        )[0],
+    )
+    .diagnostics
+)
+"""Of a step without detections."""
 
 
 @dataclass
@@ -136,7 +151,7 @@ class Chained:
             time_since_detection=np.zeros(1),
             detection=np.array([-1]),
         )
-        return optipmb.StepResult(after, found, optipmb.Diagnostics(frame.cloud is not None, 0, 0, 0, 0, int(born), 0))
+        return optipmb.StepResult(after, found, replace(NOTHING, cloud_used=frame.cloud is not None, born=int(born)))
 
 
 def chained(parameters: optipmb.Parameters) -> Chained:
