@@ -5,7 +5,7 @@ give equal bytes. Reading is total and bounded: it returns a checkpoint or raise
 compared before anything else is looked at. A service reads the versions that earlier ones wrote, and refuses later ones
 by number.
 
-What depends on how messages were delivered (duplicates, the revisions of tracks that were corrected) is kept, but is no
+What depends on how messages were delivered (duplicates, the revisions of corrected tracks, crashes) is kept, but is no
 state: `state_bytes` leaves it out, so that two sessions that took the same frames can be compared.
 """
 
@@ -79,6 +79,7 @@ class Checkpoint:
         head: the present moment.
         deliveries: what was not tracked, and what was corrected.
         newest_cloud_ns: stamp of the cloud that arrived last.
+        run: how often the session was taken up again.
         software: version of the service that wrote it.
     """
 
@@ -92,6 +93,7 @@ class Checkpoint:
     head: Moment
     deliveries: Deliveries
     newest_cloud_ns: int | None
+    run: int = 0
     software: str = _SOFTWARE
 
     @property
@@ -108,7 +110,7 @@ def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
 def state_bytes(checkpoint: Checkpoint) -> bytes:
     """Return the bytes of what does not depend on how messages were delivered."""
     window = tuple(replace(one, revision=0) for one in checkpoint.window)
-    bare = replace(checkpoint, window=window, deliveries=Deliveries(), newest_cloud_ns=None, software="")
+    bare = replace(checkpoint, window=window, deliveries=Deliveries(), newest_cloud_ns=None, run=0, software="")
     return encode_checkpoint(bare)
 
 
@@ -179,6 +181,7 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
         "head": _moment(checkpoint.head) if checkpoint.window else None,
         "deliveries": asdict(checkpoint.deliveries),
         "newest_cloud_ns": checkpoint.newest_cloud_ns,
+        "run": checkpoint.run,
     }
 
 
@@ -226,6 +229,7 @@ def _read_1(body: Document) -> Checkpoint:
         head=head,
         deliveries=Deliveries(**body.document("deliveries").wholes(Deliveries.__slots__)),
         newest_cloud_ns=body.optional("newest_cloud_ns", body.whole),
+        run=body.whole("run"),
         software=body.text("software"),
     )
 

@@ -107,6 +107,7 @@ class Session:
         self._clouds = Clouds(self._policy.clouds)
         self._recovery_ns: int | None = None
         self._quarantine = ""
+        self._run = 0
 
     # What arrives
 
@@ -260,6 +261,7 @@ class Session:
             head=self._history.head,
             deliveries=replace(self._deliveries),
             newest_cloud_ns=self._clouds.newest_ns,
+            run=self._run,
         )
 
     @classmethod
@@ -274,6 +276,9 @@ class Session:
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> Self:
         """Return the session that a checkpoint was taken of. It is `recovering` for a while.
+
+        Its tracks belong to another `run`, so the caller should write it down again before it publishes any: two runs
+        from one checkpoint would have the same number.
 
         Args:
             checkpoint: its state; its profile goes on too.
@@ -334,6 +339,15 @@ class Session:
             clouds_missed=counts.clouds_missed,
             repaired=counts.repaired,
         )
+
+    @property
+    def run(self) -> int:
+        """How often the session was taken up again.
+
+        A frame that was tracked before a crash, with others missing, may be tracked again after it with these there,
+        and nobody knows any more under which revision it was published. What a later run publishes of a frame holds.
+        """
+        return self._run
 
     @property
     def quarantine(self) -> str:
@@ -505,6 +519,7 @@ class Session:
         self._deliveries = replace(checkpoint.deliveries)
         self._clouds.newest_ns = checkpoint.newest_cloud_ns
         self._recovery_ns = now_ns + self._policy.recovery_wait_ns
+        self._run = checkpoint.run + 1
         base = checkpoint.base
         by_mark = {one.mark: one for one in checkpoint.window}
         self._done = Timeline.resume(

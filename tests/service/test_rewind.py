@@ -45,7 +45,7 @@ def test_any_order_inside_the_window_is_the_order(order: list[int]) -> None:
 
 
 def test_corrected_tracks_have_a_higher_revision() -> None:
-    """A late frame comes out with the frames behind it: it for the first time, they anew; the gap before them closes."""
+    """A late frame comes out with those behind it: it for the first time, they anew; the gap before them closes."""
     one = session()
     first = tracks(feed(one, [0, 1, 3, 4], SENSOR))
     assert [(m.seq, m.revision, m.gap) for m in first] == [(0, 0, 0), (1, 0, 0), (3, 0, 1), (4, 0, 0)]

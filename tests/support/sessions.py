@@ -45,28 +45,26 @@ def feed(one: Session, seqs: Iterable[int], sensor: Sensor, **changes: Any) -> l
 
 
 class Merged:
-    """The tracks as a user has them in the end: the latest revision of each frame, repetitions dropped."""
+    """The tracks as a user has them in the end: the latest run and revision of each frame, repetitions dropped."""
 
     def __init__(self) -> None:
-        self.newest: dict[tuple[bytes, int], Tracks] = {}
-        self.repeated = 0
+        self.newest: dict[tuple[bytes, int], tuple[int, Tracks]] = {}
 
-    def take(self, outputs: Iterable[Output]) -> None:
-        """Add what a session gave out; it must not have failed."""
+    def take(self, outputs: Iterable[Output], run: int = 0) -> None:
+        """Add what a session gave out in a run; it must not have failed."""
         outputs = list(outputs)
         assert not dumps(outputs), dumps(outputs)[0].error
         for message in tracks(outputs):
             key = message.epoch, message.seq
-            old = self.newest.get(key)
-            if old is not None and old.revision == message.revision:
-                self.repeated += 1
+            old_run, old = self.newest.get(key, (-1, message))
+            if (old_run, old.revision) == (run, message.revision):
                 assert plain(old) == plain(message), f"another message of revision {message.revision} for {key}"
-            if old is None or message.revision > old.revision:
-                self.newest[key] = message
+            if (run, message.revision) > (old_run, old.revision):
+                self.newest[key] = run, message
 
     def plain(self) -> dict[tuple[bytes, int], bytes]:
         """The bytes of the tracks but for revision and delivery."""
-        return {key: plain(message) for key, message in self.newest.items()}
+        return {key: plain(message) for key, (_, message) in self.newest.items()}
 
 
 def plain(message: Tracks) -> bytes:
@@ -121,7 +119,7 @@ class Chained:
         if frame.cloud is not None:
             digest.update(frame.cloud.xyz.tobytes())
         numbers = np.frombuffer(digest.digest(), np.uint8).astype(np.float64)
-        born = len(frame.score) > len(density.bernoulli)
+        born = not len(density.bernoulli)
         known = density.bernoulli
         # Whatever else a Bernoulli has is one.
         ones = {name: np.ones((1, *column.shape[1:]), column.dtype) for name, column in known.columns()}
