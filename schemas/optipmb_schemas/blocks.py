@@ -5,6 +5,7 @@ otherwise. The encoder moves the data of a large block to a multiple of 8 bytes 
 optional field `pad`), so that the receiver's view is aligned.
 """
 
+import sys
 from math import prod
 from typing import Any, Final
 
@@ -74,9 +75,14 @@ def _read_block(block: dict[str, Any], description: Array) -> NDArray[Any]:
 
 def block_of(array: NDArray[Any]) -> dict[str, Any]:
     """Return the block of a native array. The data of a large one are a view, not a copy."""
-    little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+    little = array if _plain(array) else np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     data = little.data if little.nbytes >= LARGE else little.tobytes()
     return {"dtype": f"{array.dtype.kind}{array.dtype.itemsize}", "shape": list(array.shape), "data": data}
+
+
+def _plain(array: NDArray[Any]) -> bool:
+    """Whether the bytes of an array are those of its block as they lie."""
+    return sys.byteorder == "little" and array.dtype.isnative and array.flags.c_contiguous
 
 
 def pack_large(block: dict[str, Any], offset: int) -> tuple[bytes, memoryview]:

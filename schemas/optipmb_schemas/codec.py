@@ -54,18 +54,22 @@ def encoding_of(message: Message | type[Message], *, form: str = "msgpack") -> s
 def encode(message: Message) -> bytes:
     """Return the message as msgpack, arrays as blocks. Fields that are None are left out."""
     fields = _plain(message, blocks=True)
-    parts: list[bytes | memoryview] = [_msgpack.Packer().pack_map_header(len(fields))]
-    size = len(parts[0])
+    packer = _msgpack.Packer(autoreset=False)
+    packer.pack_map_header(len(fields))
+    parts: list[bytes | memoryview] = []
+    size = 0  # of the parts; what the packer holds comes after them
     for name, value in fields.items():
-        parts.append(_msgpack.packb(name))
-        size += len(parts[-1])
+        packer.pack(name)
         if isinstance(value, dict) and isinstance(value.get("data"), memoryview):
+            parts.append(packer.bytes())
+            packer.reset()
+            size += len(parts[-1])
             head, data = pack_large(value, size)
             parts += (head, data)
             size += len(head) + data.nbytes
         else:
-            parts.append(_msgpack.packb(value))
-            size += len(parts[-1])
+            packer.pack(value)
+    parts.append(packer.bytes())
     return b"".join(parts)
 
 

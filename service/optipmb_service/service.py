@@ -12,6 +12,7 @@ close.
 from __future__ import annotations
 
 import asyncio
+import gc
 import sys
 import time
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -266,6 +267,7 @@ async def _serve(settings: Settings, profiles: Profiles, asked: Asked, vitals: V
         return 0
     service.start(announce=household.announces)
     vitals.report(service)
+    settle_memory()
     household.ready(service)
     log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
     while not asked.is_set():
@@ -275,6 +277,16 @@ async def _serve(settings: Settings, profiles: Profiles, asked: Asked, vitals: V
     ended = await asyncio.to_thread(service.stop)
     log.info("stopped", drained=ended)
     return 0
+
+
+def settle_memory() -> None:
+    """Take what the start has made out of the garbage collector's sight.
+
+    150,000 objects of libraries and kernels live for ever. A full collection walks them all, and for as long no frame
+    moves: 50 ms on an idle machine. Without them it takes microseconds.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 def _log_problem(problem: schemas.Problem, count: int) -> None:

@@ -12,6 +12,7 @@ ready, commands, the state to be written down, and what is done when a step fail
 from __future__ import annotations
 
 import time
+import weakref
 from bisect import insort
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
@@ -44,6 +45,7 @@ from optipmb_service.timing import Decision, Mark, Timeline, Verdict, hold_until
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from optipmb_service.history import Step
     from optipmb_service.records import Steps
 
 MAX_HELD: Final = 64
@@ -100,7 +102,7 @@ class Session:
         self._make = tracker
         self._stepper = Stepper(stream, parameters, tracker(parameters))
         life = life or Life()
-        self._history = History(empty(self._stepper, None, life.next_id, life.starts), self._step)
+        self._history = History(empty(self._stepper, None, life.next_id, life.starts), _weakly(self._step))
         self._done = Timeline(self._policy.gap_limit_ns)
         self._arrived = self._done
         self._held: list[_Held] = []
@@ -508,7 +510,7 @@ class Session:
 
     def _begin(self, moment: Moment) -> None:
         """Go on from a moment without a way back behind it."""
-        self._history = History(moment, self._step)
+        self._history = History(moment, _weakly(self._step))
         self._done = self._done.settle(moment.course, moment.last, frozenset(self._done.marks))
         self._arrived = self._done
 
@@ -538,7 +540,7 @@ class Session:
                 Entry(mark, places[mark], one.message, one.points, one.missed, one.revision, frame, ignored, weight)
             )
         entries.sort(key=lambda one: one.order)
-        self._history = History(base, self._step, entries, checkpoint.head)
+        self._history = History(base, _weakly(self._step), entries, checkpoint.head)
 
     def _wait(self, cloud_wait_ns: int) -> None:
         self._cloud_wait_ns = cloud_wait_ns
@@ -546,3 +548,15 @@ class Session:
 
     def _step(self, before: Moment, entry: Entry) -> tuple[Moment, Outcome]:
         return self._stepper.step(before, entry, self._policy)
+
+
+def _weakly(step: Step) -> Step:
+    """Return a method without hold on its session: in a circle, a session that has ended would keep its clouds."""
+    method = weakref.WeakMethod(step)
+
+    def call(before: Moment, entry: Entry) -> tuple[Moment, Outcome]:
+        bound = method()
+        assert bound is not None  # noqa: S101 - whoever calls has the session: said for the type checker
+        return bound(before, entry)
+
+    return call
