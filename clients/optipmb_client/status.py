@@ -7,7 +7,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-__all__ = ["render"]
+__all__ = ["duration", "render"]
 
 COLUMNS = ("stream", "profile", "state", "frames/s", "p50 ms", "p99 ms", "frames", "tracks", "queue")
 COUNTED = ("refused", "shed", "gaps", "last frame")
@@ -18,7 +18,7 @@ def render(services: Sequence[ServiceStatus]) -> RenderableType:
     """Return services with their streams and newest problems, ready to be printed."""
     parts: list[RenderableType] = []
     for service in services:
-        head = f"{service.instance}  {service.state}, version {service.version}, up {_duration(service.uptime_s)}, "
+        head = f"{service.instance}  {service.state}, version {service.version}, up {duration(service.uptime_s)}, "
         parts.append(Text(head + f"{service.frames} frames, {service.refused} refused", style="bold"))
         parts.append(_streams(service.sessions) if service.sessions else Text("no streams"))
         parts += [_problem(problem) for problem in service.problems[-SHOWN_PROBLEMS:]]
@@ -43,7 +43,7 @@ def _streams(sessions: Sequence[SessionSummary]) -> Table:
             str(session.refused),
             str(session.shed),
             str(session.gaps),
-            "never" if session.age_s is None else f"{_duration(session.age_s)} ago",
+            "never" if session.age_s is None else f"{duration(session.age_s)} ago",
         )
     return table
 
@@ -53,7 +53,8 @@ def _problem(problem: Problem) -> Text:
     return Text(f"problem: {problem.stream or 'no stream'}: {problem.message}{times}", style="yellow")
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Return a time in seconds as people say it."""
     for unit, size in (("d", 86_400), ("h", 3_600), ("min", 60)):
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {unit}"

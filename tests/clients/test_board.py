@@ -1,0 +1,90 @@
+"""The live view: rates from differences, the worst on top, what vanished still seen."""
+
+import io
+from typing import Any
+
+from optipmb_client.board import Board
+from optipmb_schemas import Problem, ServiceStatus, SessionSummary
+from rich.console import Console
+
+HEIGHT = 40
+
+
+def session(stream: str, **changes: Any) -> SessionSummary:
+    """A stream that is well, but for changes."""
+    fields = {"profile": "nuscenes", "state": "running", "rate_hz": 10.0, "latency_p50_ms": 2.0, "latency_p99_ms": 5.0}
+    return SessionSummary(stream=stream, frames=100, tracks=7, age_s=0.1, **fields | changes)
+
+
+def service(instance: str = "one", *sessions: SessionSummary, **changes: Any) -> ServiceStatus:
+    """An instance that is well, but for changes."""
+    fields = {"version": "1", "started_ns": 1, "uptime_s": 60.0, "state": "ready"}
+    return ServiceStatus(instance=instance, sessions=sessions, **fields | changes)
+
+
+def text(board: Board, height: int = HEIGHT) -> str:
+    """The board as a terminal would show it, without colours."""
+    console = Console(width=140, record=True, file=io.StringIO())
+    console.print(board.render(height))
+    return console.export_text()
+
+
+def test_rates_are_those_of_the_last_interval() -> None:
+    """Frames and losses per second are differences of counters, not means since the start."""
+    board = Board("here")
+    board.take([service("one", session("a/b/c", shed=50), frames=5000)], 10.0)
+    board.take([service("one", session("a/b/c", shed=54), frames=5040)], 12.0)
+    title = text(board).splitlines()[0]
+    assert "1 services, 1 streams, 20 frames/s, 2.0 lost/s" in title
+
+
+def test_a_restart_is_no_negative_rate() -> None:
+    """Counters that begin again after a restart are not compared with those before it."""
+    board = Board("here")
+    board.take([service("one", session("a/b/c"), frames=5000)], 10.0)
+    board.take([service("one", session("a/b/c"), frames=3, started_ns=2)], 11.0)
+    assert "0 frames/s, 0.0 lost/s" in text(board)
+
+
+def test_the_worst_come_first_and_the_rest_is_counted() -> None:
+    """With more streams than lines those that lose frames, then the silent, then the late are shown."""
+    well = [session(f"a/b/well-{number:02}") for number in range(50)]
+    late, silent = session("z/z/late", latency_p99_ms=300.0), session("z/z/silent", state="stale")
+    board = Board("here")
+    board.take([service("one", *well, late, silent, session("z/z/losing", shed=1))], 1.0)
+    board.take([service("one", *well, late, silent, session("z/z/losing", shed=9))], 2.0)
+    lines = text(board, 20).splitlines()
+    assert len(lines) <= 20
+    streams = [line.split()[0] for line in lines if "/" in line.split(" ")[0]]
+    assert streams[:4] == ["z/z/losing", "z/z/silent", "z/z/late", "a/b/well-00"]
+    assert f"and {53 - len(streams)} more that are better off" in text(board, 20)
+
+
+def test_an_instance_that_vanished_is_shown_for_a_while() -> None:
+    """It is marked as gone for a minute, then forgotten; the others go on."""
+    board = Board("here")
+    board.take([service("one", session("a/b/c")), service("two")], 1.0)
+    board.take([service("two", session("a/b/c"))], 21.0)
+    (line,) = [line for line in text(board).splitlines() if line.startswith("one")]
+    assert "gone for 20.0 s" in line
+    board.take([service("two")], 90.0)
+    assert "one" not in [line.split(" ")[0] for line in text(board).splitlines()]
+
+
+def test_problems_are_shown_once_with_their_age() -> None:
+    """A problem that every sample repeats is one line, which says how long ago it came."""
+    problem = Problem(stream="a/b/c", instance="one", code="late", message="Frame 7: late.", count=3)
+    board = Board("here")
+    for second in range(5):
+        board.take([service("one", session("a/b/c"), problems=(problem,))], float(second))
+    lines = [line for line in text(board).splitlines() if "Frame 7" in line]
+    assert len(lines) == 1
+    assert lines[0].split()[:4] == ["4.0", "s", "ago", "late"]
+    assert "(3 times)" in lines[0]
+
+
+def test_nothing_there_is_said() -> None:
+    """Without any service the board says so."""
+    board = Board("here")
+    board.take([], 1.0)
+    assert "no service answers" in text(board)
