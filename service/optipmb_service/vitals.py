@@ -21,8 +21,12 @@ if TYPE_CHECKING:
 
     import optipmb_schemas as schemas
 
-    from optipmb_service.http.app import Source
+    from optipmb_service.http import Source, Watched
     from optipmb_service.settings import Settings
+
+    class Shown(Source, Watched, Protocol):
+        """What is served over HTTP."""
+
 
 log = structlog.get_logger("optipmb_service")
 
@@ -113,7 +117,7 @@ class Vitals:
 
 
 @contextmanager
-def shown(settings: Settings, source: Source) -> Iterator[None]:
+def shown(settings: Settings, source: Shown) -> Iterator[None]:
     """Answer over HTTP, where that is asked for.
 
     Raises:
@@ -125,8 +129,7 @@ def shown(settings: Settings, source: Source) -> Iterator[None]:
     # A third of a second that only this needs.
     from optipmb_service.http import Server, application, page  # noqa: PLC0415
 
-    # Only a process that tracks can show streams as they come.
-    server = Server(application(source, page(source) if isinstance(source, Vitals) else ()), settings.http)
+    server = Server(application(source, page(source)), settings.http)
     log.info("http", address=server.address)
     try:
         yield

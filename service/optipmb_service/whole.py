@@ -67,6 +67,9 @@ class Network(Protocol):
     def ask(self, key: str, timeout: float) -> bytes | None:
         """Return the first answer at a key."""
 
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
+        """Hand over what comes on a stream, until the result is called."""
+
 
 class Whole:
     """All workers of one instance.
@@ -153,6 +156,10 @@ class Whole:
             problems=tuple(problem for part in answered for problem in part.problems)[-PROBLEMS:],
             **sums,
         )
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
+        """Hand over what comes on a stream to a viewer, whichever worker tracks it, until the result is called."""
+        return None if self._ending else self._network.tap(stream, receive)
 
     def text(self) -> bytes:
         """Return the metrics of all processes in Prometheus' text format; those of a worker have its label."""

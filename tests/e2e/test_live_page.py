@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import threading
 import time
+import urllib.request
 from typing import TYPE_CHECKING
 
 import pytest
@@ -24,11 +26,12 @@ ENDPOINT, HTTP = free_endpoint(), free_endpoint().removeprefix("tcp/")
 BASE = f"http://{HTTP}"
 CARS, WALKERS = "yard/gate/lidar", "yard/hall/lidar"
 LOAD_S = 1.0
+DEADLINE_S = 60.0
 
 
-def service() -> ServiceProcess:
+def service(*options: str) -> ServiceProcess:
     """The service, always at the same addresses."""
-    return ServiceProcess("--listen", ENDPOINT, "--http", HTTP, "--profile", "nuscenes", listen=False)
+    return ServiceProcess("--listen", ENDPOINT, "--http", HTTP, "--profile", "nuscenes", *options, listen=False)
 
 
 @contextlib.contextmanager
@@ -156,3 +159,16 @@ def phone(chrome: Chrome) -> None:
     assert chrome.execute_script("return document.documentElement.scrollWidth") <= 390
     assert chrome.execute_script("return canvas.clientHeight") > 300
     shown_moving(chrome)
+
+
+def test_streams_of_worker_processes_are_shown_too() -> None:
+    """With several processes the page of the whole gets the tracks of whichever worker has the stream."""
+    with service("--workers", "2") as whole:
+        whole.wait_ready()
+        with publishing(CARS, "car", 4.0), publishing(WALKERS, "pedestrian", 1.0):
+            for stream, label in ((CARS, "car"), (WALKERS, "pedestrian")):
+                address = f"{BASE}/live?stream={stream}"
+                with urllib.request.urlopen(address, timeout=DEADLINE_S) as events:  # noqa: S310 - our own
+                    frame = next(json.loads(line[6:]) for line in events if line.startswith(b"data: "))
+                assert frame["labels"][frame["tracks"][0][1]] == label
+        assert whole.end()[0] == 0
