@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import logging
 import sys
+import threading
+import time
+from collections import Counter
 from typing import TYPE_CHECKING, Final, Literal
 
 import structlog
 
 if TYPE_CHECKING:
-    from structlog.typing import Processor
+    from collections.abc import Callable
+
+    from structlog.typing import EventDict, Processor, WrappedLogger
 
 EVENTS: Final = {
     "starting": "The service compiles or loads its kernels; the first start after an installation takes a minute.",
@@ -46,6 +51,48 @@ EVENTS: Final = {
 """Every event that is logged, and what an operator makes of it."""
 
 
+BURST: Final = 50
+"""Lines of one event that are written at once."""
+
+LINES_PER_SECOND: Final = 5.0
+"""Lines of one event that are written in the long run."""
+
+
+class Limiter:
+    """Drops lines of an event that comes too often; the next one that is written says how many (`suppressed`).
+
+    A thousand streams that fall silent together must neither fill a disk nor hide what else happens.
+
+    Args:
+        clock: seconds, monotonic.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._left: dict[str, tuple[float, float]] = {}
+        self._dropped: Counter[str] = Counter()
+
+    def __call__(self, _logger: WrappedLogger, _method: str, event: EventDict) -> EventDict:
+        """Let a line pass, or drop it.
+
+        Raises:
+            structlog.DropEvent: it is one too many.
+        """
+        name = str(event.get("event"))
+        now = self._clock()
+        with self._lock:
+            left, before = self._left.get(name, (float(BURST), now))
+            left = min(BURST, left + (now - before) * LINES_PER_SECOND)
+            self._left[name] = (left - 1 if left >= 1 else left, now)
+            if left < 1:
+                self._dropped[name] += 1
+                raise structlog.DropEvent
+            if suppressed := self._dropped.pop(name, 0):
+                event["suppressed"] = suppressed
+        return event
+
+
 def configure(form: Literal["console", "json"], level: str, worker: int | None = None) -> None:
     """Send the log lines to stderr, as coloured text on a terminal, plain text elsewhere, or JSON.
 
@@ -56,6 +103,7 @@ def configure(form: Literal["console", "json"], level: str, worker: int | None =
     """
     processors: list[Processor] = [] if worker is None else [lambda _logger, _name, event: {**event, "worker": worker}]
     processors += [
+        Limiter(),
         structlog.contextvars.merge_contextvars,
         structlog.processors.add_log_level,
         structlog.processors.TimeStamper(fmt="iso", utc=True),
