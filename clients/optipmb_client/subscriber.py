@@ -3,7 +3,6 @@
 Tracks are in the fixed world frame: metres, radians, stamps in integer nanoseconds of the sensor's clock.
 """
 
-import collections
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Self
 
 from optipmb_schemas import PREFIX, Keys, MessageError, Problem, Topic, Tracks, decode
 
+from optipmb_client.merging import Merging, Novelty
 from optipmb_client.transport import Arrival, Connection, Inbox
 
 __all__ = ["Received", "Statistics", "Subscriber", "key_expression"]
@@ -22,29 +22,38 @@ REMEMBERED = 65_536  # frames whose repetition is recognised
 
 @dataclass(frozen=True)
 class Received:
-    """Tracks, and the monotonic time (`time.monotonic_ns`) at which they arrived on this machine."""
+    """Tracks, and the monotonic time (`time.monotonic_ns`) at which they arrived on this machine.
+
+    `corrects` says whether they replace what came for the same frame before.
+    """
 
     tracks: Tracks
     monotonic_ns: int
+    corrects: bool = False
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a subscriber has seen: messages given out, dropped (the program was too slow), repeated, unreadable."""
+    """What a subscriber has seen: messages given out, dropped (the program was too slow), repeated, unreadable.
+
+    `corrected` counts the messages that replaced an earlier one, whether they were given out or not.
+    """
 
     delivered: int
     dropped: int
     repeated: int
     invalid: int
     pending: int
+    corrected: int = 0
 
 
 class Subscriber:
     """Receives the tracks of one stream or of many.
 
     Iterating gives `Tracks` messages as they come. The service may deliver a message again, after a restart for
-    example: repetitions are left out. A message with a higher `revision` for a frame (the service has since got a late
-    frame that came before it) is given out; one with a lower revision than already seen is not.
+    example: repetitions are left out, so that every message is given out once. When the service gets a frame late, it
+    puts it in its place and publishes the tracks of the frames behind it anew, with a higher `revision`: the latest one
+    of a frame holds. `corrections=False` leaves these out, for programs that act on what is new and do not look back.
 
     A subscriber that comes late first gets what the service keeps of each stream, some seconds.
     A program that is too slow loses the oldest waiting messages, never anybody else's; `statistics` counts them.
@@ -55,6 +64,7 @@ class Subscriber:
         timeout: Iterating ends when nothing has come for so many seconds; None: never.
         on_problem: Called with each `Problem` that the service reports for these streams (refused messages and the
             like), by the thread that iterates.
+        corrections: Whether messages that replace earlier ones are given out too.
         queue: Number of messages that may wait.
         config: A Zenoh configuration file, for TLS, passwords and the like.
         connection: Share an open connection (it stays open) in the place of `connect` and `config`.
@@ -73,6 +83,7 @@ class Subscriber:
         *,
         timeout: float | None = None,
         on_problem: Callable[[Problem], None] | None = None,
+        corrections: bool = True,
         queue: int = 1024,
         config: str | Path | None = None,
         connection: Connection | None = None,
@@ -83,7 +94,9 @@ class Subscriber:
         tracks, problems = key_expression(keys, pattern, "tracks"), key_expression(keys, pattern, "problems")
         self.timeout = timeout
         self._on_problem = on_problem
-        self._seen = _Seen(REMEMBERED)
+        self._merging = Merging(REMEMBERED)
+        self._corrections = corrections
+        self._corrected = 0
         self._delivered = 0
         self._repeated = 0
         self._invalid = 0
@@ -125,8 +138,12 @@ class Subscriber:
             if arrival is None:
                 return None
             if (tracks := self._read(arrival)) is not None:
-                self._delivered += 1
-                return Received(tracks, arrival.monotonic_ns)
+                novelty = self._merging.take(tracks)
+                self._repeated += novelty is Novelty.REPEATED
+                self._corrected += novelty is Novelty.CORRECTION
+                if novelty is Novelty.NEW or (novelty is Novelty.CORRECTION and self._corrections):
+                    self._delivered += 1
+                    return Received(tracks, arrival.monotonic_ns, corrects=novelty is Novelty.CORRECTION)
 
     @property
     def statistics(self) -> Statistics:
@@ -137,42 +154,21 @@ class Subscriber:
             repeated=self._repeated,
             invalid=self._invalid,
             pending=self._inbox.pending,
+            corrected=self._corrected,
         )
 
     def _read(self, arrival: Arrival) -> Tracks | None:
-        """Return the tracks that arrived; None for repetitions, problems, and what is no message of ours."""
+        """Return the tracks that arrived; None for problems, and what is no message of ours."""
         try:
             if arrival.key.endswith("/problems"):
                 problem = decode(arrival.payload, Problem, encoding=arrival.encoding)
                 if self._on_problem is not None:
                     self._on_problem(problem)
                 return None
-            tracks = decode(arrival.payload, Tracks, encoding=arrival.encoding)
+            return decode(arrival.payload, Tracks, encoding=arrival.encoding)
         except MessageError:
             self._invalid += 1
             return None
-        if self._seen.before((tracks.stream, tracks.session, tracks.epoch, tracks.seq), tracks.revision):
-            self._repeated += 1
-            return None
-        return tracks
-
-
-class _Seen:
-    """The newest revision seen of each of the newest `capacity` frames."""
-
-    def __init__(self, capacity: int) -> None:
-        self._revisions: collections.OrderedDict[tuple[str, str, bytes, int], int] = collections.OrderedDict()
-        self._capacity = capacity
-
-    def before(self, frame: tuple[str, str, bytes, int], revision: int) -> bool:
-        """Whether this revision of the frame, or a newer one, has been seen; remembers it when not."""
-        if self._revisions.get(frame, -1) >= revision:
-            return True
-        self._revisions[frame] = revision
-        self._revisions.move_to_end(frame)
-        if len(self._revisions) > self._capacity:
-            self._revisions.popitem(last=False)
-        return False
 
 
 def key_expression(keys: Keys, pattern: str, topic: Topic) -> str:

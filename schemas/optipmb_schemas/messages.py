@@ -119,6 +119,11 @@ class Delivery(Message):
     queue_ms: NonNegative = Field(description="Milliseconds spent waiting, for a worker and for the cloud.")
     decode_ms: NonNegative = Field(description="Milliseconds spent decoding.")
     step_ms: NonNegative = Field(description="Milliseconds spent in the tracker.")
+    run: Count = Field(
+        default=0,
+        description="How often the session was taken up again after a stop of the service. Tracks of a later run "
+        "replace those of an earlier one for the same `epoch` and `seq`, whatever their revisions.",
+    )
 
 
 class Tracks(Header):

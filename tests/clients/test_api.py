@@ -36,7 +36,7 @@ def listen(connection: Connection, topic: str) -> Inbox:
     return inbox
 
 
-def tracks(seq: int, *, revision: int = 0, session: str = SESSION, epoch: bytes = bytes(16)) -> Tracks:
+def tracks(seq: int, *, revision: int = 0, session: str = SESSION, epoch: bytes = bytes(16), gap: int = 0) -> Tracks:
     """A tracks message without tracks."""
     none = np.zeros(0)
     return Tracks(
@@ -48,6 +48,7 @@ def tracks(seq: int, *, revision: int = 0, session: str = SESSION, epoch: bytes 
         revision=revision,
         profile="kitti",
         cloud_used=False,
+        gap=gap,
         labels=("Car",),
         id=none.astype(np.int64),
         label=none.astype(np.int64),
@@ -362,7 +363,7 @@ def test_repeated_messages_are_left_out_and_newer_revisions_kept(link: Connectio
             tracks(1),
             tracks(2, revision=1),
             tracks(2),
-            tracks(2, revision=2),
+            tracks(2, revision=2, gap=1),
             tracks(1, session="a" * 32),
             tracks(1, epoch=bytes(15) + b"x"),
         )
@@ -375,6 +376,15 @@ def test_repeated_messages_are_left_out_and_newer_revisions_kept(link: Connectio
             (1, 0, SESSION, bytes(15) + b"x"),
         ]
         assert subscriber.statistics.repeated - before == 2
+
+
+def test_corrections_can_be_left_out(link: Connection, service: Service) -> None:
+    """A program that does not look back gets every frame once; what corrected it is counted."""
+    with Subscriber(STREAM, connection=link, timeout=0.5, corrections=False) as subscriber:
+        settle(subscriber, service)
+        service.tracks(tracks(1), tracks(2), tracks(1, revision=1, gap=1), tracks(2, revision=1), tracks(3))
+        assert [(m.seq, m.revision) for m in subscriber] == [(1, 0), (2, 0), (3, 0)]
+        assert subscriber.statistics.corrected == 1
 
 
 def test_garbage_between_tracks_is_counted_and_passed_over(link: Connection, service: Service) -> None:

@@ -1,0 +1,45 @@
+"""Writes the first files of the corpora: `python tests/fuzz/seeds.py`, with tests/support on the path."""
+
+from pathlib import Path
+
+import optipmb_schemas as schemas
+from optipmb_service.checkpoint import HEAD, encode_checkpoint
+from optipmb_service.session import Session
+from router import Sensor
+from sessions import chained, feed
+
+import optipmb
+
+CORPUS = Path(__file__).parent / "corpus"
+
+
+def main() -> None:
+    """One small message of each common type, as msgpack and as JSON, and a checkpoint with and without a window."""
+    sensor = Sensor()
+    messages: list[schemas.Message] = [
+        sensor.detections(1, objects=2),
+        sensor.points(1, count=3),
+        schemas.ResetRequest(close=True),
+        schemas.SessionParameters(profile="kitti"),
+        schemas.SessionState(stream=sensor.stream, session="0" * 32, state="new", profile="kitti"),
+    ]
+    for message in messages:
+        kind = bytes([schemas.MESSAGES.index(type(message))])
+        name = type(message).__name__
+        _write("messages", f"{name}.msgpack", kind + schemas.encode(message))
+        _write("messages", f"{name}.json", kind + schemas.encode_json(message))
+    parameters = optipmb.load_profile("kitti")
+    small = parameters.model_copy(update={"classes": dict(list(parameters.classes.items())[:1]), "provenance": ""})
+    one = Session(sensor.stream, small, tracker=chained)
+    _write("checkpoints", "empty", encode_checkpoint(one.snapshot())[HEAD:])
+    feed(one, [0, 2, 1], sensor, objects=1)
+    _write("checkpoints", "window", encode_checkpoint(one.snapshot())[HEAD:])
+
+
+def _write(corpus: str, name: str, data: bytes) -> None:
+    (CORPUS / corpus).mkdir(parents=True, exist_ok=True)
+    (CORPUS / corpus / name).write_bytes(data)
+
+
+if __name__ == "__main__":
+    main()
