@@ -3,10 +3,12 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test load stack install lint types tests schemas wheel clean
+.PHONY: help demo test bench baseline figures load stack install lint types tests schemas wheel clean
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    everything that CI runs: lint, types, tests, schemas, wheel, demo"
+	@echo "make bench   time the tracker, its kernels, the codec and the service, beside the saved baseline"
+	@echo "make figures measure the tracker's figures of docs/performance.md, beside other trackers, and write the page"
 	@echo "make load    measure what the service carries on this machine, as docs/performance.md has it"
 	@echo "make stack   run the compose file's stack as processes and show that it works (needs Debian's prometheus)"
 	@echo "make clean   remove the virtual environment and everything generated"
@@ -48,6 +50,30 @@ schemas: install
 
 wheel: install
 	sh tests/wheel.sh $(PYTHON) $(BIN)
+
+# The baseline is compared with and not obeyed: machines differ, and no test fails by a time. Processor time is counted,
+# so that what else the machine does disturbs little; the service, which waits, has its own line and the clock on the wall.
+BASELINES := benchmarks/baselines
+TIMED := benchmarks/test_kernels.py benchmarks/test_tracker.py benchmarks/test_codec.py
+BENCH := $(BIN)/pytest $(TIMED) -W default --benchmark-storage=file://$(BASELINES) --benchmark-group-by=fullname \
+	--benchmark-columns=min,median,iqr,rounds --benchmark-timer=time.thread_time --benchmark-max-time=0.3
+bench: install
+	$(BENCH) --benchmark-compare
+	$(BIN)/pytest benchmarks/test_service.py -s
+
+baseline: install
+	rm -rf $(BASELINES)
+	$(BENCH) --benchmark-save=baseline
+
+PEERS := out/peers
+$(PEERS)/.installed:
+	$(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/python -m pip install --quiet "stonesoup==1.9.*" "motpy==0.0.10" "norfair==2.*"
+	touch $@
+
+figures: install $(PEERS)/.installed
+	mkdir -p out
+	$(BIN)/python benchmarks/figures.py --peers $(PEERS)/bin/python --json out/figures.json --docs
 
 clean:
 	rm -rf $(VENV) out build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,83 +1,64 @@
-"""How long a step takes: `pytest benchmarks/test_tracker.py`, in milliseconds per frame.
+"""How long a step takes: `make bench`, or `pytest benchmarks/test_tracker.py`.
 
-KITTI-like frames at 10 Hz: cars, pedestrians and cyclists without velocity, one object per 16 m^2 on average, so that
-gates overlap everywhere; a tenth is missed, a tenth is clutter, a third has low scores. Clouds hold 120,000 points, as
-a 64-beam scan does. What is measured is one step from a settled density.
+Steps of the dense scene (`dense.py`) from a settled density, the bare arithmetic of the same frames, and recorded
+sequences from their first frame to their last, detections checked, where the data are there.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
+from lower_bound import arguments, bare
+from settled import PARAMETERS, recorded, settled
 
 import optipmb
 
 if TYPE_CHECKING:
     from pytest_benchmark.fixture import BenchmarkFixture
 
-PARAMETERS = optipmb.load_profile("kitti")
-SIZES = np.array([[4.0, 1.7, 1.5], [0.6, 0.6, 1.7], [1.8, 0.6, 1.7]])
-POINTS = 120_000
-SETTLED = 10
-MISSED = 0.1
-HERE = optipmb.Pose(translation=np.array([0.0, 0.0, 1.7]), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
+OBJECTS = (10, 20, 50, 100, 200, 400, 800)
 
 
-def scan(rng: np.random.Generator, center: np.ndarray, half: float) -> optipmb.PointCloud:
-    """Points on the ground and on the objects, thinning out with distance like a real scan."""
-    angle, distance = rng.uniform(-np.pi, np.pi, POINTS), rng.exponential(0.3 * half, POINTS)
-    points = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), rng.normal(-1.7, 0.05, POINTS)])
-    on_objects = POINTS // 5
-    points[:on_objects] = center[rng.integers(len(center), size=on_objects)] + rng.normal(0, 0.5, (on_objects, 3))
-    return optipmb.PointCloud(points.astype(np.float32), HERE)
-
-
-def frames(objects: int, *, clouds: bool) -> list[optipmb.Frame]:
-    """A dense scene of so many objects, long enough to settle."""
-    rng = np.random.default_rng(objects)
-    half = 2.0 * np.sqrt(objects)
-    label = rng.integers(0, 3, objects)
-    place, heading = rng.uniform(-half, half, (objects, 2)), rng.uniform(-np.pi, np.pi, objects)
-    speed = rng.uniform(0, [6.0, 1.5, 4.0], (objects, 3))[np.arange(objects), label]
-    confidence = rng.beta(4, 1.5, objects)
-    made = []
-    for k in range(SETTLED + 1):
-        seen = np.flatnonzero(rng.random(objects) > MISSED)
-        clutter = objects // 10
-        position = np.concatenate(
-            [place[seen] + rng.normal(0, 0.1, (seen.size, 2)), rng.uniform(-half, half, (clutter, 2))]
-        )
-        labels = np.concatenate([label[seen], rng.integers(0, 3, clutter)])
-        score = np.concatenate([confidence[seen] + rng.normal(0, 0.05, seen.size), rng.beta(2, 4, clutter)])
-        center = np.column_stack([position, np.full(len(position), 0.8)])
-        frame, _ = optipmb.make_frame(
-            PARAMETERS,
-            stamp_ns=k * 100_000_000,
-            labels=PARAMETERS.labels,
-            label=labels,
-            center=center,
-            size=SIZES[labels],
-            yaw=np.concatenate([heading[seen], rng.uniform(-np.pi, np.pi, clutter)]),
-            score=np.clip(score, 0.01, 1.0),
-            cloud=scan(rng, center, half) if clouds else None,
-        )
-        made.append(frame)
-        place = place + 0.1 * speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
-    return made
-
-
-@pytest.mark.parametrize("clouds", [False, True], ids=["boxes", "boxes+cloud"])
-@pytest.mark.parametrize("objects", [10, 100, 400, 800])
-def test_step(benchmark: BenchmarkFixture, objects: int, clouds: bool) -> None:  # noqa: FBT001 - parametrized
-    """One step of the full tracker from a settled density."""
-    *before, last = frames(objects, clouds=clouds)
-    tracker = optipmb.Tracker(PARAMETERS)
-    density = tracker.initial()
-    for frame in before:
-        density = tracker.step(density, frame).density
-    result = benchmark(tracker.step, density, last)
+@pytest.mark.parametrize("points", [0, 30_000, 120_000])
+@pytest.mark.parametrize("objects", OBJECTS)
+def test_step(benchmark: BenchmarkFixture, objects: int, points: int) -> None:
+    """One step of the full tracker."""
+    tracker, density, frame = settled(objects, points)
+    result = benchmark(tracker.step, density, frame)
     benchmark.extra_info["measurements"] = result.diagnostics.detections
     benchmark.extra_info["bernoullis"] = len(result.density.bernoulli)
+    assert result.diagnostics.cloud_used == (points > 0)
     assert len(result.tracks) > 0.5 * objects
+
+
+@pytest.mark.parametrize("objects", OBJECTS)
+def test_bare_arithmetic(benchmark: BenchmarkFixture, objects: int) -> None:
+    """The lower bound of the step; its updates are those of the tracker, bit by bit."""
+    tracker, density, frame = settled(objects)
+    given = arguments(PARAMETERS, density, frame)
+    benchmark(bare, *given)
+    means = {row.tobytes() for row in tracker.step(density, frame).density.bernoulli.mean}
+    assert len(given[-2]) > 0.5 * objects
+    assert all(row.tobytes() in means for row in given[-2])
+
+
+@pytest.mark.parametrize("dataset", ["kitti", "nuscenes"])
+def test_sequence(benchmark: BenchmarkFixture, dataset: str) -> None:
+    """All frames of the recorded sequences."""
+    parameters, runs = recorded(dataset)
+    tracker = optipmb.Tracker(parameters)
+
+    def track() -> int:
+        frames = 0
+        for run in runs:
+            density = tracker.initial()
+            for given in run:
+                frame, _ = optipmb.make_frame(parameters, **given | {"pose": optipmb.Pose(*given["pose"])})
+                density = tracker.step(density, frame).density
+                frames += 1
+        return frames
+
+    frames = benchmark.pedantic(track, rounds=5, warmup_rounds=1)
+    benchmark.extra_info["frames"] = frames
+    assert frames > 30

@@ -1,0 +1,245 @@
+"""All figures of docs/performance.md in one run: `python benchmarks/figures.py [--peers PYTHON] [--docs]`.
+
+Every figure that is compared with another is measured in turns with it, so that what else the machine does hits both.
+Prints the tables; `--docs` writes them, and the plots, into the page. `--peers` names the interpreter of an environment
+with the trackers of `peers.py`. Recorded sequences are left out where their data are not there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from lower_bound import arguments, bare
+from plots import draw
+from settled import PARAMETERS, recorded, settled
+
+import optipmb
+from optipmb.points import points_in_boxes
+from optipmb.tracker import STAGES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+FOLDER = Path(__file__).resolve().parent
+PAGE = FOLDER.parent / "docs" / "performance.md"
+IMAGES = PAGE.parent / "images"
+OBJECTS = (10, 20, 50, 100, 200, 400, 800)
+POINTS = (0, 30_000, 120_000)
+BOXES = 100
+ROUNDS = 30
+CALLS = 10
+Times = dict[str, np.ndarray]
+CLOCK = time.thread_time_ns
+"""Processor time of this thread: what else the machine does is not in it, but for the caches that it empties."""
+
+
+def in_turns(tasks: dict[str, Callable[[], object]], rounds: int = ROUNDS, calls: int = CALLS) -> Times:
+    """Milliseconds of every call of every task, a few calls of each in turn."""
+    spent: dict[str, list[int]] = {name: [] for name in tasks}
+    for task in tasks.values():
+        task()
+    for _ in range(rounds):
+        for name, task in tasks.items():
+            for _ in range(calls):
+                begun = CLOCK()
+                task()
+                spent[name].append(CLOCK() - begun)
+    return {name: np.array(times) / 1e6 for name, times in spent.items()}
+
+
+def summary(times: np.ndarray) -> dict[str, float]:
+    """Median, 99th percentile and smallest of milliseconds."""
+    return {"median": float(np.median(times)), "p99": float(np.percentile(times, 99)), "least": float(times.min())}
+
+
+def dense() -> dict[str, Any]:
+    """Steps of growing scenes, and the bare arithmetic of the same frames."""
+    tasks: dict[str, Callable[[], object]] = {}
+    for objects in OBJECTS:
+        tracker, density, frame = settled(objects)
+        given = arguments(PARAMETERS, density, frame)
+        tasks[f"step {objects}"] = lambda t=tracker, d=density, f=frame: t.step(d, f)
+        tasks[f"bare {objects}"] = lambda a=given: bare(*a)
+    times = in_turns(tasks)
+    return {kind: {n: summary(times[f"{kind} {n}"]) for n in OBJECTS} for kind in ("step", "bare")}
+
+
+def growth(steps: dict[int, dict[str, float]]) -> float:
+    """The exponent b of time = a objects^b from 100 to 800 objects, by least squares over the logarithms."""
+    sizes = [n for n in OBJECTS if n >= 100]
+    return float(np.polyfit(np.log(sizes), np.log([steps[n]["median"] for n in sizes]), 1)[0])
+
+
+def clouds() -> dict[str, Any]:
+    """Points in a hundred boxes, alone and as part of a step."""
+    tasks: dict[str, Callable[[], object]] = {}
+    for points in POINTS:
+        tracker, density, frame = settled(BOXES, points)
+        tasks[f"step {points}"] = lambda t=tracker, d=density, f=frame: t.step(d, f)
+        if frame.cloud is not None:
+            boxes = density.bernoulli
+            center = np.column_stack([boxes.mean[:, :2], boxes.auxiliary[:, 3]])
+            size, yaw = boxes.auxiliary[:, :3].copy(), boxes.mean[:, 3].copy()
+            box = frame.cloud, center[:BOXES], size[:BOXES], yaw[:BOXES]
+            tasks[f"count {points}"] = lambda b=box: points_in_boxes(*b)
+    return {name: summary(times) for name, times in in_turns(tasks).items()}
+
+
+def sequences() -> dict[str, Any]:
+    """Recorded sequences, frame by frame: the step alone, and with the check of its detections before it."""
+    found = {}
+    for dataset in ("kitti", "nuscenes"):
+        try:
+            parameters, runs = recorded(dataset)
+        except pytest.skip.Exception as reason:
+            print(f"{dataset}: {reason}")
+            continue
+        tracker = optipmb.Tracker(parameters)
+        step, whole = [], []
+        for _ in range(3 if dataset == "kitti" else 30):
+            for run in runs:
+                density = tracker.initial()
+                for given in run:
+                    begun = CLOCK()
+                    frame, _ = optipmb.make_frame(parameters, **given | {"pose": optipmb.Pose(*given["pose"])})
+                    checked = CLOCK()
+                    density = tracker.step(density, frame).density
+                    done = CLOCK()
+                    step.append(done - checked)
+                    whole.append(done - begun)
+        frames = [len(given["label"]) for run in runs for given in run]
+        found[dataset] = {
+            "frames": len(frames),
+            "detections": float(np.mean(frames)),
+            "step": summary(np.array(step) / 1e6),
+            "whole": summary(np.array(whole) / 1e6),
+        }
+    return found
+
+
+def stages() -> dict[str, dict[str, float]]:
+    """Median microseconds of each stage of a step, by the tracker's own clock."""
+    found = {}
+    for objects, points in ((10, 0), (100, 0), (800, 0), (100, 30_000)):
+        _, density, frame = settled(objects, points)
+        tracker = optipmb.Tracker(PARAMETERS, clock=CLOCK)
+        taken = [tracker.step(density, frame).diagnostics.stage_ns for _ in range(ROUNDS * CALLS)]
+        name = f"{objects} objects" + (f", {points // 1000},000 points" if points else "")
+        found[name] = dict(zip(STAGES, np.median(taken, axis=0) / 1e3, strict=True))
+    return found
+
+
+def share_of_kernels() -> dict[int, dict[str, float]]:
+    """Microseconds of a step spent in compiled code, in numpy and the interpreter, and in scipy's assignment."""
+    from profiled import shares  # noqa: PLC0415 - it replaces functions of the tracker, after everything else
+
+    return {objects: shares(*settled(objects)) for objects in (10, 100, 800)}
+
+
+def peers(python: str) -> dict[str, dict[str, list[float]]]:
+    """The times of other trackers on the same scenes."""
+    done = subprocess.run([python, FOLDER / "peers.py"], stdout=subprocess.PIPE, check=True)  # noqa: S603 - our own
+    return dict(json.loads(done.stdout))
+
+
+def conditions() -> str:
+    """What the figures were measured on."""
+    with Path("/proc/cpuinfo").open(encoding="utf-8") as info:
+        models = {line.split(":")[1].strip() for line in info if line.startswith("model name")}
+    load = os.getloadavg()[0]
+    return (
+        f"{', '.join(sorted(models)) or platform.machine()}, {os.cpu_count()} cores, CPython "
+        f"{platform.python_version()}, processor time of one thread, load average {load:.1f} before the run"
+    )
+
+
+def tables(found: dict[str, Any]) -> str:
+    """All figures as Markdown."""
+    lines = [f"Measured on: {found['conditions']}.", ""]
+    others = found["peers"]
+    lines += [
+        "| objects | median ms | p99 ms | least ms | us per object | bare arithmetic ms | ratio to it |"
+        + "".join(f" {n} ms | ratio |" for n in others)
+    ]
+    lines += ["| ---: " * (7 + 2 * len(others)) + "|"]
+    for n in OBJECTS:
+        step, floor = found["dense"]["step"][n], found["dense"]["bare"][n]
+        row = (
+            f"| {n} | {step['median']:.3f} | {step['p99']:.3f} | {step['least']:.3f} | {1e3 * step['median'] / n:.1f} "
+        )
+        row += f"| {floor['median']:.3f} | {step['median'] / floor['median']:.1f} |"
+        for times in others.values():
+            median = np.median(times[str(n)]) if str(n) in times else None
+            row += f" {median:.1f} | {median / step['median']:.0f} |" if median else " | |"
+        lines.append(row)
+    lines += ["", f"Growth from 100 to 800 objects: time goes with objects to the power of {found['growth']:.2f}.", ""]
+    lines += ["| 100 objects | median ms | p99 ms | least ms |", "| --- | ---: | ---: | ---: |"]
+    words = {"step": "whole step with", "count": "points in boxes alone,"}
+    for name, one in found["clouds"].items():
+        kind, points = name.split()
+        lines.append(
+            f"| {words[kind]} {int(points):,} points | {one['median']:.3f} | {one['p99']:.3f} | {one['least']:.3f} |"
+        )
+    lines += [
+        "",
+        "| recorded | frames | detections per frame | step ms | frames/s | with check, median ms | p99 ms | frames/s |",
+    ]
+    lines += ["| --- " + "| ---: " * 7 + "|"]
+    for name, one in found["sequences"].items():
+        step, whole = one["step"]["median"], one["whole"]["median"]
+        label = {"kitti": "KITTI, cars", "nuscenes": "nuScenes keyframes, score filter and NMS"}[name]
+        lines.append(
+            f"| {label} | {one['frames']} | {one['detections']:.0f} | {step:.3f} | {1e3 / step:,.0f} "
+            f"| {whole:.3f} | {one['whole']['p99']:.3f} | {1e3 / whole:,.0f} |"
+        )
+    lines += [
+        "",
+        "| us per step | " + " | ".join(found["stages"]) + " |",
+        "| --- " + "| ---: " * len(found["stages"]) + "|",
+    ]
+    for stage in STAGES:
+        lines.append(f"| `{stage}` | " + " | ".join(f"{one[stage]:.0f}" for one in found["stages"].values()) + " |")
+    lines += ["", "| objects | kernels us | calls of kernels us | interpreter and numpy us | assignment (scipy) us |"]
+    lines += ["| ---: | ---: | ---: | ---: | ---: |"]
+    for n, one in found["shares"].items():
+        lines.append(f"| {n} | " + " | ".join(f"{one[k]:.0f}" for k in ("kernels", "calls", "python", "scipy")) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Measure, print, and write the page if asked."""
+    parser = argparse.ArgumentParser(description="All figures of docs/performance.md in one run.")
+    parser.add_argument("--peers", metavar="PYTHON", help="interpreter of an environment with other trackers")
+    parser.add_argument("--docs", action="store_true", help="write tables and plots into docs/performance.md")
+    parser.add_argument("--json", type=Path, help="also write all figures to this file")
+    chosen = parser.parse_args()
+    optipmb.warm_up()
+    found: dict[str, Any] = {"conditions": conditions()}
+    for name, part in (("dense", dense), ("clouds", clouds), ("sequences", sequences), ("stages", stages)):
+        print(f"measuring: {name}", flush=True)
+        found[name] = part()
+    found["growth"] = growth(found["dense"]["step"])
+    found["peers"] = peers(chosen.peers) if chosen.peers else {}
+    found["shares"] = share_of_kernels()
+    text = tables(found)
+    print(text)
+    if chosen.json:
+        chosen.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
+    if chosen.docs:
+        page = PAGE.read_text(encoding="utf-8")
+        head, rest = page.split("<!-- figures -->\n")[0], page.split("<!-- end of figures -->\n")[1]
+        PAGE.write_text(f"{head}<!-- figures -->\n{text}<!-- end of figures -->\n{rest}", encoding="utf-8")
+        draw(found, IMAGES)
+
+
+if __name__ == "__main__":
+    main()

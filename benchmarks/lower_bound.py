@@ -1,0 +1,142 @@
+"""The bare arithmetic of a frame in one compiled loop: what no tracker with these formulas can be faster than.
+
+Everything that has to be found out is given: which pairs lie in the gate, which pairs win. Nothing is allocated,
+checked, sorted, searched, assigned, suppressed, pruned or put together. What is left are the numbers themselves: every
+object and component is predicted by the unscented transform, every gated pair gets its likelihood and its cost, every
+winning pair is updated by the unscented Kalman filter. The formulas are those of the tracker, by its own scalar
+kernels, inlined into one loop; faster formulas would lower this bound and the tracker's time alike.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+
+from optipmb.association import associate
+from optipmb.hypotheses import enumerate_hypotheses
+from optipmb.motion import predict_state
+from optipmb.predict import predict
+from optipmb.preprocess import preprocess
+from optipmb.table import ClassTable
+from optipmb.update import ukf_update, workspace
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    import optipmb
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+
+@numba.njit(error_model="numpy")
+def bare(
+    mean: Array,
+    covariance: Array,
+    label: Index,
+    dt: float,
+    process_noise: Array,
+    row: Index,
+    measurement: Index,
+    existence: Array,
+    p_d: Array,
+    position: Array,
+    noise_position: Array,
+    won: Index,
+    z: Array,
+    sigma: Array,
+    heading_sign: NDArray[np.bool_],
+    root: Array,
+    points: Array,
+    buffers: tuple[Array, ...],
+    mean_predicted: Array,
+    covariance_predicted: Array,
+    cost: Array,
+    mean_out: Array,
+    covariance_out: Array,
+) -> None:
+    """Predict all states, weigh all pairs, update all winners; arguments as in the kernels of the tracker."""
+    for n in range(mean.shape[0]):
+        predict_state(
+            mean[n],
+            covariance[n],
+            dt,
+            process_noise[label[n]],
+            root,
+            points,
+            mean_predicted[n],
+            covariance_predicted[n],
+        )
+    for k in range(row.shape[0]):
+        n, m = row[k], measurement[k]
+        r_xy = noise_position[label[n]] ** 2
+        s_xx, s_xy = covariance_predicted[n, 0, 0] + r_xy, covariance_predicted[n, 0, 1]
+        s_yy = covariance_predicted[n, 1, 1] + r_xy
+        determinant = s_xx * s_yy - s_xy * s_xy
+        dx, dy = position[m, 0] - mean_predicted[n, 0], position[m, 1] - mean_predicted[n, 1]
+        squared = (s_yy * dx * dx - 2.0 * s_xy * dx * dy + s_xx * dy * dy) / determinant
+        log_likelihood = -math.log(2.0 * math.pi) - 0.5 * math.log(determinant) - 0.5 * squared
+        r, p = existence[n], p_d[n]
+        cost[k] = math.log(1.0 - r + r * (1.0 - p)) - math.log(r * p) - log_likelihood
+    for k in range(won.shape[0]):
+        n, m = won[k, 0], won[k, 1]
+        c = label[n]
+        ukf_update(
+            mean_predicted[n],
+            covariance_predicted[n],
+            z[m],
+            sigma[c],
+            heading_sign[c],
+            buffers,
+            mean_out[k],
+            covariance_out[k],
+        )
+
+
+def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: optipmb.Frame) -> tuple[Any, ...]:
+    """Return the arguments of `bare` for one frame: all that the tracker would have to find out, found out."""
+    table = ClassTable.of(parameters)
+    predicted, _ = predict(density, frame.stamp_ns, table)
+    measurements, _, _ = preprocess(frame, table)
+    old, undetected = predicted.bernoulli, predicted.poisson
+    p_d, p_d_poisson = table.detection[old.label], table.detection[undetected.label]
+    found = enumerate_hypotheses(old, p_d, undetected, p_d_poisson, measurements, table)
+    assigned = associate(found, len(old))
+    before, waiting = density.bernoulli, density.poisson
+    count = len(before) + len(waiting)
+    # Predicted rows that a limit has removed are not in a settled scene; the bound counts on it.
+    if (len(old), len(undetected)) != (len(before), len(waiting)):
+        raise ValueError("a scene without silent objects is wanted")
+    winners = np.flatnonzero(assigned >= 0)
+    z = np.column_stack([measurements.position, measurements.velocity, measurements.yaw])
+    sigma = np.column_stack(
+        [table.noise_position, table.noise_position, table.noise_velocity, table.noise_velocity, table.noise_heading]
+    )
+    return (
+        np.concatenate([before.mean, waiting.mean]),
+        np.concatenate([before.covariance, waiting.covariance]),
+        np.concatenate([before.label, waiting.label]),
+        (frame.stamp_ns - density.stamp_ns) * 1e-9,
+        table.process_noise,
+        np.concatenate([found.row, found.component + len(before)]),
+        np.concatenate([found.measurement, found.announced]),
+        np.concatenate([old.existence, undetected.weight]),
+        np.concatenate([p_d, p_d_poisson]),
+        measurements.position,
+        table.noise_position,
+        np.column_stack([winners, assigned[winners]]),
+        z,
+        sigma,
+        table.heading_sign_reliable,
+        np.empty((6, 6)),
+        np.empty((12, 6)),
+        workspace(),
+        np.empty((count, 6)),
+        np.empty((count, 6, 6)),
+        np.empty(len(found.row) + len(found.component)),
+        np.empty((winners.size, 6)),
+        np.empty((winners.size, 6, 6)),
+    )

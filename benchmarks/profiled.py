@@ -1,0 +1,89 @@
+"""What share of a step is arithmetic, what is the calling of kernels, what is the interpreter and numpy.
+
+Each dispatcher of a kernel that the tracker calls is replaced by a function that reads a clock before and after. A
+kernel's time is that of its call less what calling a kernel with as many arrays costs, measured with one that does
+nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+from optipmb import association
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import optipmb
+
+STEPS = 200
+
+
+@numba.njit
+def nothing(*arrays: Any) -> int:
+    """Do nothing, with so many arguments."""
+    return len(arrays)
+
+
+def cost_of_a_call(arguments: int) -> float:
+    """Nanoseconds to call a kernel with so many arrays."""
+    arrays = [np.zeros(4)] * arguments
+    spent = []
+    for _ in range(300):
+        begun = time.thread_time_ns()
+        nothing(*arrays)
+        spent.append(time.thread_time_ns() - begun)
+    return float(np.median(spent))
+
+
+def shares(tracker: optipmb.Tracker, density: optipmb.Density, frame: optipmb.Frame) -> dict[str, float]:
+    """Median microseconds per step: in kernels, in calling them, in scipy, and the rest."""
+    spent = {"kernels": 0.0, "scipy": 0.0}
+    calls: list[int] = []
+
+    def clocked(kind: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*arguments: Any) -> Any:
+            begun = time.thread_time_ns()
+            result = function(*arguments)
+            spent[kind] += time.thread_time_ns() - begun
+            if kind == "kernels":
+                calls.append(len(arguments))
+            return result
+
+        return timed
+
+    modules = [module for name, module in sys.modules.items() if name.startswith("optipmb.")]
+    replaced = [(m, n, v) for m in modules for n, v in vars(m).items() if isinstance(v, Dispatcher)]
+    replaced.append((association, "linear_sum_assignment", association.linear_sum_assignment))
+    plain = []
+    for _ in range(STEPS):
+        begun = time.thread_time_ns()
+        tracker.step(density, frame)
+        plain.append(time.thread_time_ns() - begun)
+    rows = []
+    try:
+        for module, name, function in replaced:
+            setattr(module, name, clocked("kernels" if isinstance(function, Dispatcher) else "scipy", function))
+        for _ in range(STEPS):
+            spent.update(kernels=0.0, scipy=0.0)
+            calls.clear()
+            tracker.step(density, frame)
+            rows.append((spent["kernels"], spent["scipy"]))
+    finally:
+        for module, name, function in replaced:
+            setattr(module, name, function)
+    in_calls, scipy = np.median(rows, axis=0)
+    calling = min(sum(cost_of_a_call(count) for count in calls), in_calls)
+    total = float(np.median(plain))
+    return {
+        "kernels": (in_calls - calling) / 1e3,
+        "calls": calling / 1e3,
+        "scipy": scipy / 1e3,
+        "python": max(total - in_calls - scipy, 0.0) / 1e3,
+    }

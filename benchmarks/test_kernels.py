@@ -1,0 +1,108 @@
+"""How long the kernels take, each alone, on the dense scene: `make bench`, or `pytest benchmarks/test_kernels.py`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from settled import PARAMETERS, settled
+
+import optipmb
+from optipmb.association import associate
+from optipmb.hypotheses import enumerate_hypotheses
+from optipmb.points import points_in_boxes
+from optipmb.predict import predict
+from optipmb.preprocess import non_maximum_suppression, preprocess
+from optipmb.table import ClassTable
+
+if TYPE_CHECKING:
+    from pytest_benchmark.fixture import BenchmarkFixture
+
+TABLE = ClassTable.of(PARAMETERS)
+OBJECTS = pytest.mark.parametrize("objects", [10, 100, 800])
+
+
+@OBJECTS
+def test_predict(benchmark: BenchmarkFixture, objects: int) -> None:
+    """Unscented transforms of all objects and components."""
+    _, density, frame = settled(objects)
+    predicted, repaired = benchmark(predict, density, frame.stamp_ns, TABLE)
+    assert (len(predicted.bernoulli), repaired) == (len(density.bernoulli), 0)
+
+
+@OBJECTS
+def test_preprocess(benchmark: BenchmarkFixture, objects: int) -> None:
+    """Canonical order, score filter and suppression."""
+    _, _, frame = settled(objects)
+    measurements, below, suppressed = benchmark(preprocess, frame, TABLE)
+    assert len(measurements) + below + suppressed == len(frame.score)
+
+
+@pytest.mark.parametrize("apart", [1.0, 6.0], ids=["heap", "street"])
+def test_suppression(benchmark: BenchmarkFixture, apart: float) -> None:
+    """A thousand boxes, heaped upon each other or standing beside each other."""
+    rng = np.random.default_rng(0)
+    boxes = rng.uniform([-16, -16, 3, 1.5, -3], [16, 16, 5, 2, 3], (1000, 5))
+    boxes[:, :2] *= apart
+    keep = benchmark(non_maximum_suppression, boxes, np.zeros(1000, np.int64), np.array([0.1]))
+    assert 0 < keep.sum() < 1000
+
+
+@OBJECTS
+def test_hypotheses(benchmark: BenchmarkFixture, objects: int) -> None:
+    """Gates, likelihoods and costs."""
+    _, density, frame = settled(objects)
+    density, _ = predict(density, frame.stamp_ns, TABLE)
+    measurements, _, _ = preprocess(frame, TABLE)
+    old, new = density.bernoulli, density.poisson
+    p_d = TABLE.detection[old.label], TABLE.detection[new.label]
+    found = benchmark(enumerate_hypotheses, old, p_d[0], new, p_d[1], measurements, TABLE)
+    assert len(found.row) > 0.5 * objects
+
+
+@OBJECTS
+def test_associate(benchmark: BenchmarkFixture, objects: int) -> None:
+    """Clusters and assignment."""
+    _, density, frame = settled(objects)
+    density, _ = predict(density, frame.stamp_ns, TABLE)
+    measurements, _, _ = preprocess(frame, TABLE)
+    old, new = density.bernoulli, density.poisson
+    p_d = TABLE.detection[old.label], TABLE.detection[new.label]
+    found = enumerate_hypotheses(old, p_d[0], new, p_d[1], measurements, TABLE)
+    assigned = benchmark(associate, found, len(old))
+    assert (assigned >= 0).sum() > 0.5 * objects
+
+
+@pytest.mark.parametrize("boxes", [0, 100])
+@pytest.mark.parametrize("points", [30_000, 120_000])
+def test_points_in_boxes(benchmark: BenchmarkFixture, points: int, boxes: int) -> None:
+    """One pass over a cloud."""
+    _, density, frame = settled(100, points)
+    assert frame.cloud is not None
+    objects = density.bernoulli
+    center = np.column_stack([objects.mean[:, :2], objects.auxiliary[:, 3]])[:boxes]
+    counts = benchmark(
+        points_in_boxes, frame.cloud, center, objects.auxiliary[:boxes, :3], objects.mean[:boxes, 3].copy()
+    )
+    assert counts.sum() >= 0
+
+
+@pytest.mark.parametrize("objects", [10, 100, 800])
+def test_make_frame(benchmark: BenchmarkFixture, objects: int) -> None:
+    """The check of detections, and their way from the sensor to the world."""
+    _, _, frame = settled(objects)
+    pose = optipmb.Pose(np.array([1.0, 2.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0]))
+    made, left_out = benchmark(
+        optipmb.make_frame,
+        PARAMETERS,
+        stamp_ns=frame.stamp_ns,
+        labels=PARAMETERS.labels,
+        label=frame.label,
+        center=frame.center,
+        size=frame.size,
+        yaw=frame.yaw,
+        score=frame.score,
+        pose=pose,
+    )
+    assert (len(made.score), left_out) == (len(frame.score), 0)
