@@ -85,7 +85,7 @@ class ServiceProcess:
                     stderr=subprocess.STDOUT,
                     start_new_session=True,
                     cwd=folder,  # whatever the service keeps goes with it
-                    env=self._environment,
+                    env={"XDG_STATE_HOME": folder} | self._environment,
                 )
             started.callback(self.stop)
             self._context = started.pop_all()

@@ -68,23 +68,34 @@ class SessionState(Message):
     epoch: Epoch | None = Field(default=None, description="Epoch of the newest frame.")
     seq: Count | None = Field(default=None, description="Number of the newest frame.")
     stamp_ns: Stamp | None = Field(default=None, description="Stamp of the newest frame.")
+    received: Count = Field(
+        default=0,
+        description="Detections messages that arrived: the sum of `frames`, `duplicates`, `late`, `refused`, `shed` "
+        "and `queue`.",
+    )
     frames: Count = Field(default=0, description="Frames tracked.")
     duplicates: Count = Field(default=0, description="Frames that had been tracked before and were dropped.")
     late: Count = Field(default=0, description="Frames that came too late and were dropped.")
     inserted: Count = Field(default=0, description="Late frames and clouds that were put in their place.")
     corrected: Count = Field(default=0, description="Tracks that were published anew because of these.")
-    refused: Count = Field(default=0, description="Messages that were not valid.")
+    refused: Count = Field(default=0, description="Detections messages that were not valid, or could not be tracked.")
     shed: Count = Field(default=0, description="Frames dropped because the queue was full.")
     gaps: Count = Field(default=0, description="Frames missing.")
     new_epochs: Count = Field(default=0, description="How often the publisher started anew or its stamps jumped.")
     clouds_used: Count = Field(default=0, description="Frames tracked with their cloud.")
     clouds_missed: Count = Field(default=0, description="Frames that waited for a cloud in vain.")
     repaired: Count = Field(default=0, description="Covariances that had lost rank in rounding and were repaired.")
+    clouds_refused: Count = Field(default=0, description="Points messages that were not valid.")
     tracks: Count = Field(default=0, description="Tracks extracted at the newest frame.")
     bernoullis: Count = Field(default=0, description="Bernoulli components now.")
     poissons: Count = Field(default=0, description="Poisson components now.")
     next_id: Count = Field(default=0, description="Lower bound of the next new track id.")
     queue: Count = Field(default=0, description="Frames waiting now.")
+    digest: Text = Field(
+        default="",
+        description="32 hexadecimal digits over everything that later tracks depend on: two runs with equal digests "
+        "give equal tracks from equal messages. Empty: without a session.",
+    )
 
 
 class Problem(Message):
@@ -147,8 +158,20 @@ class ServiceStatus(Message):
     sessions: tuple[SessionSummary, ...] = Field(
         default=(), max_length=10_000, fail_fast=True, description="The sessions of this instance."
     )
+    standby: Count = Field(
+        default=0, description="Streams that another instance tracks and this one is ready to take over."
+    )
+    received: Count = Field(
+        default=0,
+        description="Detections messages that arrived since the start: the sum of `frames`, `duplicates`, `late`, "
+        "`refused` and `shed`, but for those that wait or are being tracked.",
+    )
     frames: Count = Field(default=0, description="Frames tracked since the start.")
-    refused: Count = Field(default=0, description="Messages refused since the start.")
+    duplicates: Count = Field(default=0, description="Frames dropped since the start because they had been tracked.")
+    late: Count = Field(default=0, description="Frames that came too late since the start.")
+    refused: Count = Field(default=0, description="Detections messages refused since the start.")
+    shed: Count = Field(default=0, description="Frames dropped since the start because a queue was full.")
+    clouds_refused: Count = Field(default=0, description="Points messages refused since the start.")
     problems: tuple[Problem, ...] = Field(
         default=(), max_length=100, fail_fast=True, description="The newest problems, the oldest first."
     )

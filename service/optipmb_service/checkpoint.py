@@ -286,3 +286,14 @@ def _read_moment(one: Document, classes: int) -> Moment:
 
 
 _READERS: Final[dict[int, Callable[[Document], Checkpoint]]] = {1: _read_1}
+
+
+def digest_of(checkpoint: Checkpoint) -> str:
+    """Return 32 hexadecimal digits over all that later tracks depend on, which counts of messages are no part of."""
+    return hashlib.blake2b(state_bytes(checkpoint), digest_size=DIGEST).hexdigest()
+
+
+def forgotten(checkpoint: Checkpoint) -> Checkpoint:
+    """Return a checkpoint of a session that was reset, without its counts: what remains of a stream that was closed."""
+    moment = replace(checkpoint.head, counts=Counts())
+    return replace(checkpoint, base=moment, head=moment, window=(), deliveries=Deliveries())

@@ -14,8 +14,7 @@ if TYPE_CHECKING:
 
     import optipmb
     from optipmb_service.metrics import Value
-    from optipmb_service.records import Counters
-    from optipmb_service.registry import Totals
+    from optipmb_service.records import Traffic
 
 STATES: Final = ("starting", "ready", "degraded", "stopping")
 SESSION_STATES: Final = ("new", "running", "stale")
@@ -35,19 +34,18 @@ def of_problems(counts: dict[str, int]) -> Iterator[Value]:
         yield "problems_total", (code,), count
 
 
-def of_totals(totals: Totals) -> Iterator[Value]:
+def of_totals(counters: Traffic) -> Iterator[Value]:
     """Give what happened to the messages of all streams since the start."""
-    counters: Counters = totals.counters
     yield "frames_total", (), counters.frames
     yield "dropped_total", ("duplicate",), counters.duplicates
     yield "dropped_total", ("late",), counters.late
     yield "dropped_total", ("refused",), counters.refused
-    yield "dropped_total", ("shed",), totals.shed_frames
+    yield "dropped_total", ("shed",), counters.shed
     yield "gaps_total", (), counters.gaps
     yield "publishers_restarted_total", (), counters.new_epochs
     yield "clouds_total", ("used",), counters.clouds_used
     yield "clouds_total", ("missed",), counters.clouds_missed
-    yield "clouds_shed_total", (), totals.shed_clouds
+    yield "clouds_shed_total", (), counters.clouds_shed
 
 
 def of_sessions(sessions: Sequence[schemas.SessionSummary]) -> Iterator[Value]:

@@ -51,6 +51,11 @@ class Inbox:
         """Frames that wait."""
         return self._waiting
 
+    def counts(self) -> tuple[int, int, int]:
+        """Return the frames shed so far, those that wait, and the clouds shed so far, of one moment."""
+        with self._lock:
+            return self.shed_frames, self._waiting, self.shed_clouds
+
     def offer_frame(self, packet: Packet) -> bool | None:
         """Put a frame last; True: a worker must be sent, None: closed."""
         with self._lock:
@@ -89,12 +94,17 @@ class Inbox:
             self._rung = True
             return self._schedule()
 
-    def take(self) -> tuple[str, Packet | Command] | None:
-        """Take what is next, with its kind: "command", "cloud" or "frame"; None when nothing waits."""
+    def take(self, *, urgent: bool = False) -> tuple[str, Packet | Command] | None:
+        """Take what is next, with its kind: "command", "cloud" or "frame"; None when nothing waits.
+
+        With `urgent`, only commands that go before everything.
+        """
         with self._lock:
             self._rung = False
             if self._urgent:
                 return "command", self._urgent.popleft()
+            if urgent:
+                return None
             if self._clouds:
                 return "cloud", self._clouds.popleft()
             if not self._frames:
@@ -110,11 +120,15 @@ class Inbox:
         """Clouds that wait."""
         return len(self._clouds)
 
-    def leave(self, *, close: bool) -> bool | None:
-        """End a worker's turn: True: it must come again, None: the inbox was empty and is closed now, as asked."""
+    def leave(self, *, close: bool, urgent: bool = False) -> bool | None:
+        """End a worker's turn: True: it must come again, None: the inbox was empty and is closed now, as asked.
+
+        With `urgent`, what waits but is not urgent does not count: the worker is to come when it is sent for.
+        """
         with self._lock:
-            if self._urgent or self._clouds or self._frames or self._rung:
+            if self._urgent or self._rung or (not urgent and (self._clouds or self._frames)):
                 return True
+            close = close and not (self._clouds or self._frames)
             self._scheduled = False
             self._closed = close
             return None if close else False

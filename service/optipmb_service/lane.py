@@ -1,32 +1,38 @@
 """A stream's way through the service: decode, session, publish, all on one worker at a time, so nothing is locked here.
 
-A lane is made for whatever arrives on a stream's key, its session only for a valid message: garbage costs a lane that
-is gone when its inbox is empty. Clocks: `now_ns` monotonic for all decisions, the wall clock only for what delivery
-reports.
+A lane is made for whatever arrives on a stream's key, its session only for a valid message of a stream that this
+instance owns: garbage costs a lane that is gone when its inbox is empty. While another instance owns the stream, or it
+is not known yet who does, packets wait for a takeover (`standby`). Clocks: `now_ns` monotonic for all decisions, the
+wall clock only for what delivery reports.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import optipmb_schemas as schemas
 import structlog
 
+from optipmb_service.checkpoint import Checkpoint, digest_of, forgotten
 from optipmb_service.inbox import Inbox
 from optipmb_service.meter import Meter
-from optipmb_service.ports import Packet, TransportError
+from optipmb_service.outgoing import Outgoing, Ticket
+from optipmb_service.ownership import Standing
+from optipmb_service.ports import Packet
 from optipmb_service.problems import problem_of
-from optipmb_service.records import SECOND, Begun, Life, Output, Policy, Quarantined, Tracked
+from optipmb_service.records import Begun, Counters, Life, Output, Policy, Quarantined, Tracked, Traffic
 from optipmb_service.session import Session
+from optipmb_service.standby import Budget, Standby
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     import optipmb
+    from optipmb_service.keeper import Keeping
     from optipmb_service.metrics import Metrics
-    from optipmb_service.ports import Claim, Outlet
+    from optipmb_service.ports import Outlet
     from optipmb_service.problems import Desk
 
 log = structlog.get_logger("optipmb_service")
@@ -34,7 +40,24 @@ log = structlog.get_logger("optipmb_service")
 BATCH: Final = 8
 """Items that a worker takes before the other streams have their turn."""
 
-MILLISECOND: Final = 1e6
+
+class Seating(Protocol):
+    """What a lane needs of the steward."""
+
+    def standing(self, stream: str) -> Standing:
+        """Return what this instance is to a stream."""
+
+    def may_write(self, stream: str) -> bool:
+        """Whether this instance may publish and store for a stream now."""
+
+    def elsewhere(self, stream: str) -> bool:
+        """Whether another instance tracks a stream."""
+
+    def seek(self, stream: str) -> None:
+        """Ask for a stream."""
+
+    def leave(self, stream: str) -> None:
+        """Give up a stream."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +73,12 @@ class Circle:
         outlet: where results go.
         desk: where problems go.
         parameters_of: profile of a stream.
+        steward: says which streams this instance owns.
+        keeper: where checkpoints go and come from.
+        standby_ns: how long packets wait for a takeover.
+        budget: bytes that may wait for takeovers, over all streams.
+        dump: saves what is needed to see an error of a session again; returns the file.
+        room: whether a further session has room.
         admit: asked before a session begins; returns what the stream had before, None when there is no room.
         release: told when a session has ended.
         discard: told when a lane without a session has nothing left to do.
@@ -67,6 +96,12 @@ class Circle:
     outlet: Outlet
     desk: Desk
     parameters_of: Callable[[str], optipmb.Parameters]
+    steward: Seating
+    keeper: Keeping
+    standby_ns: int
+    budget: Budget
+    dump: Callable[[str, bytes], str]
+    room: Callable[[], bool]
     admit: Callable[[str], Life | None]
     release: Callable[[Session], None]
     discard: Callable[[Lane], None]
@@ -74,15 +109,6 @@ class Circle:
     arm: Callable[[Lane, int], None]
     metrics: Metrics
     tracker: Callable[[optipmb.Parameters], Any]
-
-
-@dataclass(frozen=True, slots=True)
-class _Ticket:
-    """What is known of a frame's way when its tracks come out."""
-
-    wall_ns: int
-    now_ns: int
-    decode_ns: int
 
 
 class Lane:
@@ -99,17 +125,27 @@ class Lane:
         self.meter = Meter(time.monotonic_ns())
         self.session: Session | None = None
         self.stale = False
-        self.refused = 0
-        """Messages refused while there was no session to count them."""
+        self.traffic = Traffic()
+        """What became of messages, but for what a session counts while it lasts."""
+        self._base = Counters()
+        self._opened = Traffic()
         self._circle = circle
-        self._claim: Claim | None = None
+        self._standby = Standby(circle.standby_ns, circle.budget)
+        self._out = Outgoing(stream, circle.instance, circle.outlet, self.meter, circle.metrics, circle.steward)
+        self._asking: list[Callable[[Lane], None]] = []
+        self._changed = False
         self._armed_ns: int | None = None
         self._shed_told = 0
-        self._ids: frozenset[int] = frozenset()
+        self._clouds_shed_told = 0
 
     def wake(self) -> None:
         """Send a worker though nothing came: frames have waited long enough."""
         if self.inbox.ring():
+            self._circle.submit(self)
+
+    def tell(self, command: Callable[[Lane], None]) -> None:
+        """Have the worker run a command before all that waits."""
+        if self.inbox.offer_command(lambda: command(self), urgent=True):
             self._circle.submit(self)
 
     # The worker's turn
@@ -117,20 +153,47 @@ class Lane:
     def work(self) -> bool:
         """Take some of what waits; True: come again."""
         for _ in range(BATCH):
-            taken = self.inbox.take()
+            taken = self.inbox.take(urgent=self._paused)
             if taken is None:
                 break
             self._guard(self._handle, *taken)
-        self._guard(self._settle)
-        turn = self.inbox.leave(close=self.session is None)
+        paused = self._paused
+        if not paused:
+            self._out.flush()
+            self._guard(self._settle)
+        close = not self._needed
+        if close:
+            self._circle.steward.leave(self.stream)
+        turn = self.inbox.leave(close=close, urgent=paused)
         if turn is None:
             self._circle.discard(self)
         return bool(turn)
 
-    def _guard(self, work: Callable[..., None], *arguments: Any) -> None:
+    @property
+    def _paused(self) -> bool:
+        """Whether frames have to wait: the tenure lapsed, and somebody looks whether another instance took over."""
+        return self.session is not None and not self._circle.steward.may_write(self.stream)
+
+    @property
+    def _needed(self) -> bool:
+        """Whether the lane holds anything that the next message of its stream, or the steward, will ask for."""
+        coming = self._circle.steward.standing(self.stream) in {Standing.CLAIMING, Standing.OWNER}
+        return self.session is not None or coming or bool(self._standby) or bool(self._asking)
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether another instance tracks the stream, and answers for it."""
+        return self.session is None and self._circle.steward.elsewhere(self.stream)
+
+    @property
+    def stands_by(self) -> bool:
+        """Whether packets wait here for a takeover; may be called by any thread."""
+        return self.session is None and bool(self._standby)
+
+    def _guard(self, work: Callable[..., None], *arguments: Any, **named: Any) -> None:
         """Do a piece of work; whatever it raises, the stream and its worker go on."""
         try:
-            work(*arguments)
+            work(*arguments, **named)
         except Exception as error:
             log.exception("internal_error", stream=self.stream)
             self._report("internal", "", "a message handled without an error", f"{type(error).__name__}: {error}")
@@ -143,9 +206,7 @@ class Lane:
 
     def _settle(self) -> None:
         """Let go what has waited long enough, and have the worker come back for what has not."""
-        shed = self.inbox.shed_frames - self._shed_told
-        if shed:
-            self._shed_told += shed
+        if shed := self._count_shed():
             expected = f"at most {self._circle.queue_frames} frames waiting"
             self._report("shed", "", expected, f"{shed} more; the oldest were dropped", count=shed)
         session = self.session
@@ -159,31 +220,51 @@ class Lane:
             self._armed_ns = deadline_ns
             self._circle.arm(self, deadline_ns)
 
+    def _count_shed(self) -> int:
+        """Count what was shed since the last time; returns how much."""
+        shed, _, clouds = self.inbox.counts()
+        fresh, self._shed_told = shed - self._shed_told, shed
+        self.traffic.clouds_shed += clouds - self._clouds_shed_told
+        self._clouds_shed_told = clouds
+        self.traffic.shed += fresh
+        self.traffic.received += fresh
+        return fresh
+
     # Messages
 
     def _receive(self, packet: Packet, *, frame: bool) -> None:
-        began_ns = time.perf_counter_ns()
-        kind = schemas.Detections if frame else schemas.Points
-        try:
-            message = self._decode(packet, kind)
-        except schemas.MessageError as error:
-            self._count_refused()
-            self._report(error.code, error.path, error.expected, error.received, what=kind.__name__)
-            return
-        session = self.session or self.open_session()
+        session = self.session
         if session is None:
+            self._stand_by(packet, frame=frame)
+            return
+        began_ns = time.perf_counter_ns()
+        self._changed = True
+        self.traffic.received += frame
+        message = self._read(packet, frame=frame)
+        if message is None:
             return
         now_ns = time.monotonic_ns()
         self.meter.arrived(packet.now_ns, frame=frame)
         if self.stale and frame:
             self.stale = False
             log.info("stream_back", stream=self.stream)
-        ticket = _Ticket(packet.wall_ns, packet.now_ns, time.perf_counter_ns() - began_ns)
+        ticket = Ticket(packet.wall_ns, packet.now_ns, time.perf_counter_ns() - began_ns)
         if isinstance(message, schemas.Points):
             outputs = session.on_points(message, now_ns, ticket=ticket)
+            self.traffic.clouds_refused += any(getattr(one, "code", "") == "invalid_value" for one in outputs)
         else:
             outputs = session.on_detections(message, now_ns, arrived_ns=packet.now_ns, ticket=ticket)
         self._deliver(outputs)
+
+    def _read(self, packet: Packet, *, frame: bool) -> schemas.Detections | schemas.Points | None:
+        """Return the message of a packet; None after a refusal."""
+        kind = schemas.Detections if frame else schemas.Points
+        try:
+            return self._decode(packet, kind)
+        except schemas.MessageError as error:
+            self._count_refused(frame=frame)
+            self._report(error.code, error.path, error.expected, error.received, what=kind.__name__)
+            return None
 
     def _decode(
         self, packet: Packet, kind: type[schemas.Detections | schemas.Points]
@@ -201,16 +282,19 @@ class Lane:
             raise schemas.MessageError("invalid_value", "stream", repr(self.stream), repr(message.stream))
         return message
 
-    def _count_refused(self) -> None:
-        if self.session is None:
-            self.refused += 1
-        else:
+    def _count_refused(self, *, frame: bool) -> None:
+        if not frame:
+            self.traffic.clouds_refused += 1
+        elif self.session is not None:
             self.session.refuse()
+        else:
+            self.traffic.received += 1
+            self.traffic.refused += 1
 
     def _deliver(self, outputs: Sequence[Output]) -> None:
         for output in outputs:
             if isinstance(output, Tracked):
-                self._publish(output)
+                self._out.send(output)
             elif isinstance(output, Begun):
                 log.info(
                     "session_begun",
@@ -221,42 +305,10 @@ class Lane:
                     jump_s=output.jump_ns / 1e9,
                 )
             elif isinstance(output, Quarantined):
-                log.error("session_quarantined", stream=self.stream, error=output.error)
+                file = self._circle.dump(self.stream, output.dump)
+                log.error("session_quarantined", stream=self.stream, error=output.error, file=file)
             else:
                 self._circle.desk.report(output, time.monotonic_ns())
-
-    def _publish(self, tracked: Tracked) -> None:
-        ticket: _Ticket = tracked.ticket
-        passed_ns = time.monotonic_ns() - ticket.now_ns
-        waited_ns = max(0, passed_ns - ticket.decode_ns - tracked.step_ns)
-        delivery = schemas.Delivery(
-            instance=self._circle.instance,
-            received_ns=ticket.wall_ns,
-            published_ns=time.time_ns(),
-            queue_ms=waited_ns / MILLISECOND,
-            decode_ms=ticket.decode_ns / MILLISECOND,
-            step_ms=tracked.step_ns / MILLISECOND,
-        )
-        payload = schemas.encode(tracked.tracks.model_copy(update={"delivery": delivery}))
-        try:
-            if self._claim is not None:
-                self._claim.publish(payload)
-        except TransportError as error:
-            log.warning("publish_failed", stream=self.stream, error=str(error))
-            return
-        latency_ns = time.monotonic_ns() - ticket.now_ns
-        self.meter.published(latency_ns)
-        self._circle.metrics.published(
-            latency_s=latency_ns / SECOND,
-            queue_s=waited_ns / SECOND,
-            decode_s=ticket.decode_ns / SECOND,
-            step_s=tracked.step_ns / SECOND,
-        )
-        self._count_tracks(frozenset(tracked.tracks.id.tolist()))
-
-    def _count_tracks(self, ids: frozenset[int]) -> None:
-        self._circle.metrics.tracks(started=len(ids - self._ids), ended=len(self._ids - ids))
-        self._ids = ids
 
     def _report(self, code: str, path: str, expected: str, received: str, *, what: str = "", count: int = 1) -> None:
         message = f"{what or 'Stream'}: {path or 'message'}: expected {expected}, received {received}."
@@ -272,43 +324,136 @@ class Lane:
         )
         self._circle.desk.report(problem, time.monotonic_ns())
 
+    # Who tracks the stream; to be called by the worker alone
+
+    def _stand_by(self, packet: Packet, *, frame: bool) -> None:
+        """Keep a packet for the moment when this instance owns the stream, and ask for it if nobody does."""
+        if self._circle.steward.standing(self.stream) is Standing.NONE:
+            if self._read(packet, frame=frame) is None or not self._admitted(frame=frame):
+                return
+            self._circle.steward.seek(self.stream)
+        self._standby.add(packet, frame=frame)
+
+    def ask(self, command: Callable[[Lane], None], *, seek: bool) -> None:
+        """Call `command` as soon as it is known whether this instance owns the stream, perhaps now.
+
+        With `seek` it asks for a stream that nobody owns.
+        """
+        steward = self._circle.steward
+        if seek and self.session is None and steward.standing(self.stream) is Standing.NONE:
+            steward.seek(self.stream)
+        self._asking.append(command)
+        if self.session is not None or steward.standing(self.stream) in {Standing.NONE, Standing.STANDBY}:
+            self._answer()
+
+    def take_seat(self) -> None:
+        """This instance owns the stream: go on where its last owner was, with all that came since."""
+        if self._circle.steward.standing(self.stream) is not Standing.OWNER:
+            return  # given up meanwhile, or lost again, which will be told too
+        if self.session is None and self._open() is None:
+            self._circle.steward.leave(self.stream)
+        self._answer()
+        for packet, frame in self._standby.take():
+            if self.session is not None:
+                self._guard(self._receive, packet, frame=frame)
+            else:
+                self._count_refused(frame=frame)
+
+    def give_seat(self) -> None:
+        """Another instance owns the stream: what is here is no longer the newest state."""
+        self._drop_session("superseded")
+        self._answer()
+
+    def leave_seat(self) -> None:
+        """The session has ended and its state is kept: whoever gets the next message of the stream may go on."""
+        if self.session is None:
+            self._circle.steward.leave(self.stream)
+            if self._standby:
+                self._circle.steward.seek(self.stream)
+
+    def trim(self) -> None:
+        """Drop what has waited too long for a takeover."""
+        self._standby.trim(time.monotonic_ns())
+
+    def _answer(self) -> None:
+        asking, self._asking = self._asking, []
+        for command in asking:
+            self._guard(command, self)
+
     # Sessions; to be called by the worker alone
 
-    def open_session(self) -> Session | None:
-        """Begin a session; None when the service has no room for another."""
+    def _admitted(self, *, frame: bool) -> bool:
+        if self._circle.room():
+            return True
+        self._count_refused(frame=frame)
+        self._report(
+            "refused", "", "a stream that is tracked already", "a new one; the service carries no more sessions"
+        )
+        return False
+
+    def _open(self) -> Session | None:
+        """Begin a session, or go on with the one that was kept; None when the service has no room for another."""
         life = self._circle.admit(self.stream)
         if life is None:
-            self._count_refused()
-            self._report(
-                "refused", "", "a stream that is tracked already", "a new one; the service carries no more sessions"
-            )
+            self._admitted(frame=True)
             return None
-        try:
-            self._claim = self._circle.outlet.claim(self.stream)
-        except TransportError as error:
-            log.warning("claim_failed", stream=self.stream, error=str(error))
-        self.session = Session(
-            self.stream,
-            self._circle.parameters_of(self.stream),
-            self._circle.policy,
-            instance=self._circle.instance,
-            life=life,
-            tracker=self._circle.tracker,
-        )
-        log.info("session_opened", stream=self.stream, profile=self.session.parameters.name)
-        return self.session
+        self._out.open()
+        circle = self._circle
 
-    def close_session(self, reason: str) -> None:
-        """End the session and free what it holds; the next valid message of the stream begins another."""
-        session, claim = self.session, self._claim
+        def restore(checkpoint: Checkpoint) -> Session:
+            now_ns = time.monotonic_ns()
+            return Session.restore(checkpoint, now_ns, circle.policy, instance=circle.instance, tracker=circle.tracker)
+
+        session = circle.keeper.recall(self.stream, restore)
         if session is None:
+            parameters = circle.parameters_of(self.stream)
+            session = Session(
+                self.stream, parameters, circle.policy, instance=circle.instance, life=life, tracker=circle.tracker
+            )
+            log.info("session_opened", stream=self.stream, profile=session.parameters.name)
+        else:
+            log.info("session_restored", stream=self.stream, session=session.session, frames=session.counters.frames)
+        self.session, self._changed = session, False
+        self._base, self._opened = session.counters, replace(self.traffic)
+        return session
+
+    def close_session(self, reason: str, then: Callable[[], None] = lambda: None) -> None:
+        """End the session and free what it holds; the next valid message of the stream begins another, or goes on.
+
+        A session that is idle or moved is kept as it is; one that is closed by a query forgets its density and its
+        counters. `then` is called when its state is kept and the stream left.
+        """
+        session = self.session
+        if session is None:
+            then()
             return
         self._deliver(session.flush())
-        self.session, self._claim, self._armed_ns = None, None, None
-        self._count_tracks(frozenset())
+        state = session.snapshot()
+        if reason == "query":
+            session.reset()
+            state = forgotten(session.snapshot())
+        self._drop_session(reason)
+
+        def leave(lane: Lane) -> None:
+            lane.leave_seat()
+            then()
+
+        self._circle.keeper.put(state, lambda: self.tell(leave))
+
+    def keep(self) -> None:
+        """Give the state to the keeper, if it changed."""
+        if self.session is not None and self._changed:
+            self._changed = False
+            self._circle.keeper.put(self.session.snapshot())
+
+    def _drop_session(self, reason: str) -> None:
+        session = self.session
+        if session is None:
+            return
+        self.session, self._armed_ns = None, None
+        self._out.close()
+        self.traffic = self.traffic.since(self._base, session.counters)
         self._circle.release(session)
-        if claim is not None:
-            claim.release()
         log.info(
             "session_closed", stream=self.stream, session=session.session, reason=reason, frames=session.counters.frames
         )
@@ -319,7 +464,25 @@ class Lane:
 
     def state(self) -> schemas.SessionState | None:
         """Return the state of the session, None without one."""
-        return self.session.state(shed=self.inbox.shed_frames, queue=self.inbox.waiting) if self.session else None
+        session = self.session
+        if session is None:
+            return None
+        return self._state(session).model_copy(update={"digest": digest_of(session.snapshot())})
+
+    def _state(self, session: Session) -> schemas.SessionState:
+        shed, waiting, _ = self.inbox.counts()
+        untold = shed - self._shed_told
+        base, opened = self._base, self._opened
+        before = base.frames + base.duplicates + base.late + base.refused
+        state = session.state(shed=self.traffic.shed - opened.shed + untold, queue=waiting)
+        received = before + self.traffic.received - opened.received + untold + waiting
+        clouds_refused = self.traffic.clouds_refused - opened.clouds_refused
+        return state.model_copy(update={"received": received, "clouds_refused": clouds_refused})
+
+    def totals(self) -> Traffic:
+        """Return what became of messages since the lane is there; may be called by any thread."""
+        session = self.session
+        return self.traffic if session is None else self.traffic.since(self._base, session.counters)
 
     def summary(self, now_ns: int) -> schemas.SessionSummary | None:
         """Return the line of the service's status; may be called by any thread."""
@@ -327,7 +490,7 @@ class Lane:
         if session is None:
             return None
         p50, p99 = self.meter.latency_ms()
-        state = session.state()
+        state = self._state(session)
         return schemas.SessionSummary(
             stream=self.stream,
             profile=state.profile,
@@ -337,9 +500,9 @@ class Lane:
             latency_p99_ms=p99,
             frames=state.frames,
             refused=state.refused,
-            shed=self.inbox.shed_frames,
+            shed=state.shed,
             gaps=state.gaps,
             tracks=state.tracks,
-            queue=self.inbox.waiting,
+            queue=state.queue,
             age_s=self.meter.age_s(now_ns),
         )

@@ -25,11 +25,20 @@ EVENTS: Final = {
     "peer_connected": "A node, router or service is linked to this process.",
     "peer_lost": "That link is gone. A client links again by itself and recovers what the caches still hold.",
     "session_opened": "A stream sent its first valid message, or parameters were set for it.",
+    "session_restored": "A stream's session goes on from its checkpoint; what it missed is asked of the publishers.",
     "session_begun": "A density began: `first` frame, `publisher` restarted with a jump, a `jump` of stamps, `reset`, "
     "`parameters`, a `pose` far off, the end of a `quarantine`. Repeated jumps: check the sensor's clock.",
     "session_quarantined": "Tracking a stream raised `error`: its frames are refused until a reset or another start of "
     "the publisher. Its last frames are saved; report them.",
-    "session_closed": "A session was freed: `idle` for long, by a `query`, or `moved` to another worker.",
+    "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` to another worker, or `superseded` "
+    "by another instance.",
+    "checkpoint_torn": "A checkpoint cannot be read; it is set aside and the one before it is used.",
+    "checkpoint_refused": "Another instance has taken the stream over; this one's checkpoint was not written.",
+    "store_failed": "Checkpoints cannot be written (disk full, read-only?): tracking goes on, the state is `degraded`.",
+    "store_back": "Checkpoints are written again.",
+    "tenure_lapsed": "This process was frozen, starved or cut off: nothing is published until it has looked whether"
+    " another instance took over.",
+    "tenure_renewed": "It has looked; what is still its own goes on.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames came again.",
     "problem": "Something was refused or lost; `count` equal ones since the last line. See the problems below.",

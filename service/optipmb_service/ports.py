@@ -31,20 +31,20 @@ class Packet:
 
 
 class Claim(Protocol):
-    """A stream that this instance tracks: the publisher of its tracks and the token that says so."""
+    """The publisher of a stream's tracks."""
 
     def publish(self, payload: bytes) -> None:
         """Send encoded tracks; never waits for a receiver."""
 
     def release(self) -> None:
-        """Withdraw the publisher and the token."""
+        """Withdraw the publisher."""
 
 
 class Outlet(Protocol):
     """Where results go."""
 
     def claim(self, stream: str) -> Claim:
-        """Become the owner of a stream."""
+        """Open the publisher of a stream that this instance owns."""
 
     def publish_problem(self, problem: schemas.Problem) -> None:
         """Send a problem on its stream's key; never waits for a receiver."""

@@ -91,12 +91,31 @@ class Queries:
             _guarded(request, lambda: request.refuse(self._problem(stream, unknown)))
             return
         command, urgent = commands[name]
-        taken = self._registry.command(
-            stream, lambda lane: _guarded(request, lambda: command(lane, request)), urgent=urgent
-        )
+
+        def answer(lane: Lane) -> None:
+            # Where several instances run, the one that tracks the stream answers.
+            _guarded(request, lambda: None if lane.elsewhere else command(lane, request))
+
+        # A stream can be set up ahead of its first frame, by a valid request.
+        seeks = name == "parameters" and self._sets(request)
+        taken = self._registry.command(stream, lambda lane: lane.ask(answer, seek=seeks), urgent=urgent)
         if not taken:
             full = schemas.MessageError("too_large", "key", "fewer new streams at once", "another one")
             _guarded(request, lambda: request.refuse(self._problem(stream, full)))
+
+    def _sets(self, request: Request) -> bool:
+        """Whether a request for parameters is valid and changes any."""
+        try:
+            asked = schemas.decode(
+                request.payload or b"",
+                schemas.SessionParameters,
+                encoding=request.encoding,
+                limits=self._registry.limits,
+            )
+        except schemas.MessageError:
+            return False
+        known = asked.profile is None or self._registry.profiles.named(asked.profile) is not None
+        return known and asked != schemas.SessionParameters()
 
     def _answer_many(self, request: Request) -> None:
         """Answer a question about the state of all streams that a key expression includes; many answer nothing else."""
@@ -133,7 +152,7 @@ class Queries:
         state = self._nothing(lane.stream, "closed" if asked.close else "new")
         if session is not None and asked.close:
             lane.close_session("query")
-            state = session.state(shed=lane.inbox.shed_frames, closed=True)
+            state = session.state(closed=True)
         elif session is not None:
             lane.deliver(session.reset())
             state = lane.state() or state
@@ -152,7 +171,7 @@ class Queries:
                 error = schemas.MessageError("invalid_value", "profile", expected, repr(asked.profile))
                 request.refuse(self._problem(lane.stream, error))
                 return
-        if asked != empty and lane.session is None and lane.open_session() is None:
+        if asked != empty and lane.session is None:
             full = schemas.MessageError(
                 "too_large", "stream", "a stream that is tracked already", "no room for another"
             )

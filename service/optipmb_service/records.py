@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import optipmb_schemas as schemas
@@ -149,6 +149,28 @@ class Counters:
     clouds_used: int = 0
     clouds_missed: int = 0
     repaired: int = 0
+
+
+@dataclass(slots=True)
+class Traffic(Counters):
+    """The same with what never came to a session, of a stream or of all.
+
+    Every frame received ends in one of frames, duplicates, late, refused and shed, or waits: received is their sum.
+    """
+
+    received: int = 0
+    shed: int = 0
+    clouds_refused: int = 0
+    clouds_shed: int = 0
+
+    def __add__(self, other: Traffic) -> Traffic:
+        """Return the sums."""
+        return Traffic(**{one.name: getattr(self, one.name) + getattr(other, one.name) for one in fields(Traffic)})
+
+    def since(self, earlier: Counters, now: Counters) -> Traffic:
+        """Return this with what came to a session between two times."""
+        come = {one.name: getattr(now, one.name) - getattr(earlier, one.name) for one in fields(Counters)}
+        return self + Traffic(**come)
 
 
 class RefusedError(ValueError):

@@ -9,22 +9,26 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
 import structlog
 
 import optipmb
-from optipmb_service.lane import Circle, Lane
+from optipmb_service import quarantine
+from optipmb_service.lane import Circle, Lane, Seating
+from optipmb_service.ownership import Change
 from optipmb_service.problems import problem_of
-from optipmb_service.records import SECOND, Counters, Life, Policy
+from optipmb_service.records import SECOND, Life, Policy, Traffic
 from optipmb_service.share import Share
+from optipmb_service.standby import Budget
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from optipmb_service.inbox import Pool
+    from optipmb_service.keeper import Keeping
     from optipmb_service.metrics import Metrics
     from optipmb_service.ports import Outlet, Packet
     from optipmb_service.problems import Desk
@@ -40,28 +44,13 @@ MAX_UNPROVEN: Final = 256
 MAX_LIVES: Final = 65_536
 """Streams without a session whose past is remembered."""
 
+DUMPS: Final = "quarantine"
+MAX_DUMPS: Final = 32
+
+MEGABYTE: Final = 2**20
+
 MAX_KEYS: Final = 8192
 """Keys whose stream is remembered."""
-
-
-@dataclass(slots=True)
-class Totals:
-    """What happened to all messages since the start."""
-
-    counters: Counters = field(default_factory=Counters)
-    shed_frames: int = 0
-    shed_clouds: int = 0
-
-    def add(self, counters: Counters) -> None:
-        """Add what happened in a session."""
-        for one in fields(Counters):
-            setattr(self.counters, one.name, getattr(self.counters, one.name) + getattr(counters, one.name))
-
-    def add_lane(self, lane: Lane) -> None:
-        """Add what happened before its session, and in its queue."""
-        self.counters.refused += lane.refused
-        self.shed_frames += lane.inbox.shed_frames
-        self.shed_clouds += lane.inbox.shed_clouds
 
 
 class Registry:
@@ -73,6 +62,8 @@ class Registry:
         outlet: where results go.
         desk: where problems go.
         pool: the workers.
+        steward: says which streams this instance owns.
+        keeper: where checkpoints go and come from.
         arm: has `Lane.wake` called at a monotonic time (ns).
         metrics: counts what comes and goes.
         tracker: makes the trackers of sessions.
@@ -83,11 +74,13 @@ class Registry:
         self,
         settings: Settings,
         profiles: Profiles,
+        *,
         outlet: Outlet,
         desk: Desk,
         pool: Pool,
+        steward: Seating,
+        keeper: Keeping,
         arm: Callable[[Lane, int], None],
-        *,
         metrics: Metrics,
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
         share: Share | None = None,
@@ -106,7 +99,7 @@ class Registry:
         self._sessions = 0
         self._lives: OrderedDict[str, Life] = OrderedDict()
         self._streams: dict[str, str] = {}
-        self._past = Totals()
+        self._past = Traffic()
         self._metrics = metrics
         self._circle = Circle(
             instance=settings.instance,
@@ -126,6 +119,12 @@ class Registry:
             outlet=outlet,
             desk=desk,
             parameters_of=profiles.of,
+            steward=steward,
+            keeper=keeper,
+            standby_ns=round(settings.standby_s * SECOND),
+            dump=lambda stream, dump: _save(settings.folder, stream, dump),
+            budget=Budget(settings.standby_mb * MEGABYTE),
+            room=lambda: self._sessions < settings.max_sessions,
             admit=self._admit,
             release=self._release,
             discard=self._discard,
@@ -177,16 +176,20 @@ class Registry:
             lane = self._lanes.get(stream)
         return lane if lane is not None and lane.session is not None else None
 
-    def totals(self) -> Totals:
-        """Return what happened to all messages since the start."""
+    def totals(self) -> Traffic:
+        """Return what became of all messages since the start."""
         with self._lock:
-            totals = Totals(replace(self._past.counters), self._past.shed_frames, self._past.shed_clouds)
-            lanes = list(self._lanes.values())
+            totals, lanes = self._past, list(self._lanes.values())
         for lane in lanes:
-            totals.add_lane(lane)
-            if (session := lane.session) is not None:
-                totals.add(session.counters)
+            totals += lane.totals()
         return totals
+
+    @property
+    def standing_by(self) -> int:
+        """Streams of which packets wait here for a takeover."""
+        with self._lock:
+            lanes = list(self._lanes.values())
+        return sum(lane.stands_by for lane in lanes)
 
     @property
     def busy(self) -> bool:
@@ -206,6 +209,30 @@ class Registry:
                 log.warning("stream_stale", stream=lane.stream, age_s=round(age_s, 3))
             if now_ns - lane.meter.active_ns > self._settings.idle_s * SECOND:
                 self.command(lane.stream, self._close_idle, urgent=False)
+        with self._lock:
+            waiting = [lane for lane in self._lanes.values() if lane.stands_by]
+        for lane in waiting:
+            lane.tell(Lane.trim)
+
+    def changed(self, stream: str, change: Change) -> None:
+        """Tell a stream's worker that this instance owns the stream now, or does not."""
+        command = Lane.take_seat if change is Change.GRANTED else Lane.give_seat
+        self.command(stream, command, urgent=True)
+
+    def resume(self) -> None:
+        """Send workers to all streams: they paused, and need not any longer."""
+        for lane in self.lanes():
+            lane.wake()
+
+    def keep(self) -> None:
+        """Have every session that changed give its state to the keeper."""
+        for lane in self.lanes():
+            lane.tell(Lane.keep)
+
+    def keep_now(self) -> None:
+        """Do the same in the calling thread, when the workers have ended."""
+        for lane in self.lanes():
+            lane.keep()
 
     def finish(self) -> None:
         """Process what is held for clouds, in every session; the workers do it."""
@@ -237,15 +264,22 @@ class Registry:
     def _lane(self, stream: str) -> Lane | None:
         with self._lock:
             lane = self._lanes.get(stream)
-            if lane is None and len(self._lanes) - self._sessions < MAX_UNPROVEN:
+            if lane is None and self._unproven < MAX_UNPROVEN:
                 lane = self._lanes[stream] = Lane(stream, self._circle)
             return lane
+
+    @property
+    def _unproven(self) -> int:
+        """Lanes of streams that have not sent a valid message, as far as is known; called with the lock."""
+        if len(self._lanes) < MAX_UNPROVEN:
+            return 0
+        return sum(lane.session is None and not lane.stands_by for lane in self._lanes.values())
 
     def _discard(self, lane: Lane) -> None:
         with self._lock:
             if self._lanes.get(lane.stream) is lane:
                 del self._lanes[lane.stream]
-                self._past.add_lane(lane)
+                self._past += lane.traffic
 
     def _admit(self, stream: str) -> Life | None:
         with self._lock:
@@ -257,22 +291,23 @@ class Registry:
     def _release(self, session: Session) -> None:
         with self._lock:
             self._sessions -= 1
-            self._past.add(session.counters)
             self._lives[session.stream] = session.life
             if len(self._lives) > MAX_LIVES:
                 self._lives.popitem(last=False)
 
     def _refuse(self, stream: str) -> None:
-        with self._lock:
-            self._past.counters.refused += 1
+        self._count_refused()
         self._report("shed", stream, f"fewer than {MAX_UNPROVEN} new streams at once", "another one")
+
+    def _count_refused(self) -> None:
+        with self._lock:
+            self._past += Traffic(received=1, refused=1)
 
     def _stream_of(self, packet: Packet) -> str | None:
         try:
             return self._parsed(packet.key)
         except schemas.MessageError as error:
-            with self._lock:
-                self._past.counters.refused += 1
+            self._count_refused()
             self._report("invalid_value", "", error.expected, error.received)
             return None
 
@@ -302,6 +337,17 @@ class Registry:
             message=message,
         )
         self._desk.report(problem, time.monotonic_ns())
+
+
+def _save(folder: Path | None, stream: str, dump: bytes) -> str:
+    """Write what is needed to see an error again into the folder of the state; return the file, empty without one."""
+    if folder is None:
+        return ""
+    try:
+        return str(quarantine.save(folder / DUMPS, stream, dump, most=MAX_DUMPS))
+    except OSError as error:
+        log.warning("store_failed", error=str(error))
+        return ""
 
 
 def _flush(lane: Lane) -> None:

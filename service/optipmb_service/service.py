@@ -23,6 +23,7 @@ import structlog
 import optipmb
 from optipmb_service import __version__, figures
 from optipmb_service.inbox import Pool
+from optipmb_service.keeper import open_keeper
 from optipmb_service.loops import Asked, beat, say_ready, unless
 from optipmb_service.metrics import Metrics
 from optipmb_service.ports import HttpError, TransportError
@@ -30,6 +31,7 @@ from optipmb_service.problems import Desk
 from optipmb_service.queries import Queries
 from optipmb_service.registry import Registry
 from optipmb_service.share import Share
+from optipmb_service.steward import Steward
 from optipmb_service.transport import Transport
 from optipmb_service.vitals import Vitals, shown
 
@@ -75,19 +77,22 @@ class Service:
         self._settings = settings
         self._started_ns = time.time_ns()
         self._began_ns = time.monotonic_ns()
-        self.state = "starting"
-        """As in the status."""
+        self._state = "starting"
         self._metrics = metrics or Metrics()
         self._transport = Transport(settings)
         self._desk = Desk(self._transport.publish_problem, _log_problem)
         self._pool = Pool(settings.thread_count)
+        self._steward = Steward(settings.instance, self._transport, settings.lease_s)
+        self._keeper = open_keeper(settings, self._steward.may_write)
         self._registry = Registry(
             settings,
             profiles,
-            self._transport,
-            self._desk,
-            self._pool,
-            arm,
+            outlet=self._transport,
+            desk=self._desk,
+            pool=self._pool,
+            steward=self._steward,
+            keeper=self._keeper,
+            arm=arm,
             metrics=self._metrics,
             tracker=tracker,
             share=share,
@@ -98,9 +103,14 @@ class Service:
     def start(self, *, announce: bool = True) -> None:
         """Receive, answer, and say so."""
         self._transport.watch()
+        self._transport.watch_owners(
+            lambda stream, instance, present: self._steward.told(stream, instance, present=present)
+        )
+        self._steward.start(self._registry.changed, self._registry.resume)
+        self._keeper.start(self._registry.keep)
         self._transport.subscribe(self._registry.frame, self._registry.cloud, self._registry.wants)
         self._transport.serve(self._queries.about_streams, self._queries.about_service)
-        self.state = "ready"
+        self._state = "ready"
         if announce:
             self._transport.announce()
 
@@ -112,13 +122,18 @@ class Service:
 
     def stop(self) -> bool:
         """Track what was received, within the grace, and close; False when a step would not end."""
-        self.state = "stopping"
+        self._state = "stopping"
         ends = time.monotonic() + self._settings.grace_s
         self._transport.stop(JOIN_S)
-        self._registry.finish()
+        if not self._keeper.durable:
+            self._registry.finish()  # else what waits for its cloud comes again from the publishers' caches
         while self._registry.busy and time.monotonic() < ends:
             time.sleep(DRAIN_POLL_S)
         ended = self._pool.close(JOIN_S)
+        if ended:
+            self._registry.keep_now()
+        self._keeper.close(JOIN_S)
+        self._steward.close(JOIN_S)
         self._desk.flush(time.monotonic_ns())
         self._transport.close()
         return ended
@@ -127,15 +142,19 @@ class Service:
         """End the session of a stream after what was received, then call `then`; False when there is none."""
 
         def end(lane: Lane) -> None:
-            lane.close_session("moved")
-            then()
+            lane.close_session("moved", then)
 
         return self._registry.lane(stream) is not None and self._registry.command(stream, end, urgent=False)
+
+    @property
+    def state(self) -> str:
+        """What the service is: starting, ready, degraded (it tracks, and cannot keep checkpoints) or stopping."""
+        return "degraded" if self._state == "ready" and self._keeper.failure else self._state
 
     def status(self) -> schemas.ServiceStatus:
         """Return the answer to `q/status`."""
         now_ns = time.monotonic_ns()
-        counters = self._registry.totals().counters
+        totals = self._registry.totals()
         return schemas.ServiceStatus(
             instance=self._settings.instance,
             version=__version__,
@@ -143,8 +162,14 @@ class Service:
             uptime_s=(now_ns - self._began_ns) / 1e9,
             state=self.state,
             sessions=self._summaries(now_ns),
-            frames=counters.frames,
-            refused=counters.refused,
+            standby=self._registry.standing_by,
+            received=totals.received,
+            frames=totals.frames,
+            duplicates=totals.duplicates,
+            late=totals.late,
+            refused=totals.refused,
+            shed=totals.shed,
+            clouds_refused=totals.clouds_refused,
             problems=self._desk.newest(),
         )
 

@@ -164,7 +164,6 @@ class Session:
         try:
             convert.cloud_of(message)
         except optipmb.FrameError as error:
-            self._deliveries.refused += 1
             return [self._complain.invalid(Mark(message.epoch, message.seq, message.stamp_ns), error)]
         self._clouds.add(message)
         outputs = self._amend(message, ticket) if self._policy.late_clouds and not self._quarantine else []

@@ -13,7 +13,7 @@ import re
 import socket
 import tomllib
 from dataclasses import dataclass
-from pathlib import Path  # noqa: TC003 - pydantic reads the annotation
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from optipmb_schemas import DEFAULT, Limits
@@ -183,6 +183,31 @@ class Settings(BaseSettings):
     idle_s: float = Field(
         default=600.0, gt=0, description="a session without a message for this long is closed and freed"
     )
+    store: str = Field(
+        default="",
+        description="folder of the checkpoints and of quarantined sessions; `none`: nothing is kept, a restart begins"
+        " anew; default: a folder named after prefix and endpoint in `$STATE_DIRECTORY`, else in `optipmb` under"
+        " `$XDG_STATE_HOME` or `~/.local/state`",
+    )
+    checkpoint_s: float = Field(
+        default=1.0, ge=0.05, le=3600, description="time between two checkpoints of a session that changed"
+    )
+    lease_s: float = Field(
+        default=3.0,
+        ge=0.5,
+        le=60,
+        description="an instance that is frozen, or cut off, for this long loses its streams to one that stands by",
+    )
+    standby_s: float = Field(
+        default=10.0,
+        ge=0,
+        le=600,
+        description="how much of a stream that another instance tracks is kept for a takeover; longer than `lease_s`"
+        " and `checkpoint_s` together",
+    )
+    standby_mb: int = Field(
+        default=256, ge=1, le=65536, description="megabytes kept for takeovers, over all streams; clouds go first"
+    )
     stale_s: float = Field(default=2.0, gt=0, description="a stream without a frame for this long is logged as stale")
     grace_s: float = Field(default=1.0, ge=0, le=60, description="at the end, time for the frames already received")
     http: Annotated[str, AfterValidator(_address)] = Field(
@@ -214,6 +239,19 @@ class Settings(BaseSettings):
     def thread_count(self) -> int:
         """Number of threads that track, of one process."""
         return self.threads or min(8, os.cpu_count() or 1)
+
+    @property
+    def folder(self) -> Path | None:
+        """Where state is kept; None: nowhere."""
+        if self.store == "none":
+            return None
+        if self.store:
+            return Path(self.store).expanduser()
+        state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+        home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        # Instances on one network share the state, other networks of the same host have their own.
+        where = re.sub(r"[^A-Za-z0-9_.]+", "-", f"{self.prefix} {(*self.connect, *self.endpoints)[0]}")
+        return Path(state or Path(home) / "optipmb") / where
 
     @classmethod
     def settings_customise_sources(

@@ -141,7 +141,10 @@ class Supervisor:
 
     async def _kept(self, index: int) -> None:
         """Have a worker run until the end."""
-        settings = self._settings.model_copy(update={"instance": f"{self._settings.instance}-w{index}"})
+        folder = self._settings.folder  # one for all, wherever the workers connect
+        settings = self._settings.model_copy(
+            update={"instance": f"{self._settings.instance}-w{index}", "store": str(folder) if folder else "none"}
+        )
         pause_s = 0.0
         while not self._over:
             child = self._children[index] = Child(index, lambda event: self._take_in(index, event))

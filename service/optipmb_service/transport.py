@@ -48,6 +48,15 @@ TRACKS_CACHE: Final = 128
 HEARTBEAT_S: Final = 0.2
 """How long the loss of the newest tracks may stay unnoticed."""
 
+CLAIM: Final = "/claim"
+"""Ending of the liveliness keys by which instances settle who may have a stream, before one says that it has."""
+
+TOKENS: Final = 2**20
+"""More tokens than there are."""
+
+OWNERS_S: Final = 1.0
+"""How long the network may take to say who owns a stream; it takes less than a millisecond."""
+
 WAIT_BEFORE_DROP_US: Final = 50_000
 WAIT_BEFORE_DROP_FRAGMENTS_US: Final = 500_000
 
@@ -95,6 +104,7 @@ def configuration(settings: Settings) -> zenoh.Config:
         "scouting/delay": 0,
         "timestamping/enabled": True,
         "transport/shared_memory/enabled": settings.shared_memory,
+        "transport/link/tx/lease": round(settings.lease_s * 1e3),
         "transport/link/rx/max_message_size": MESSAGE_HEADROOM * settings.limits.max_bytes,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
         "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": WAIT_BEFORE_DROP_FRAGMENTS_US,
@@ -156,6 +166,7 @@ class Transport:
         self._prefix = settings.prefix
         self._instance = settings.instance
         self._max_bytes = settings.limits.max_bytes
+        self._is_router = settings.is_router
         try:
             self._session = zenoh.open(configuration(settings))
         except zenoh.ZError as error:
@@ -272,7 +283,7 @@ class Transport:
         self._alive = self._session.liveliness().declare_token(self._keys.alive(self._instance))
 
     def claim(self, stream: str) -> Claim:
-        """Become the owner of a stream.
+        """Open the publisher of a stream's tracks; to be called by the owner of the stream.
 
         Raises:
             TransportError: the session is closed.
@@ -289,10 +300,9 @@ class Transport:
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
                 publisher_detection=True,
             )
-            token = self._session.liveliness().declare_token(self._keys.owner(stream, self._instance))
         except zenoh.ZError as error:
             raise TransportError(_line(error)) from error
-        claim = Claim(publisher, token, self._forget)
+        claim = Claim(publisher, self._forget)
         with self._lock:
             self._claims.add(claim)
         return claim
@@ -309,6 +319,59 @@ class Transport:
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.DATA_LOW,
             )
+
+    # Owners
+
+    def linked(self) -> bool:
+        """Whether this session is part of a network: a router always is, a client while it has a router."""
+        return self._is_router or bool(self._session.info.routers_zid())
+
+    def watch_owners(self, told: Callable[[str, str, bool], None]) -> None:
+        """Tell which instance claims which stream, or does so no longer (False), from now on."""
+        tokens = self._session.liveliness().declare_subscriber(
+            self._keys.all_owners(), zenoh.handlers.FifoChannel(CHANNEL), history=True
+        )
+
+        def receive(sample: zenoh.Sample) -> None:
+            key = str(sample.key_expr)
+            told(self._keys.stream_of(key), self._keys.instance_of(key), sample.kind == zenoh.SampleKind.PUT)
+
+        self._read("owners", tokens, tokens.handler, receive)
+
+    def declare_claim(self, stream: str) -> Token | None:
+        """Say that this instance wants a stream; None at the end, when the session is closed."""
+        return self._declare(f"{self._keys.owner(stream, self._instance)}{CLAIM}")
+
+    def declare_owner(self, stream: str) -> Token | None:
+        """Say that this instance tracks a stream; None at the end, when the session is closed."""
+        return self._declare(self._keys.owner(stream, self._instance))
+
+    def claimants(self, streams: Iterable[str] | None) -> dict[str, set[str]] | None:
+        """Return which instances want or have some streams, or any; None when it cannot be found out.
+
+        Whoever declares a claim and then asks, and whoever does the same at the same time: at least one sees the other.
+        That holds only for tokens that this session does not watch: of those that it watches Zenoh answers at once
+        from what it has been told so far.
+        """
+        owners = [self._keys.all_owners()] if streams is None else [self._keys.owners(stream) for stream in streams]
+        claimants: dict[str, set[str]] = {}
+        try:
+            for pattern in owners:
+                # Its own tokens are put into the channel before anybody reads it: it must not fill up.
+                channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(TOKENS)
+                for reply in self._session.liveliness().get(f"{pattern}{CLAIM}", channel, timeout=OWNERS_S):
+                    if (sample := reply.ok) is None:
+                        return None  # the timeout: nobody can say who else is there
+                    key = str(sample.key_expr).removesuffix(CLAIM)
+                    claimants.setdefault(self._keys.stream_of(key), set()).add(self._keys.instance_of(key))
+        except (zenoh.ZError, schemas.MessageError):
+            return None
+        return claimants
+
+    def _declare(self, key: str) -> Token | None:
+        with contextlib.suppress(zenoh.ZError):
+            return Token(self._session.liveliness().declare_token(key))
+        return None
 
     # The end
 
@@ -339,11 +402,10 @@ class Transport:
 
 
 class Claim:
-    """A stream that this instance tracks."""
+    """The publisher of a stream's tracks."""
 
-    def __init__(self, publisher: _Publisher, token: _Undeclared, forget: Callable[[Claim], None]) -> None:
+    def __init__(self, publisher: _Publisher, forget: Callable[[Claim], None]) -> None:
         self._publisher = publisher
-        self._token = token
         self._forget = forget
 
     def publish(self, payload: bytes) -> None:
@@ -358,10 +420,20 @@ class Claim:
             raise TransportError(_line(error)) from error
 
     def release(self) -> None:
-        """Withdraw the publisher and the token."""
-        _undeclare(self._token)
+        """Withdraw the publisher."""
         _undeclare(self._publisher)
         self._forget(self)
+
+
+class Token:
+    """A liveliness token; it vanishes with its process and its link too."""
+
+    def __init__(self, declared: _Undeclared) -> None:
+        self._declared = declared
+
+    def withdraw(self) -> None:
+        """Take it back."""
+        _undeclare(self._declared)
 
 
 class Question:

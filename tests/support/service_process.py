@@ -42,7 +42,8 @@ class ServiceProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env=clean | dict(environment or {}),
+            # Tests that want state say where it is to be kept; nobody's own is touched.
+            env=clean | {"OPTIPMB_STORE": "none"} | dict(environment or {}),
         )
         self._threads = [threading.Thread(target=read, daemon=True) for read in (self._read_out, self._read_errors)]
         for thread in self._threads:

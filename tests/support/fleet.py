@@ -1,0 +1,136 @@
+"""A router process and service processes beside it, sharing a store: started, frozen, killed, and always ended."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING, Self
+
+from routers import free_endpoint, open_client
+from service_process import ServiceProcess
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from types import TracebackType
+
+    import zenoh
+
+START_S = 20.0
+
+_ROUTER = """
+import sys, threading
+sys.path.insert(0, sys.argv[1])
+from routers import open_router
+session = open_router(sys.argv[2])
+print("up", flush=True)
+threading.Event().wait()
+"""
+
+
+class RouterProcess:
+    """A Zenoh router in a process of its own; it can be killed and started again at the same endpoint."""
+
+    def __init__(self) -> None:
+        self.endpoint = free_endpoint()
+        self._process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.kill()
+
+    def start(self) -> None:
+        """Start it, and wait until it listens."""
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _ROUTER, os.path.dirname(__file__), self.endpoint],  # noqa: PTH120 - a text is needed
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == "up\n"
+
+    def kill(self) -> None:
+        """SIGKILL."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            if self._process.stdout is not None:
+                self._process.stdout.close()
+            self._process = None
+
+
+class Fleet:
+    """Services that are clients of one router and share a store.
+
+    Args:
+        folder: where the store is.
+        environment: settings of all services, on top of those that the tests need.
+    """
+
+    def __init__(self, folder: Path, **environment: object) -> None:
+        self.folder = folder
+        self.router = RouterProcess()
+        self._context = contextlib.ExitStack()
+        self._environment = {
+            "OPTIPMB_STORE": str(folder),
+            "OPTIPMB_LOG_LEVEL": "info",
+            "OPTIPMB_LEASE_S": "2.0",
+            "OPTIPMB_CHECKPOINT_S": "0.5",
+        } | {f"OPTIPMB_{name.upper()}": str(value) for name, value in environment.items()}
+
+    def __enter__(self) -> Self:
+        self._context.enter_context(self.router)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._context.close()
+
+    @property
+    def endpoint(self) -> str:
+        """Where the router listens."""
+        return self.router.endpoint
+
+    def service(self, instance: str, *, wait: bool = True, **environment: object) -> ServiceProcess:
+        """Start a service; it is killed at the end, if it still runs."""
+        extra = {f"OPTIPMB_{name.upper()}": str(value) for name, value in environment.items()}
+        process = ServiceProcess(
+            *("--connect", self.endpoint, "--instance", instance),
+            environment=self._environment | extra,
+            listen=False,
+        )
+        self._context.enter_context(process)
+        if wait:
+            process.wait_ready()
+        return process
+
+    def client(self) -> zenoh.Session:
+        """A plain Zenoh client of the router, closed at the end."""
+        return self._context.enter_context(open_client(self.endpoint))
+
+
+def freeze(service: ServiceProcess) -> None:
+    """SIGSTOP, and wait until it has stopped."""
+    service.process.send_signal(signal.SIGSTOP)
+    deadline = time.monotonic() + START_S
+    while _state(service.process.pid) != "T" and time.monotonic() < deadline:
+        time.sleep(0.001)
+
+
+def thaw(service: ServiceProcess) -> None:
+    """SIGCONT."""
+    service.process.send_signal(signal.SIGCONT)
+
+
+def _state(pid: int) -> str:
+    with open(f"/proc/{pid}/stat", encoding="ascii") as file:  # noqa: PTH123 - the kernel's
+        return file.read().rpartition(")")[2].split()[0]
