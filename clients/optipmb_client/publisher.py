@@ -45,6 +45,9 @@ class Publisher:
         timeout: Seconds to wait for a router.
         connection: Share an open connection (it stays open) in the place of `connect` and `config`.
         cache: Number of detection messages kept for recovery.
+        cache_clouds: Number of point clouds kept for recovery, in memory. Without, a frame that is recovered is tracked
+            as one that never had a cloud: good enough for most uses, as clouds are a hundred times larger than
+            detections. With it clouds are sent whether or not anybody subscribes.
         prefix: First part of all keys, as configured in the service.
 
     Raises:
@@ -52,7 +55,7 @@ class Publisher:
         MessageError: `stream` is no stream name.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  each option by its name, all but two seldom used
         self,
         stream: str,
         connect: str | Sequence[str] | None = None,
@@ -62,6 +65,7 @@ class Publisher:
         timeout: float = 5.0,
         connection: Connection | None = None,
         cache: int = CACHE,
+        cache_clouds: int = 0,
         prefix: str = PREFIX,
     ) -> None:
         keys = Keys(prefix)
@@ -77,7 +81,7 @@ class Publisher:
         link = connection or self._own
         assert link is not None  # noqa: S101  one of the two is there: said for the type checker
         self._detections = link.cached_sender(detections, encoding_of(Detections), cache=cache)
-        self._points = link.plain_sender(points, encoding_of(Points))
+        self._points = link.plain_sender(points, encoding_of(Points), cache=cache_clouds)
 
     def __enter__(self) -> Self:
         return self

@@ -29,6 +29,7 @@ from optipmb_client.transport import Connection
 __all__ = ["Pace", "ReplayedSequence", "replay"]
 
 CLOUD_WAIT_S = 10.0  # a cloud may be late on a busy machine; tracking without it would change the result
+CACHED_CLOUDS = 16  # for a service that is killed and restarted meanwhile; it keeps no more of a stream by default
 STRAGGLERS_S = 2.0  # how long frames that were overtaken by later ones may still be recovered
 POINTS_WANTED_S = 5.0  # how long to wait until the service's subscription to clouds has come to this session
 TICK_S = 0.2  # how often a waiting thread looks whether it shall stop
@@ -189,7 +190,13 @@ class _Replay:
                 queue=4 * cache + 64,
                 prefix=self.task.prefix,
             ) as tracks,
-            Publisher(self.stream, connection=self.task.connection, cache=cache, prefix=self.task.prefix) as publisher,
+            Publisher(
+                self.stream,
+                connection=self.task.connection,
+                cache=cache,
+                cache_clouds=CACHED_CLOUDS if self.sequence.has_clouds else 0,
+                prefix=self.task.prefix,
+            ) as publisher,
         ):
             self._epoch = publisher.epoch
             wanted = SessionParameters(profile=self.task.profile, cloud_wait_s=CLOUD_WAIT_S)

@@ -263,9 +263,21 @@ class Connection:
             )
         return self._keep(Sender(publisher, None))
 
-    def plain_sender(self, key: str, encoding: str) -> Sender:
-        """Open a publisher for large messages that may get lost: no cache, lower priority than the small ones."""
+    def plain_sender(self, key: str, encoding: str, *, cache: int = 0) -> Sender:
+        """Open a publisher for large messages: lower priority than the small ones; with `cache` it keeps the newest."""
         with _usable():
+            if cache:
+                cached = zenoh.ext.declare_advanced_publisher(
+                    self._session,
+                    key,
+                    encoding=encoding,
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    priority=zenoh.Priority.DATA_LOW,
+                    cache=zenoh.ext.CacheConfig(cache),
+                    sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
+                    publisher_detection=True,
+                )
+                return self._keep(Sender(cached, None))
             publisher = self._session.declare_publisher(
                 key,
                 encoding=encoding,

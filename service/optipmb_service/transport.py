@@ -20,7 +20,7 @@ import json
 import re
 import threading
 import time
-from typing import TYPE_CHECKING, Final, Literal, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeVar, cast
 
 import optipmb_schemas as schemas
 import structlog
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 CHANNEL: Final = 4096
 """Messages between Zenoh and a draining thread; more than any publisher's history."""
 
-HISTORY_S: Final = 10.0
-"""Age of the detections fetched from the publishers' caches when the service starts or a publisher appears."""
+HISTORY_S: Final = 60.0
+"""Age of what is fetched from the publishers' small caches when the service starts or a publisher appears."""
 
 TRACKS_CACHE: Final = 128
 """Tracks kept per stream for subscribers that lost some or come late: 5 s and more at the usual rates."""
@@ -182,16 +182,20 @@ class Transport:
         self, on_frame: Callable[[Packet], None], on_cloud: Callable[[Packet], None], wanted: Callable[[str], bool]
     ) -> None:
         """Hand over the detections and point clouds on all keys that are wanted, each on a thread of its own."""
-        detections = zenoh.ext.declare_advanced_subscriber(
+        detections = self._subscriber("detections", CHANNEL)
+        self._read("detections", detections, detections.handler, lambda sample: self._receive(sample, on_frame, wanted))
+        points = self._subscriber("points", CHANNEL // 16)
+        self._read("points", points, points.handler, lambda sample: self._receive(sample, on_cloud, wanted))
+
+    def _subscriber(self, topic: schemas.Topic, channel: int) -> zenoh.ext.AdvancedSubscriber[Any]:
+        """Subscribe to a topic of all streams, with what the publishers' caches hold: also of clouds, if they do."""
+        return zenoh.ext.declare_advanced_subscriber(
             self._session,
-            self._keys.all("detections"),
-            zenoh.handlers.FifoChannel(CHANNEL),
+            self._keys.all(topic),
+            zenoh.handlers.FifoChannel(channel),
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_age=HISTORY_S),
             recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
         )
-        self._read("detections", detections, detections.handler, lambda sample: self._receive(sample, on_frame, wanted))
-        points = self._session.declare_subscriber(self._keys.all("points"), zenoh.handlers.FifoChannel(CHANNEL // 16))
-        self._read("points", points, points.handler, lambda sample: self._receive(sample, on_cloud, wanted))
 
     def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""
