@@ -23,6 +23,7 @@ from optipmb_schemas import (
     SessionState,
     Tracks,
     decode,
+    decode_dump,
     encode,
     encode_json,
     encoding_of,
@@ -36,6 +37,7 @@ import optipmb
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -199,8 +201,8 @@ def test_unknown_classes_are_reported_once(node: Node) -> None:
     assert [(p.code, p.received) for p in node.problems(SENSOR.stream)] == [("unknown_class", "'dog'")]
 
 
-def test_an_error_in_the_tracker_is_contained(start: Callable[..., Any]) -> None:
-    """An exception in a step becomes a problem; the session goes on as if that frame had been lost."""
+def test_an_error_in_the_tracker_is_contained(start: Callable[..., Any], tmp_path: Path) -> None:
+    """Fault 15: an exception in a step quarantines that stream and saves its frames; others go on, a reset helps."""
 
     class Failing(optipmb.Tracker):
         def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
@@ -208,12 +210,22 @@ def test_an_error_in_the_tracker_is_contained(start: Callable[..., Any]) -> None
                 raise ZeroDivisionError("seven")
             return super().step(density, frame)
 
-    _, endpoint = start(tracker=Failing)
+    other = replace(SENSOR, stream="site/node/other")
+    _, endpoint = start(tracker=Failing, store=str(tmp_path))
     with Node(endpoint) as node:
         node.send(SENSOR.detections(0), SENSOR.detections(1, objects=7), SENSOR.detections(2))
-        received = node.tracks(SENSOR.stream, 2)
-        assert "seven" in node.problem(SENSOR.stream, "internal").received
-        assert [(message.seq, message.gap) for message in received] == [(0, 0), (2, 1)]
+        problem = node.problem(SENSOR.stream, "quarantined")
+        assert "ZeroDivisionError: seven" in problem.received
+        (file,) = (tmp_path / "quarantine").iterdir()
+        dump = decode_dump(file.read_bytes())
+        assert (dump.stream, dump.error) == (SENSOR.stream, "ZeroDivisionError: seven")
+        assert [frame.detections.seq for frame in dump.frames] == [0, 1]
+        node.send(*(other.detections(seq) for seq in range(3)))
+        node.tracks(other.stream, 3)
+        state = node.ask(KEYS.query(SENSOR.stream, "reset"), SessionState)
+        assert (state.received, state.frames, state.refused) == (3, 1, 2)
+        node.send(SENSOR.detections(3))
+        assert node.tracks(SENSOR.stream, 2)[-1].seq == 3
 
 
 def test_a_publisher_that_starts_anew_goes_on(start: Callable[..., Any]) -> None:

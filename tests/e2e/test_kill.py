@@ -1,0 +1,102 @@
+"""SIGKILL at random moments while recorded sequences are replayed: nobody can tell afterwards, but for the outage."""
+
+from __future__ import annotations
+
+import os
+import random
+import threading
+import time
+from statistics import median
+from typing import TYPE_CHECKING
+
+import pytest
+from fleet import Fleet
+from optipmb_client import Connection
+from optipmb_client.transport import Inbox
+from real_data import kitti_root
+from recorded import KEYS, Replay, kitti, undisturbed
+
+import optipmb
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+KILLS = int(os.environ.get("OPTIPMB_TEST_KILLS", "3"))
+SEED = int(os.environ.get("OPTIPMB_TEST_SEED", "1"))
+FRAMES = 120
+FEW = 10
+SEQUENCES = ("0000", "0002", "0004", "0011")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled() -> None:
+    optipmb.warm_up()
+
+
+@pytest.mark.timeout(60 + 60 * KILLS)
+def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Fault 1: four recorded streams, SIGKILL in the middle, a new process: state and tracks are those of no kill.
+
+    The tracks of every frame, repetitions set aside, and the digest of the state are byte-equal to those of a session
+    that nothing happened to; every round has a moment of its own.
+    """
+    root = kitti_root()
+    moments = random.Random(SEED)
+    outages: list[float] = []
+    repeated = 0
+    settings = {"profile": "kitti", "cloud_wait_s": 30, "recovery_wait_s": 10, "checkpoint_s": 0.2}
+    with Fleet(tmp_path, **settings) as fleet, Connection(fleet.endpoint) as connection:
+        service = fleet.service("one")
+        for round_ in range(KILLS):
+            recordings = [kitti(root, name, f"round{round_}/kitti/{name}", FRAMES) for name in SEQUENCES]
+            replay = Replay(connection, recordings, pace_s=0.004)
+            inbox = Inbox(100_000)
+            subscriptions = [connection.subscribe(KEYS.tracks(one.stream), inbox) for one in recordings]
+            reader = threading.Thread(target=_read, args=(inbox, replay))
+            reader.start()
+            replay.start()
+            total = FRAMES * len(SEQUENCES)
+            replay.wait(moments.randrange(total // 10, total * 8 // 10), 60.0)
+            time.sleep(moments.uniform(0.0, 0.02))  # a moment in the life of a frame, not a wait for anything
+            service.process.kill()
+            killed = time.monotonic_ns()
+            service.process.wait()
+            service = fleet.service("one", wait=False)
+            replay.finish(60.0)
+            outages.append(_outage(replay, killed))
+            for recording in recordings:
+                tracks, digest = undisturbed(recording, "kitti")
+                result = replay.results[recording.stream]
+                assert [result.tracks[seq] for seq in range(FRAMES)] == [{one} for one in tracks], (round_, SEED)
+                state = replay.state(recording.stream)
+                assert (state.digest, state.frames, state.gaps) == (digest, FRAMES, 0), (round_, SEED)
+                repeated += result.repeated
+            if KILLS > FEW:
+                _tell(capsys, f"kill {round_ + 1} of {KILLS}: outage {outages[-1]:.2f} s")
+            for subscription in subscriptions:
+                subscription.close()
+            inbox.close()
+            reader.join()
+            replay.close()
+        assert service.end()[0] == 0
+    _tell(
+        capsys,
+        f"{KILLS} of {KILLS} kills left no trace (seed {SEED}): {4 * KILLS * FRAMES} frames, "
+        f"{repeated} published again, outage median {median(outages):.2f} s, longest {max(outages):.2f} s",
+    )
+
+
+def _tell(capsys: pytest.CaptureFixture[str], text: str) -> None:
+    with capsys.disabled():
+        print(f"\n{text}", flush=True)  # noqa: T201 - the figures that the test is for
+
+
+def _read(inbox: Inbox, replay: Replay) -> None:
+    while (arrival := inbox.get()) is not None:
+        replay.take(arrival.payload)
+
+
+def _outage(replay: Replay, killed_ns: int) -> float:
+    """Seconds from the kill to the first new tracks after it."""
+    after = [at for result in replay.results.values() for at in result.times_ns if at > killed_ns + 50_000_000]
+    return (min(after) - killed_ns) / 1e9

@@ -1,0 +1,178 @@
+"""Recorded sequences as the messages that a sensor would send, and what an undisturbed session makes of them."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+import time
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from optipmb_client.datasets import open_dataset
+from optipmb_schemas import Detections, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
+from optipmb_service.checkpoint import digest_of
+from optipmb_service.records import Policy, Tracked
+from optipmb_service.session import Session
+from router import plain
+
+import optipmb
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from optipmb_client.transport import Connection
+
+KEYS = Keys()
+WINDOW = 8
+"""Frames under way at most."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One stream's messages: every frame with its cloud, if it has one."""
+
+    stream: str
+    frames: list[tuple[Detections, Points | None]]
+
+
+def kitti(root: Path, name: str, stream: str, frames: int) -> Recording:
+    """The first frames of a KITTI sequence, under a stream and an epoch of its own."""
+    dataset = open_dataset("kitti", root)
+    (sequence,) = dataset.sequences([name])
+    epoch = hashlib.blake2b(stream.encode(), digest_size=16).digest()
+    made: list[tuple[Detections, Points | None]] = []
+    clouds = 0
+    for seq, frame in enumerate(islice(sequence.frames(), frames)):
+        detections = Detections(
+            stream=stream,
+            epoch=epoch,
+            seq=seq,
+            stamp_ns=frame.stamp_ns,
+            frame="sensor",
+            pose=Pose(translation=frame.pose.translation, quaternion=frame.pose.quaternion),
+            labels=frame.labels,
+            label=frame.label,
+            center=frame.center,
+            size=frame.size,
+            yaw=frame.yaw,
+            score=frame.score,
+            velocity=frame.velocity,
+            has_points=frame.cloud is not None,
+        )
+        points = None
+        if frame.cloud is not None:
+            pose = Pose(translation=frame.cloud.translation, quaternion=frame.cloud.quaternion)
+            points = Points(
+                stream=stream,
+                epoch=epoch,
+                seq=clouds,
+                stamp_ns=frame.stamp_ns,
+                frame="sensor",
+                pose=pose,
+                xyz=frame.cloud.xyz,
+            )
+            clouds += 1
+        made.append((detections, points))
+    return Recording(stream, made)
+
+
+def undisturbed(recording: Recording, profile: str, policy: Policy | None = None) -> tuple[list[bytes], str]:
+    """The tracks of every frame, and the digest of the state after the last, of a session that nothing happens to."""
+    session = Session(recording.stream, optipmb.load_profile(profile), policy)
+    outputs = []
+    for detections, points in recording.frames:
+        if points is not None:
+            outputs += session.on_points(points, 0)
+        outputs += session.on_detections(detections, 0)
+    tracks = [plain(output.tracks) for output in outputs if isinstance(output, Tracked)]
+    return tracks, digest_of(session.snapshot())
+
+
+@dataclass
+class Replayed:
+    """What came back of a recording: by frame the distinct tracks, in the order of their revisions."""
+
+    tracks: dict[int, set[bytes]] = field(default_factory=dict)
+    repeated: int = 0
+    times_ns: list[int] = field(default_factory=list)
+
+
+class Replay:
+    """Sends recordings, each on a thread, with at most `WINDOW` frames of each under way; collects their tracks."""
+
+    def __init__(self, connection: Connection, recordings: list[Recording], *, pace_s: float = 0.0) -> None:
+        self._connection = connection
+        self._pace_s = pace_s
+        self.recordings = recordings
+        self.results = {recording.stream: Replayed() for recording in recordings}
+        self.changed = threading.Condition()
+        self.failed: list[str] = []
+        self._senders = []
+        for recording in recordings:
+            detections = connection.cached_sender(
+                KEYS.detections(recording.stream), encoding_of(Detections), cache=len(recording.frames)
+            )
+            points = connection.plain_sender(KEYS.points(recording.stream), encoding_of(Points), cache=16)
+            self._senders.append((detections, points))
+        self._threads = [
+            threading.Thread(target=self._send, args=(recording, *senders), daemon=True)
+            for recording, senders in zip(recordings, self._senders, strict=True)
+        ]
+
+    def take(self, payload: bytes) -> None:
+        """Take in a message of tracks."""
+        tracks = decode(payload, Tracks)
+        if (result := self.results.get(tracks.stream)) is None:
+            return
+        with self.changed:
+            seen = result.tracks.setdefault(tracks.seq, set())
+            result.repeated += bool(seen)
+            if not seen:
+                result.times_ns.append(time.monotonic_ns())
+            seen.add(plain(tracks))
+            self.changed.notify_all()
+
+    def start(self) -> None:
+        """Begin to send."""
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def returned(self) -> int:
+        """Frames whose tracks have come."""
+        return sum(len(result.tracks) for result in self.results.values())
+
+    def wait(self, frames: int, deadline_s: float) -> None:
+        """Wait until the tracks of so many frames have come."""
+        with self.changed:
+            came = self.changed.wait_for(lambda: self.returned >= frames, deadline_s)
+        assert came, f"{self.returned} of {frames} frames came back within {deadline_s:g} s"
+
+    def finish(self, deadline_s: float) -> None:
+        """Wait for all tracks."""
+        self.wait(sum(len(recording.frames) for recording in self.recordings), deadline_s)
+        for thread in self._threads:
+            thread.join(deadline_s)
+
+    def close(self) -> None:
+        """Withdraw the publishers."""
+        for senders in self._senders:
+            for sender in senders:
+                sender.close()
+
+    def state(self, stream: str) -> SessionState:
+        """Ask for the state of a stream."""
+        (answer,) = self._connection.query(KEYS.query(stream, "state"), timeout=5.0)
+        return decode(answer.payload, SessionState)
+
+    def _send(self, recording: Recording, detections: object, points: object) -> None:
+        result = self.results[recording.stream]
+        for number, (frame, cloud) in enumerate(recording.frames):
+            with self.changed:
+                self.changed.wait_for(lambda number=number: number - len(result.tracks) < WINDOW)  # type: ignore[misc]  # bound now
+            if self._pace_s:
+                time.sleep(self._pace_s)  # the rate of a sensor, not a wait for anything
+            if cloud is not None:
+                points.put(encode(cloud))  # type: ignore[attr-defined]  # a sender
+            detections.put(encode(frame))  # type: ignore[attr-defined]  # a sender
