@@ -38,3 +38,7 @@ class ServiceRefused(ClientError):  # noqa: N818  as above
 
 class UsageError(Exception):
     """The caller asked for something that does not exist: a data set, a directory, a class."""
+
+
+class TrackingFailed(ClientError):  # noqa: N818  as above
+    """A frame raised in the tracker; the text says which and what."""

@@ -1,11 +1,14 @@
-"""`optipmb track`: a dataset through the tracker, in this process."""
+"""`optipmb track`: a dataset through the tracker, in this process; or what a service saved when tracking failed."""
 
+import sys
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
-    DatasetName,
     Detections,
     Full,
     Options,
@@ -17,12 +20,16 @@ from optipmb_client.commands.options import (
     print_json,
     say,
 )
+from optipmb_client.datasets import DATASETS
+from optipmb_client.errors import TrackingFailed, UsageError
 from optipmb_client.progress import FrameProgress
 
 
 def track(  # noqa: PLR0913  these are the command's options
     *,
-    dataset: DatasetName,
+    dataset: Annotated[
+        str | None, typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False)
+    ] = None,
     root: Root = None,
     detections: Detections = None,
     sequences: Sequences = None,
@@ -31,12 +38,24 @@ def track(  # noqa: PLR0913  these are the command's options
     profile: Profile = None,
     classes: Classes = None,
     full: Full = False,
+    dump: Annotated[
+        Path | None, typer.Option("--dump", help="What a service saved of a stream when tracking it failed.")
+    ] = None,
+    trace: Annotated[bool, typer.Option("--trace", help="With --dump: also print where the error was raised.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Track a dataset in this process, without a service, and write its result files.
 
     A profile may also be a TOML file here. Replaying the same data through a service gives the same files.
+
+    With --dump, the frames that a service saved are gone through once more instead. Status 1 and one line say which
+    of them raises which error; status 0 that none does any more.
     """
+    if dump is not None:
+        _replay_dump(dump, trace=trace, as_json=as_json)
+        return
+    if dataset is None:
+        raise UsageError("--dataset (or --dump) is missing")
     from optipmb_client import offline  # noqa: PLC0415  loads the tracker and its compiler
 
     opened, chosen = open_sequences(dataset, root, detections, sequences, option)
@@ -56,3 +75,18 @@ def track(  # noqa: PLR0913  these are the command's options
         print_json({"command": "track", "dataset": dataset, "profile": name, "out": out, "sequences": results})
     else:
         say(f"results in {out}")
+
+
+def _replay_dump(file: Path, *, trace: bool, as_json: bool) -> None:
+    from optipmb_client import dumps  # noqa: PLC0415  loads the tracker and its compiler
+
+    result = dumps.replay(dumps.read(file))
+    if as_json:
+        print_json({"command": "track", "dump": file, "result": result})
+    if result.error is None:
+        say(f"{result.stream}: {result.frames} frames without an error; saved was {result.saved}")
+        return
+    if trace:
+        print(result.trace, file=sys.stderr)  # noqa: T201  it was asked for
+    again = "the saved error again" if result.same else f"another error than the saved one ({result.saved})"
+    raise TrackingFailed(f"{result.stream}: frame {result.seq}, stamp {result.stamp_ns} ns: {result.error}: {again}")
