@@ -1,18 +1,19 @@
 """How long a user waits for tracks: `pytest benchmarks/test_service.py -s`, in milliseconds from `put` to arrival.
 
-A service process with its own router on this machine, sensors at 10 Hz with 40 objects each and no clouds, their frames
-spread over the period as independent sensors' are. Time counts from just before `put` in the publisher to the arrival
-of the tracks in a subscriber of the same process; encoding the frame is not in it. Throughput is in frames per
-second, when a window of 8 is kept full, as a replay does.
+A service process with its own router on this machine, sensors at 10 Hz with 40 objects each, their frames spread over
+the period as independent sensors' are; sent by what `optipmb load` is made of. Time counts from just before `put` in
+the publisher to the arrival of the tracks in a subscriber of the same process; encoding the frame is not in it.
+Throughput is in frames per second, when a window of 8 is kept full, as a replay does.
 """
 
 from __future__ import annotations
 
-import time
+import os
 from typing import TYPE_CHECKING
 
 import pytest
-from optipmb_schemas import Tracks, decode
+from optipmb_client import Connection
+from optipmb_client.load import Load, generated, run_load
 from router import Node, Sensor
 from service_process import ServiceProcess
 
@@ -22,66 +23,41 @@ if TYPE_CHECKING:
     from pytest_benchmark.fixture import BenchmarkFixture
 
 OBJECTS = 40
-PERIOD_S = 0.1
-SETTLED = 20
-FRAMES = 150
+RATE = 10.0
+SECONDS = float(os.environ.get("OPTIPMB_BENCHMARK_SECONDS", "8"))
 WINDOW = 8
 ROUNDS = 5
 ROUND = 100
 
 
 @pytest.fixture(scope="module")
-def node() -> Iterator[Node]:
-    """A node beside a service in a process of its own."""
-    with ServiceProcess("--instance", "benchmark") as service:
-        service.wait_ready()
-        with Node(service.endpoint) as one:
-            yield one
+def service() -> Iterator[ServiceProcess]:
+    """A service in a process of its own."""
+    with ServiceProcess("--instance", "benchmark", "--log-level", "warning") as process:
+        process.wait_ready()
+        yield process
 
 
-def percentile(values: list[float], share: float) -> float:
-    """The value that a share of all is not above."""
-    return sorted(values)[min(len(values) - 1, int(share * len(values)))]
+@pytest.fixture
+def node(service: ServiceProcess) -> Iterator[Node]:
+    """A node beside it."""
+    with Node(service.endpoint) as one:
+        yield one
 
 
-@pytest.mark.parametrize("streams", [1, 10])
-def test_latency(benchmark: BenchmarkFixture, node: Node, streams: int) -> None:
-    """Latency of sensors at 10 Hz."""
-    sensors = [Sensor(stream=f"latency/{streams}/{index}", objects=OBJECTS) for index in range(streams)]
-    for sensor in sensors:
-        node.send(sensor.detections(0))
-    messages = [(sensor, seq, sensor.detections(seq)) for seq in range(1, FRAMES) for sensor in sensors]
-    sent: dict[tuple[str, int], int] = {}
-
-    def stream_all() -> None:
-        first = time.monotonic()
-        for number, (sensor, seq, message) in enumerate(messages):
-            pause = first + number * PERIOD_S / streams - time.monotonic()
-            if pause > 0:
-                time.sleep(pause)
-            sent[sensor.stream, seq] = time.monotonic_ns()
-            node.send(message)
-        for sensor in sensors:
-            node.tracks(sensor.stream, FRAMES)
-
-    benchmark.pedantic(stream_all, rounds=1)
-    latencies, steps = [], []
-    for at, (key, payload, _) in zip(node.tracks_seen.times_ns, node.tracks_seen.items, strict=True):
-        stream = node.keys.stream_of(key)
-        if stream.startswith(f"latency/{streams}/"):
-            tracks = decode(payload, Tracks)
-            if tracks.seq >= SETTLED and tracks.delivery is not None:
-                latencies.append((at - sent[stream, tracks.seq]) / 1e6)
-                steps.append(tracks.delivery.step_ms)
-    figures = {
-        "streams": streams,
-        "p50_ms": round(percentile(latencies, 0.5), 3),
-        "p99_ms": round(percentile(latencies, 0.99), 3),
-        "step_p50_ms": round(percentile(steps, 0.5), 3),
-    }
+@pytest.mark.parametrize(("streams", "points"), [(1, 0), (10, 0), (50, 0), (1, 30_000), (10, 30_000)])
+def test_latency(benchmark: BenchmarkFixture, service: ServiceProcess, streams: int, points: int) -> None:
+    """Latency of sensors at 10 Hz, and what of it is spent where."""
+    frames = generated(OBJECTS, points, RATE)
+    with Connection(service.endpoint) as connection:
+        load = Load(streams, RATE, SECONDS)
+        run = benchmark.pedantic(lambda: run_load(connection, load, frames), rounds=1)
+    figures = {name: round(getattr(run, name), 3) for name in ("p50_ms", "p99_ms", "max_ms", "late_p99_ms")}
+    figures |= {f"{stage}_p50_ms": round(value, 3) for stage, value in run.stages_p50_ms.items()}
+    figures |= {"streams": streams, "points": points, "lost": run.lost}
     benchmark.extra_info.update(figures)
     print(figures)  # noqa: T201 - the table of pytest-benchmark does not show what is wanted here
-    assert len(latencies) == streams * (FRAMES - SETTLED)
+    assert run.received > 0
 
 
 class Window:

@@ -32,6 +32,7 @@ SETTLED = 10
 """Frames of a stream whose latency does not count: its session begins with them."""
 
 STRAGGLERS_S = 5.0
+"""After the last frame, how long nothing may come before what has not come counts as lost."""
 CACHE = 50
 EPOCH_NS = 1_600_000_000_000_000_000
 
@@ -172,7 +173,10 @@ def run_load(
         began, cpu = time.monotonic(), time.process_time()
         sending.run(on_frame)
         seconds, cpu = time.monotonic() - began, time.process_time() - cpu
-        arrivals.enough.wait(STRAGGLERS_S)
+        seen = -1
+        while arrivals.received > seen and not arrivals.enough.is_set():
+            seen = arrivals.received
+            arrivals.enough.wait(STRAGGLERS_S)
     return _result(load, frames, sending, arrivals, seconds, cpu)
 
 
