@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 EVENTS: Final = {
     "starting": "The service compiles or loads its kernels; the first start after an installation takes a minute.",
     "connecting": "As a client it waits for a router; nothing else happens until one answers. Check `connect`.",
-    "http": "Health and metrics are served at `address`.",
+    "http": "Health, metrics and the live page are served at `address`.",
     "ready": "Streams and queries are served. stdout has the ready line.",
     "unknown_environment": "Variables that start with `OPTIPMB_` and are no setting: usually a typing error.",
     "peer_connected": "A node, router or service is linked to this process.",
