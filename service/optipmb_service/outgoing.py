@@ -94,6 +94,7 @@ class Outgoing:
             queue_ms=waited_ns / MILLISECOND,
             decode_ms=ticket.decode_ns / MILLISECOND,
             step_ms=tracked.step_ns / MILLISECOND,
+            run=tracked.run,
         )
         self._count_tracks(frozenset(tracked.tracks.id.tolist()))
         self._waiting.append(

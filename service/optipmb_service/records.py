@@ -77,11 +77,13 @@ class Tracked:
         tracks: the message.
         ticket: what the caller gave with the detections.
         step_ns: time that conversion and tracking took.
+        run: how often the session had been taken up again.
     """
 
     tracks: schemas.Tracks
     ticket: Any
     step_ns: int
+    run: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -472,7 +472,7 @@ class Session:
                     outputs.append(self._complain.astray(one.entry, self._policy))
             if one.tracks is not None:
                 self._deliveries.corrected += one.entry.revision > 0
-                outputs.append(Tracked(one.tracks, ticket, step_ns))
+                outputs.append(Tracked(one.tracks, ticket, step_ns, self._run))
         return outputs
 
     def _refuse(self, mark: Mark, decision: Decision) -> list[Output]:
