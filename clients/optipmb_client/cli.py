@@ -15,6 +15,7 @@ from optipmb_client.commands.ablate import ablate
 from optipmb_client.commands.demo import demo
 from optipmb_client.commands.evaluate import evaluate
 from optipmb_client.commands.load import load
+from optipmb_client.commands.move import move
 from optipmb_client.commands.options import MANY
 from optipmb_client.commands.play import play
 from optipmb_client.commands.plot import plot
@@ -41,7 +42,7 @@ _OptionError: Any = typer.BadParameter.__base__
 app = typer.Typer(
     name="optipmb", help="Track objects in 3D: offline, or through a tracking service.", add_completion=False
 )
-for command in (demo, track, replay, record, play, watch, evaluate, tune, ablate, plot, status, load, warm_up):
+for command in (demo, track, replay, record, play, watch, evaluate, tune, ablate, plot, status, load, move, warm_up):
     app.command()(command)
 
 

@@ -7,6 +7,7 @@ from optipmb_schemas import (
     PREFIX,
     Keys,
     MessageError,
+    MoveRequest,
     Problem,
     ResetRequest,
     ServiceStatus,
@@ -20,12 +21,13 @@ from optipmb_schemas import (
 from optipmb_client.errors import ServiceRefused, ServiceUnavailable
 from optipmb_client.transport import Answer, Connection
 
-__all__ = ["close_session", "find_services", "set_parameters"]
+__all__ = ["close_session", "find_services", "move_stream", "set_parameters"]
 
 QUERY_S = 2.0
+MOVE_S = 25.0
 RETRY_S = 0.1
 
-Message = TypeVar("Message", SessionParameters, SessionState, ServiceStatus)
+Message = TypeVar("Message", SessionParameters, SessionState, ServiceStatus, MoveRequest)
 
 
 def set_parameters(
@@ -63,6 +65,21 @@ def close_session(connection: Connection, stream: str, *, prefix: str = PREFIX) 
         return _read(asked, SessionState) if asked else None
     except ServiceRefused:
         return None
+
+
+def move_stream(connection: Connection, instance: str, stream: str, worker: int, *, prefix: str = PREFIX) -> None:
+    """Give a stream to another worker process of an instance.
+
+    Raises:
+        MessageError: The stream's name is none.
+        ServiceUnavailable: No such instance, or it has no worker processes.
+        ServiceRefused: It has no such worker, or the move was not done in time.
+    """
+    request = MoveRequest(stream=stream, worker=worker)
+    asked = connection.query(Keys(prefix).move(instance), encode(request), encoding_of(MoveRequest), timeout=MOVE_S)
+    if not asked:
+        raise ServiceUnavailable(f"no service {instance} with worker processes answers")
+    _read(asked, MoveRequest)
 
 
 def find_services(connection: Connection, *, prefix: str = PREFIX, patience_s: float = 1.0) -> list[ServiceStatus]:

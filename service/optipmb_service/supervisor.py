@@ -247,6 +247,8 @@ def divided(settings: Settings, socket: str) -> tuple[Settings, Settings]:
             "listen": (),
             "connect": (socket,) if router else settings.connect,
             "http": "",
+            # Its name follows from the endpoints, and those of the workers are the parent's own affair.
+            "store": "none" if settings.folder is None else str(settings.folder),
             "zenoh_config": None if router else settings.zenoh_config,
         }
     )

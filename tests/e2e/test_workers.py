@@ -8,7 +8,8 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from optipmb_schemas import Keys, ServiceStatus, Tracks, decode
+from commands import optipmb as optipmb_command
+from optipmb_schemas import Keys, MoveRequest, ServiceStatus, Tracks, decode
 from optipmb_service.records import Tracked
 from optipmb_service.session import Session
 from optipmb_service.share import worker_of
@@ -122,8 +123,41 @@ def test_a_killed_worker_comes_back(service: ServiceProcess) -> None:
         assert pid_of(service, 1) != first
         node.send(sensors[1].detections(1))
         arrived(node, sensors[1].stream, 1)
+        newest = [plain(message) for message in node.tracks(sensors[1].stream, 2) if message.seq == 1]
+        assert newest[-1] == alone(sensors[1], 2)[1]
         shares = workers_of(node.ask(KEYS.status("pair"), ServiceStatus))
         assert all(shares[stream] == worker for worker, stream in VICTIMS.items())
+
+
+def test_a_stream_can_be_moved(service: ServiceProcess) -> None:
+    """A moved stream goes on at the other worker, in the midst of its frames, with the same tracks and none missing."""
+    sensor = Sensor(stream="moves/node/lidar")
+    source = worker_of(sensor.stream, 2)
+    with Node(service.endpoint) as node:
+        node.send(*(sensor.detections(seq) for seq in range(FRAMES)))
+        for number, target in enumerate((1 - source, source), 1):
+            moved = node.ask(KEYS.move("pair"), MoveRequest, MoveRequest(stream=sensor.stream, worker=target))
+            assert moved.worker == target
+            node.send(*(sensor.detections(seq) for seq in range(number * FRAMES, (number + 1) * FRAMES)))
+            status_when(node, lambda status: workers_of(status).get(sensor.stream) == target)  # noqa: B023 - called here
+        received = node.tracks(sensor.stream, 3 * FRAMES)
+        assert [plain(message) for message in received] == alone(sensor, 3 * FRAMES)
+        problem = node.refused(KEYS.move("pair"), MoveRequest(stream=sensor.stream, worker=2))
+        assert (problem.path, problem.received) == ("worker", "2")
+
+
+def test_the_command_moves(service: ServiceProcess) -> None:
+    """`optipmb move` moves, also ahead of the first frame, and says no with status 1 and one line."""
+    stream = "moves/command/lidar"
+    target = 1 - worker_of(stream, 2)
+    assert optipmb_command("move", stream, "--to", target, "--connect", service.endpoint).returncode == 0
+    with Node(service.endpoint) as node:
+        node.send(Sensor(stream=stream).detections(0))
+        node.tracks(stream, 1)
+        assert workers_of(node.ask(KEYS.status("pair"), ServiceStatus))[stream] == target
+    refused = optipmb_command("move", stream, "--to", 7, "--connect", service.endpoint)
+    assert (refused.returncode, refused.stderr.count("\n")) == (1, 1)
+    assert "from 0 to 1" in refused.stderr
 
 
 def test_workers_end_with_their_parent() -> None:
