@@ -108,6 +108,9 @@ def _complain(results: "list[PlayedStream]") -> None:
     for result in results:
         if result.clouds_lost:
             typer.echo(f"optipmb: {result.name}: {result.clouds_lost} clouds are missing in the recording", err=True)
+        if result.other_values:
+            here = f"profile {result.profile} here has other values than what was in force"
+            typer.echo(f"optipmb: {result.name}: {here}", err=True)
         if result.first_difference is not None:
             differ = f"{result.recorded - result.equal} of {result.recorded} frames differ from the recorded ones"
             typer.echo(f"optipmb: {result.name}: {differ}, the first is number {result.first_difference}", err=True)

@@ -36,6 +36,7 @@ class PlayedStream:
         name: The stream in the recording.
         stream: The stream that it was played as.
         profile: Parameters in force.
+        other_values: Whether the profile has other values than when it was recorded; None: the recording does not tell.
         frames: Frames of the recording.
         returned: Frames whose tracks came back.
         clouds: Frames that were played with a cloud.
@@ -52,6 +53,7 @@ class PlayedStream:
     name: str
     stream: str
     profile: str
+    other_values: bool | None
     frames: int
     returned: int
     clouds: int
@@ -157,6 +159,7 @@ class _Player:
         self._put_ns: dict[FrameId, int] = {}
         self._under_way: dict[FrameId, None] = {}
         self._progress = time.monotonic()
+        self._in_force = SessionParameters()
         self._results: dict[FrameId, Tracks] = {}
         self._latencies: list[int] = []
         self._problems: collections.deque[Problem] = collections.deque(maxlen=KEPT_PROBLEMS)
@@ -171,7 +174,9 @@ class _Player:
 
     def __enter__(self) -> Self:
         wanted = SessionParameters(profile=self._profile, cloud_wait_s=CLOUD_WAIT_S)
-        set_parameters(self._connection, self._stream, wanted, prefix=self._prefix, patience_s=self._pace.service_s)
+        self._in_force = set_parameters(
+            self._connection, self._stream, wanted, prefix=self._prefix, patience_s=self._pace.service_s
+        )
         return self
 
     def __exit__(
@@ -228,6 +233,7 @@ class _Player:
             name=one.stream,
             stream=self._stream,
             profile=self._profile,
+            other_values=None if one.parameters is None else one.parameters.values != self._in_force.values,
             frames=len(one.frames),
             returned=len(self._results),
             clouds=len(one.with_cloud),
