@@ -38,8 +38,13 @@ class Recording:
 
 def kitti(root: Path, name: str, stream: str, frames: int) -> Recording:
     """The first frames of a KITTI sequence, under a stream and an epoch of its own."""
-    dataset = open_dataset("kitti", root)
-    (sequence,) = dataset.sequences([name])
+    return recording("kitti", root, None, name, stream, frames)
+
+
+def recording(kind: str, root: Path, detector: str | None, name: str, stream: str, frames: int) -> Recording:
+    """The first frames of a sequence (or of the first one, for `all`), under a stream and an epoch of its own."""
+    dataset = open_dataset(kind, root, detector)
+    sequence = dataset.sequences([name])[0]
     epoch = hashlib.blake2b(stream.encode(), digest_size=16).digest()
     made: list[tuple[Detections, Points | None]] = []
     clouds = 0
