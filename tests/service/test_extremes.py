@@ -1,0 +1,98 @@
+"""Covariances that have lost their rank, weights next to nothing, long silences: finite, repaired, counted, shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from optipmb_service.checkpoint import Checkpoint, decode_checkpoint, encode_checkpoint
+from optipmb_service.session import Session
+from router import Sensor
+from sessions import feed, tracks
+
+import optipmb
+
+NUSCENES = optipmb.load_profile("nuscenes")
+SENSOR = Sensor()
+
+
+def spoiled(checkpoint: Checkpoint, spoil: np.random.Generator, weight: float, scale: float) -> Checkpoint:
+    """The checkpoint with covariances of rank one or two, of any size, and weights next to nothing."""
+    density = checkpoint.head.density
+
+    def covariances(count: int) -> np.ndarray:
+        root = spoil.normal(size=(count, 6, 2)) * scale
+        root[::2, :, 1] = 0.0
+        return root @ root.transpose(0, 2, 1)
+
+    bernoulli, poisson = density.bernoulli, density.poisson
+    bernoulli = replace(
+        bernoulli,
+        covariance=covariances(len(bernoulli)),
+        existence=np.full(len(bernoulli), max(weight, 1e-300)),
+    )
+    poisson = replace(poisson, covariance=covariances(len(poisson)), weight=np.full(len(poisson), weight))
+    moment = replace(checkpoint.head, density=replace(density, bernoulli=bernoulli, poisson=poisson))
+    return replace(checkpoint, base=moment, window=(), head=moment)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    weight=st.sampled_from([1e-300, 1e-200, 1e-30, 0.5, 1.0]),
+    scale=st.sampled_from([1e-160, 1e-8, 1.0, 1e3, 1e6]),
+)
+def test_nothing_in_the_output_is_ever_nan(seed: int, weight: float, scale: float) -> None:
+    """From any such density the next frames are tracked, and all that comes out is finite: the messages check that."""
+    one = Session(SENSOR.stream, NUSCENES)
+    feed(one, range(4), SENSOR, score=np.array([0.9, 0.2, 0.05]))
+    two = Session.restore(spoiled(one.snapshot(), np.random.default_rng(seed), weight, scale), 0)
+    got = tracks(feed(two, range(4, 9), SENSOR))
+    assert (len(got), two.quarantine) == (5, "")
+    for name, column in optipmb.columns_of(two.density).items():
+        assert np.isfinite(column).all(), name
+
+
+def test_repairs_are_counted_and_shown() -> None:
+    """Covariances without rank are repaired, counted in the session's state, and the count survives a checkpoint."""
+    one = Session(SENSOR.stream, NUSCENES)
+    feed(one, range(4), SENSOR)
+    checkpoint = one.snapshot()
+    bernoulli = replace(checkpoint.head.density.bernoulli, covariance=np.zeros((3, 6, 6)))
+    moment = replace(checkpoint.head, density=replace(checkpoint.head.density, bernoulli=bernoulli))
+    two = Session.restore(replace(checkpoint, base=moment, window=(), head=moment), 0)
+    assert two.state().repaired == 0
+    feed(two, [4], SENSOR)
+    assert two.state().repaired > 0
+    three = Session.restore(decode_checkpoint(encode_checkpoint(two.snapshot())), 0)
+    assert three.state().repaired == two.state().repaired
+
+
+def test_tracks_die_of_silence() -> None:
+    """Ten seconds without a frame: tracks of before are gone by time, not by frames, and covariance has grown."""
+    one = Session(SENSOR.stream, NUSCENES)
+    before = tracks(feed(one, range(5), SENSOR))[-1]
+    assert len(before.id) == 3
+    shortly = tracks(feed(one, [10], SENSOR, objects=0))[-1]
+    spread = [np.trace(message.covariance[0]) for message in (before, shortly)]
+    assert spread[1] > spread[0]
+    assert (shortly.existence < before.existence[: len(shortly.id)]).all()
+    after = tracks(feed(one, [110], SENSOR, objects=0))[-1]
+    assert len(after.id) == 0
+
+
+def test_the_wall_clock_has_no_part_in_it() -> None:
+    """What the local clock says, also backwards, changes waiting at most, never tracks."""
+    outputs = []
+    for clock in ([0] * 8, [10**18, 5, 10**15, 0, 3, 2, 1, 10**18]):
+        one = Session(SENSOR.stream, NUSCENES, clock=lambda: 0)
+        outputs.append(
+            [
+                message.model_dump_json()
+                for seq, now_ns in enumerate(clock)
+                for message in tracks(one.on_detections(SENSOR.detections(seq), now_ns))
+            ]
+        )
+    assert outputs[0] == outputs[1]
