@@ -114,19 +114,22 @@ class Board:
         return text
 
     def _instances(self) -> Table:
-        table = _table(("instance", "state", "up"), ("streams", "frames/s", "lost/s", "waiting", "p50 ms", "p99 ms"))
+        table = _table(
+            ("instance", "state", "up"), ("streams", "stands by", "frames/s", "lost/s", "waiting", "p50 ms", "p99 ms")
+        )
         table.add_column("frames/s lately", no_wrap=True)
         for name, seen in sorted(self._seen.items()):
             sessions = seen.status.sessions
             if seen.at_s != self._now_s:
                 gone = f"gone for {duration(self._now_s - seen.at_s)}"
-                table.add_row(name, Text(gone, style=BAD), "", *[""] * 6, Text(_curve(seen.curve), style=QUIET))
+                table.add_row(name, Text(gone, style=BAD), "", *[""] * 7, Text(_curve(seen.curve), style=QUIET))
                 continue
             table.add_row(
                 name,
                 _state(seen.status.state),
                 duration(seen.status.uptime_s),
                 str(len(sessions)),
+                str(seen.status.standby),
                 f"{seen.frames_hz:.1f}",
                 _lost(seen.lost_hz),
                 str(sum(session.queue for session in sessions)),

@@ -6,6 +6,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from optipmb_service import __version__
+from optipmb_service.records import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     import optipmb
+    from optipmb_service.keeper import Keeping
     from optipmb_service.metrics import Value
     from optipmb_service.records import Traffic
 
@@ -42,10 +44,23 @@ def of_totals(counters: Traffic) -> Iterator[Value]:
     yield "dropped_total", ("refused",), counters.refused
     yield "dropped_total", ("shed",), counters.shed
     yield "gaps_total", (), counters.gaps
+    yield "inserted_total", (), counters.inserted
+    yield "corrected_total", (), counters.corrected
     yield "publishers_restarted_total", (), counters.new_epochs
     yield "clouds_total", ("used",), counters.clouds_used
     yield "clouds_total", ("missed",), counters.clouds_missed
     yield "clouds_shed_total", (), counters.clouds_shed
+    yield "clouds_refused_total", (), counters.clouds_refused
+    yield "repaired_total", (), counters.repaired
+
+
+def of_durability(keeper: Keeping, *, owned: int, standing_by: int, now_ns: int) -> Iterator[Value]:
+    """Give what would be lost if the process died now, and what it would take over if another did."""
+    if keeper.whole_ns is not None:
+        yield "checkpoint_age_seconds", (), max(0, now_ns - keeper.whole_ns) / SECOND
+    yield "checkpoints_total", (), keeper.written
+    yield "streams", ("owner",), owned
+    yield "streams", ("standby",), standing_by
 
 
 def of_sessions(sessions: Sequence[schemas.SessionSummary]) -> Iterator[Value]:

@@ -12,6 +12,7 @@ service is `degraded`, and every interval tries again with the newest state.
 from __future__ import annotations
 
 import threading
+import time
 from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
 import structlog
@@ -45,6 +46,14 @@ class Keeping(Protocol):
     def durable(self) -> bool:
         """Whether what is put is there after a restart."""
 
+    @property
+    def written(self) -> int:
+        """Checkpoints written since the start."""
+
+    @property
+    def whole_ns(self) -> int | None:
+        """Monotonic time at which the store last had all that it should; None when nothing is to be kept."""
+
     def start(self, gather: Callable[[], None]) -> None:
         """Begin the rounds; `gather` has every session that changed give its checkpoint to `put`, soon."""
 
@@ -66,9 +75,11 @@ class Nowhere:
     """
 
     durable = False
+    written = 0
 
     def __init__(self, failure: str = "") -> None:
         self.failure = failure
+        self.whole_ns = time.monotonic_ns() if failure else None
 
     def start(self, gather: Callable[[], None]) -> None:
         """Do without rounds."""
@@ -114,6 +125,8 @@ class Keeper:
         """Why the store fails at present; empty while it does not."""
         self.written = 0
         """Checkpoints written since the start."""
+        self.whole_ns = time.monotonic_ns()
+        """When the store last had all that it should, monotonic."""
 
     def start(self, gather: Callable[[], None]) -> None:
         """Begin the rounds."""
@@ -184,6 +197,8 @@ class Keeper:
             log.exception("internal_error", thread="keeper")
         else:
             self.written += len(mine) - len(lost)
+            if mine or not self.failure:
+                self.whole_ns = time.monotonic_ns()
             if mine and self.failure:
                 self.failure = ""
                 log.info("store_back")

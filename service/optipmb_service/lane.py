@@ -412,6 +412,7 @@ class Lane:
             )
             log.info("session_opened", stream=self.stream, profile=session.parameters.name)
         else:
+            self._circle.metrics.restored()
             log.info("session_restored", stream=self.stream, session=session.session, frames=session.counters.frames)
             # Its run has a new number: written soon, so that a crash just now does not give the next run the same one.
             circle.keeper.put(session.snapshot(), lambda: None)

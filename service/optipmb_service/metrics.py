@@ -49,11 +49,23 @@ METRICS: Final = {
         "Frames that came and were not tracked: `duplicate`, `late`, `shed` (queue full), `refused` (not valid).",
     ),
     "gaps_total": Described("counter", (), "Frames that publishers numbered and that never came."),
+    "inserted_total": Described("counter", (), "Late frames that were put in their place."),
+    "corrected_total": Described("counter", (), "Frames whose tracks were published again because of them."),
     "problems_total": Described("counter", ("code",), "Problems by code, each with all that it stands for."),
     "publishers_restarted_total": Described("counter", (), "New epochs of publishers."),
     "clouds_total": Described("counter", ("result",), "Frames that were tracked with their cloud, or waited in vain."),
     "clouds_shed_total": Described("counter", (), "Point clouds dropped because the queue was full."),
+    "clouds_refused_total": Described("counter", (), "Point clouds that were not valid."),
+    "repaired_total": Described("counter", (), "Covariances that lost rank in rounding and were repaired."),
     "sessions": Described("gauge", ("state",), "Sessions, by state."),
+    "streams": Described(
+        "gauge", ("role",), "Streams that this instance tracks (`owner`) or stands by for (`standby`)."
+    ),
+    "sessions_restored_total": Described("counter", (), "Sessions that went on from a checkpoint."),
+    "checkpoints_total": Described("counter", (), "Checkpoints written."),
+    "checkpoint_age_seconds": Described(
+        "gauge", (), "Time since the store had all that it should: what a crash now would have to recover."
+    ),
     "queue_frames": Described("gauge", (), "Frames waiting, over all streams."),
     "oldest_data_seconds": Described("gauge", (), "Time since the last frame of the stream that is silent longest."),
     "tracks": Described("gauge", (), "Tracks in the newest frames of all streams."),
@@ -95,6 +107,7 @@ class Metrics:
         self._bytes = self._counter("received_bytes_total")
         self._started = self._counter("tracks_started_total")
         self._ended = self._counter("tracks_ended_total")
+        self._restored = self._counter("sessions_restored_total")
         ProcessCollector(registry=self._registry)
 
     def received(self, topic: str, size: int) -> None:
@@ -113,6 +126,10 @@ class Metrics:
         """Count ids that came and went."""
         self._started.inc(started)
         self._ended.inc(ended)
+
+    def restored(self) -> None:
+        """Count a session that went on from its checkpoint."""
+        self._restored.inc()
 
     def add(self, figures: Callable[[], Iterable[Value]]) -> None:
         """Have figures read whenever somebody asks."""

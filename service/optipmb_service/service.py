@@ -187,6 +187,9 @@ class Service:
         densities = [session.density for lane in self._registry.lanes() if (session := lane.session) is not None]
         yield from figures.of_problems(self._desk.counts())
         yield from figures.of_totals(self._registry.totals())
+        yield from figures.of_durability(
+            self._keeper, owned=len(sessions), standing_by=self._registry.standing_by, now_ns=time.monotonic_ns()
+        )
         yield from figures.of_sessions(sessions)
         yield from figures.of_densities(densities)
         yield from figures.of_streams(sessions, self._settings.http_streams)

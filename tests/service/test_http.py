@@ -28,6 +28,7 @@ from starlette.routing import Route
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from starlette.requests import Request
 
@@ -172,10 +173,11 @@ def test_a_service_tells_how_it_is_from_its_start_to_its_end() -> None:
         assert "Traceback" not in service.errors
 
 
-def test_metrics_count_what_happened() -> None:
+def test_metrics_count_what_happened(tmp_path: Path) -> None:
     """Every metric of the list is there, in Prometheus' format, with the figures of what was sent; also over Zenoh."""
     options = ("--http", "127.0.0.1:0", "--log-format", "json", "--instance", "one")
-    with ServiceProcess(*options) as service:
+    environment = {"OPTIPMB_STORE": str(tmp_path), "OPTIPMB_CHECKPOINT_S": "0.1"}
+    with ServiceProcess(*options, environment=environment) as service:
         address = address_of(service)
         service.wait_ready()
         with Node(service.endpoint) as node:
@@ -184,6 +186,7 @@ def test_metrics_count_what_happened() -> None:
             node.send_raw(KEYS.detections(SENSOR.stream), b"garbage")
             node.tracks(SENSOR.stream, 6)
             node.problem(SENSOR.stream, "malformed")
+            until(lambda: samples(get(address, "/metrics")[1])[f"{NAMESPACE}checkpoints_total", ()] > 0, "a checkpoint")
             figures = samples(get(address, "/metrics")[1])
             ((ok, key, asked),) = node.query(KEYS.metrics("one"))
             status = node.ask(KEYS.status("one"), ServiceStatus)
@@ -198,6 +201,9 @@ def test_metrics_count_what_happened() -> None:
             ("dropped_total", (("reason", "late"),)): 0,
             ("problems_total", (("code", "malformed"),)): 1,
             ("sessions", (("state", "running"),)): 1,
+            ("streams", (("role", "owner"),)): 1,
+            ("streams", (("role", "standby"),)): 0,
+            ("sessions_restored_total", ()): 0,
             ("tracks", ()): status.sessions[0].tracks,
             ("latency_seconds_count", ()): 6,
             ("step_seconds_count", ()): 6,
@@ -209,6 +215,7 @@ def test_metrics_count_what_happened() -> None:
         assert {key: figures[NAMESPACE + key[0], key[1]] for key in expected} == expected
         started, ended = (figures[f"{NAMESPACE}tracks_{what}_total", ()] for what in ("started", "ended"))
         assert started - ended == figures[f"{NAMESPACE}tracks", ()] > 0
+        assert 0 <= figures[f"{NAMESPACE}checkpoint_age_seconds", ()] < 10
         assert figures["process_resident_memory_bytes", ()] > 1e7
         assert (ok, key) == (True, KEYS.metrics("one"))
         same = samples(asked.decode())
