@@ -201,6 +201,20 @@ def test_what_is_no_recording_is_refused_with_its_name(tmp_path: Path) -> None:
             list(RecordingFile(path))
 
 
+def test_a_bit_that_turned_is_found(tmp_path: Path) -> None:
+    """Noise does not compress, so only the checksum tells that a value in the middle of a cloud is another one."""
+    path = tmp_path / "a.mcap"
+    noise = np.random.default_rng(1).normal(size=(20_000, 3)).astype(np.float32)
+    with RecordingWriter(path) as writer:
+        put(writer, points(0, 0).model_copy(update={"xyz": noise}), 1)
+        middle = writer.flush() // 2
+    content = bytearray(path.read_bytes())
+    content[middle] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DatasetError, match="damaged"):
+        list(RecordingFile(path))
+
+
 def test_a_recording_is_never_written_over(tmp_path: Path) -> None:
     """A second recording of the same name is refused, the first one stays."""
     path = tmp_path / "a.mcap"
