@@ -296,10 +296,12 @@ class Lane:
             if isinstance(output, Tracked):
                 self._out.send(output)
             elif isinstance(output, Begun):
+                epoch = self.session.state().epoch if self.session else None
                 log.info(
                     "session_begun",
                     stream=self.stream,
                     session=output.session,
+                    epoch=epoch.hex() if epoch else "",
                     reason=output.reason,
                     profile=self.session.parameters.name if self.session else "",
                     jump_s=output.jump_ns / 1e9,
