@@ -20,7 +20,7 @@ DPI = 110
 
 def scaling(found: dict[str, Any], path: Path) -> None:
     """Time of a step against the number of objects, beside the bare arithmetic and other trackers."""
-    figure = Figure(figsize=(7.5, 4.8), layout="constrained")
+    figure = Figure(figsize=(7.5, 5.4), layout="constrained")
     axes = figure.add_subplot()
     step, floor = found["dense"]["step"], found["dense"]["bare"]
     sizes = list(step)
@@ -39,7 +39,7 @@ def scaling(found: dict[str, Any], path: Path) -> None:
     axes.set_xlabel("objects in the dense scene")
     axes.set_ylabel("time per frame, ms")
     axes.grid(visible=True, alpha=0.3)
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(path, dpi=DPI)
 
 

@@ -87,11 +87,30 @@ def adaptive_births(measurements: Measurements, hypotheses: Hypotheses, table: C
     Returns:
         (K,) measurements, and (K,) weights; a zero weight makes no component.
     """
-    low = (hypotheses.first_kind == CLUTTER).nonzero()[0]
-    if not low.shape[0]:
-        return low, np.empty(0)
-    weight = table.adaptive_birth_rate[measurements.label[low]] * (1.0 - hypotheses.association[low])
-    return low[weight > 0.0], weight[weight > 0.0]
+    rows, weight = np.empty(len(measurements), np.int64), np.empty(len(measurements))
+    count = select_births(
+        hypotheses.first_kind,
+        hypotheses.association,
+        measurements.label,
+        table.adaptive_birth_rate,
+        rows,
+        weight,
+    )
+    return rows[:count], weight[:count]
+
+
+@kernel
+def select_births(
+    first_kind: Index, association: Array, label: Index, birth_rate: Array, rows: Index, weight: Array
+) -> int:
+    """Write the measurements of lambda_b and their weights; return how many they are."""
+    count = 0
+    for m in range(first_kind.shape[0]):
+        born = birth_rate[label[m]] * (1.0 - association[m])
+        if first_kind[m] == CLUTTER and born > 0.0:
+            rows[count], weight[count] = m, born
+            count += 1
+    return count
 
 
 def measurement_births(measurements: Measurements, table: ClassTable) -> tuple[Index, Array]:

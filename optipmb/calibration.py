@@ -48,7 +48,7 @@ def log_odds(score: float) -> float:
 def calibrated(bernoulli: Bernoullis, rows: Index, table: ClassTable) -> tuple[Array, Array, Array]:
     """Return existence (K,), score (K,) and covariance (K, 6, 6) of the objects in `rows`, as they are told."""
     existence, score, covariance = bernoulli.existence[rows], bernoulli.score[rows], bernoulli.covariance[rows]
-    if table.knots.any():
+    if table.calibrated:
         calibrate_rows(
             rows,
             bernoulli.label,

@@ -7,7 +7,8 @@ service may run many streams side by side without threads inside a frame. Divisi
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numba
 
@@ -19,6 +20,21 @@ else:
     F = TypeVar("F")
 
 
+def _sources() -> tuple[tuple[str, int, int], ...]:
+    """Name, time of change and size of every module of the package."""
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    return tuple((file.name, file.stat().st_mtime_ns, file.stat().st_size) for file in files)
+
+
+_SOURCES: Final = _sources()
+
+
 def kernel(function: F) -> F:
-    """Compile `function` with numba at its first call; later processes load the machine code from beside the source."""
-    return cast("F", numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    """Compile `function` with numba at its first call; later processes load the machine code from beside the source.
+
+    Kernels have others compiled into them, and constants, from other modules. Numba takes code from its cache while the
+    file of the kernel itself is as it was; here it does while the whole package is.
+    """
+    compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    compiled._cache._cache_file._source_stamp = _SOURCES  # noqa: SLF001 - numba has no public name for it
+    return cast("F", compiled)

@@ -7,6 +7,7 @@ coordinates to the world.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -51,9 +52,13 @@ class Pose:
     def __post_init__(self) -> None:
         translation = _shaped("pose.translation", self.translation, (3,))
         quaternion = _shaped("pose.quaternion", self.quaternion, (4,))
-        _bounded("pose.translation", translation, MAX_COORDINATE)
-        _bounded("pose.quaternion", quaternion, 2.0)
-        norm = float(np.sqrt(np.sum(quaternion * quaternion)))
+        # A few numbers are looked at one by one faster than as an array; the arrays are for naming what is wrong.
+        w, x, y, z = quaternion.tolist()
+        if not all(abs(value) <= MAX_COORDINATE for value in translation.tolist()):
+            _bounded("pose.translation", translation, MAX_COORDINATE)
+        if not all(abs(value) <= 2.0 for value in (w, x, y, z)):  # noqa: PLR2004 - no unit quaternion is near
+            _bounded("pose.quaternion", quaternion, 2.0)
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
         if abs(norm - 1.0) > UNIT_TOLERANCE:
             raise FrameError("pose.quaternion", "a unit quaternion (w, x, y, z)", f"norm {norm:.6g}")
         object.__setattr__(self, "translation", translation)
@@ -62,7 +67,7 @@ class Pose:
     @cached_property
     def rotation(self) -> NDArray[np.float64]:
         """Rotation matrix (3, 3) of the quaternion."""
-        w, x, y, z = (float(value) for value in self.quaternion)
+        w, x, y, z = self.quaternion.tolist()
         return np.array(
             [
                 [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -177,7 +182,9 @@ def make_frame(
     if pose is not None:
         rotation = pose.rotation
         center = center @ rotation.T + pose.translation
-        heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) @ rotation[:2, :2].T
+        heading = np.empty((m, 2))
+        heading[:, 0], heading[:, 1] = np.cos(yaw), np.sin(yaw)
+        heading = heading @ rotation[:2, :2].T
         yaw = np.arctan2(heading[:, 1], heading[:, 0])
         velocity = velocity @ rotation[:2, :2].T
 

@@ -168,6 +168,8 @@ def surviving_components(
         (K,) rows that stay, and (K,) their weights.
     """
     kept, weight = np.empty(len(poisson), np.int64), np.empty(len(poisson))
+    if not len(poisson):
+        return kept, weight
     count = select_components(
         poisson.weight,
         p_d,

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from optipmb.association import UNASSIGNED, gain_matrix
-from optipmb.birth import announced_states
+from optipmb.birth import announced_states, fill_components, select_births
+from optipmb.calibration import SURE
 from optipmb.density import whole_periods
 from optipmb.extract import read_tracks, select_tracks
 from optipmb.geometry import box_iou, iou_exceeds
@@ -235,7 +236,7 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     np.testing.assert_allclose(out[5], np.where(hit, confidence, 0.0), rtol=1e-15)
     np.testing.assert_array_equal(flags, [*extracted[row[old]], False, False])
     with np.errstate(divide="ignore"):
-        latest = np.where(hit, np.clip(np.log(score[m] / (1 - score[m])), -7, 7), -missed[out[0]])
+        latest = np.where(hit, np.clip(np.log(score[m] / (1 - score[m])), -SURE, SURE), -missed[out[0]])
     kept = memory[out[0]] ** np.where(birth == NOW, 1.0, 1.5)
     np.testing.assert_allclose(weighed, kept * [*evidence[row[old]], 0, 0] + (1 - kept) * latest, rtol=1e-12)
 
@@ -299,3 +300,33 @@ def test_announced_objects_are_matched_mixtures(seed: int) -> None:
         moment_match(np.array([0, members.size]), weight / weight.sum(), parts, spreads, one, one_spread)
         np.testing.assert_allclose(out[k], one[0], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(spread[k], one_spread[0], rtol=1e-12, atol=1e-12)
+
+
+@SEEDS
+def test_low_scores_are_born_with_what_association_leaves(seed: int) -> None:
+    """Clutter makes components of weight mu_ab (1 - p_a), unless that is zero."""
+    rng = np.random.default_rng(seed)
+    kind, association = rng.choice([FROM_POISSON, CLUTTER, NEWBORN], 20), rng.choice([0.0, 0.3, 1.0], 20)
+    label, rate = rng.integers(0, 2, 20), np.array([0.5, 2.0])
+    rows, weight = np.empty(20, np.int64), np.empty(20)
+    count = select_births(kind, association, label, rate, rows, weight)
+    wanted = np.flatnonzero((kind == CLUTTER) & (association < 1))
+    np.testing.assert_array_equal(rows[:count], wanted)
+    np.testing.assert_array_equal(weight[:count], rate[label[wanted]] * (1 - association[wanted]))
+
+
+@SEEDS
+def test_components_that_stay_and_those_that_are_born_stand_in_order(seed: int) -> None:
+    """First the columns of the rows that stay, then box, class and stamp of the measurements."""
+    rng = np.random.default_rng(seed)
+    mean, covariance, label = rng.normal(0, 1, (8, 6)), rng.normal(0, 1, (8, 6, 6)), rng.integers(0, 3, 8)
+    auxiliary, born, kept, rows = rng.normal(0, 1, (8, 4)), stamps(rng, 8), np.array([1, 5]), np.array([2, 0, 3])
+    measured, boxes = rng.integers(0, 3, 4), rng.normal(0, 1, (4, 4))
+    out = np.zeros((5, 6)), np.zeros((5, 6, 6)), np.empty(5, np.int64), np.empty((5, 4)), np.empty(5, np.int64)
+    fill_components(kept, mean, covariance, label, auxiliary, born, rows, measured, boxes, NOW, *out)
+    np.testing.assert_array_equal(out[0][:2], mean[kept])
+    np.testing.assert_array_equal(out[1][:2], covariance[kept])
+    assert not out[0][2:].any()
+    np.testing.assert_array_equal(out[2], [*label[kept], *measured[rows]])
+    np.testing.assert_array_equal(out[3], [*auxiliary[kept], *boxes[rows]])
+    np.testing.assert_array_equal(out[4], [*born[kept], NOW, NOW, NOW])
