@@ -12,7 +12,7 @@ state: `state_bytes` leaves it out, so that two sessions that took the same fram
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
@@ -51,12 +51,14 @@ class Recorded:
         points: its cloud.
         missed: whether it waited for a cloud in vain.
         revision: of the tracks that were published last for it.
+        packed: both as bytes, as soon as they were made.
     """
 
     message: schemas.Detections
     points: schemas.Points | None
     missed: bool
     revision: int
+    packed: dict[str, bytes] = field(default_factory=dict, compare=False)
 
     @property
     def mark(self) -> Mark:
@@ -170,8 +172,8 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
         "base": _moment(checkpoint.base),
         "window": [
             {
-                "detections": schemas.encode(one.message),
-                "points": None if one.points is None else schemas.encode(one.points),
+                "detections": _packed(one, "detections", one.message),
+                "points": None if one.points is None else _packed(one, "points", one.points),
                 "missed": one.missed,
                 "revision": one.revision,
             }
@@ -183,6 +185,13 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
         "newest_cloud_ns": checkpoint.newest_cloud_ns,
         "run": checkpoint.run,
     }
+
+
+def _packed(one: Recorded, name: str, message: schemas.Message) -> bytes:
+    packed = one.packed.get(name)
+    if packed is None:
+        packed = one.packed[name] = schemas.encode(message)
+    return packed
 
 
 def _mask(mask: int) -> bytes:

@@ -91,7 +91,7 @@ class History:
             publishers: whether detections came in an epoch; see `Clouds.get`.
         """
         return [
-            replace(one, points=points, missed=False, weight=one.weight + points.xyz.nbytes)
+            replace(one, points=points, missed=False, weight=one.weight + points.xyz.nbytes, packed={})
             if one.mark.stamp_ns == points.stamp_ns
             and one.points is None
             and one.message.has_points is not False

@@ -104,6 +104,7 @@ class Entry:
         frame: the detections as the tracker reads them, without the cloud.
         ignored: how many were left out because the profile lacks their class.
         weight: bytes that its inputs take, nearly.
+        packed: its messages as bytes, once a checkpoint has made them: they are in one checkpoint after the other.
     """
 
     mark: Mark
@@ -115,6 +116,7 @@ class Entry:
     frame: optipmb.Frame
     ignored: int
     weight: int
+    packed: dict[str, bytes] = field(default_factory=dict, compare=False)
 
     @property
     def order(self) -> tuple[int, int, int]:

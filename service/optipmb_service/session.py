@@ -258,7 +258,7 @@ class Session:
             quarantine=self._quarantine,
             epochs=self._done.epochs,
             base=base,
-            window=tuple(Recorded(one.message, one.points, one.missed, one.revision) for one in entries),
+            window=tuple(Recorded(one.message, one.points, one.missed, one.revision, one.packed) for one in entries),
             head=self._history.head,
             deliveries=replace(self._deliveries),
             newest_cloud_ns=self._clouds.newest_ns,
