@@ -6,7 +6,7 @@ bin=$1
 endpoint=${ENDPOINT:-tcp/127.0.0.1:7497}
 seconds=${SECONDS_EACH:-30}
 folder=$(mktemp -d)
-"$bin/optipmb-service" --listen "$endpoint" --instance load --log-level warning ${SERVICE:-} >"$folder/out" &
+OPTIPMB_STORE="$folder/store" "$bin/optipmb-service" --listen "$endpoint" --instance load --log-level warning ${SERVICE:-} >"$folder/out" &
 service=$!
 trap 'kill $service 2>/dev/null; wait $service || true; rm -rf "$folder"' EXIT INT TERM
 until grep -q ready "$folder/out"; do kill -0 $service; sleep 0.2; done
