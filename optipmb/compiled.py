@@ -7,6 +7,7 @@ service may run many streams side by side without threads inside a frame. Divisi
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
@@ -20,13 +21,15 @@ else:
     F = TypeVar("F")
 
 
-def _sources() -> tuple[tuple[str, int, int], ...]:
-    """Name, time of change and size of every module of the package."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
-    return tuple((file.name, file.stat().st_mtime_ns, file.stat().st_size) for file in files)
+def _digest() -> str:
+    """Digest of the source of the whole package; times of files would change when an image is packed."""
+    digest = hashlib.blake2b(digest_size=16)
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
 
 
-_SOURCES: Final = _sources()
+_SOURCES: Final = _digest()
 
 
 def kernel(function: F) -> F:

@@ -14,8 +14,8 @@ import optipmb
 FOLDER = Path(optipmb.__file__).parent
 MODULES = {path.stem: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(FOLDER.glob("*.py"))}
 ALLOWED = {
-    "__future__", "collections", "dataclasses", "functools", "importlib", "math", "numba", "numpy", "operator",
-    "optipmb", "pathlib", "pydantic", "scipy", "tomllib", "typing",
+    "__future__", "collections", "dataclasses", "functools", "hashlib", "importlib", "math", "numba", "numpy",
+    "operator", "optipmb", "pathlib", "pydantic", "scipy", "tomllib", "typing",
 }  # fmt: skip
 TOUCHES_FILES = {"compiled", "parameters", "prepared"}
 DOES_IO = {"open", "print", "input", "exec", "eval", "__import__"}
