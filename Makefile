@@ -11,6 +11,8 @@ help:
 	@echo "make figures measure the tracker's figures of docs/performance.md, beside other trackers, and write the page"
 	@echo "make load    measure what the service carries on this machine, as docs/performance.md has it"
 	@echo "make stack   run the compose file's stack as processes and show that it works (needs Debian's prometheus)"
+	@echo "make tune    make the tuned profiles anew from DATA=... (out/tune-*/tuned.toml) and compare them with those that ship"
+	@echo "make ablate  print the tables of docs/ablation.md anew from DATA=..."
 	@echo "make clean   remove the virtual environment and everything generated"
 
 # The stamp is newer than what it was made from, so a second call installs nothing.
@@ -74,6 +76,18 @@ $(PEERS)/.installed:
 figures: install $(PEERS)/.installed
 	mkdir -p out
 	$(BIN)/python benchmarks/figures.py --peers $(PEERS)/bin/python --json out/figures.json --docs
+
+tune: install
+	$(BIN)/optipmb tune $(NUSCENES) --profile nuscenes --name nuscenes --classes car pedestrian --metric both \
+		--folds 0 --trials 1 --out out/tune-nuscenes
+	$(BIN)/optipmb tune $(KITTI) --profile kitti-paper --name kitti --trials 4 --fold-trials 1 --jobs 2 \
+		--out out/tune-kitti
+	cmp out/tune-nuscenes/tuned.toml optipmb/profiles/nuscenes.toml
+	cmp out/tune-kitti/tuned.toml optipmb/profiles/kitti.toml
+
+ablate: install
+	$(BIN)/optipmb ablate $(KITTI) --markdown
+	$(BIN)/optipmb ablate $(NUSCENES) --markdown
 
 clean:
 	rm -rf $(VENV) out build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

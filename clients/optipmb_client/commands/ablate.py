@@ -1,7 +1,8 @@
 """`optipmb ablate`: what each module of the tracker is worth on a dataset."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+import typer
 from rich.table import Table
 
 from optipmb_client.commands.options import (
@@ -16,6 +17,7 @@ from optipmb_client.commands.options import (
     open_sequences,
     print_json,
     print_table,
+    say,
 )
 from optipmb_client.progress import FrameProgress
 
@@ -25,10 +27,10 @@ if TYPE_CHECKING:
     from optipmb_client.tuning import Figures, Row
 
 MODULES = ("adp", "habm", "rpp", "ote")
-SHOWN = ("AMOTA", "AMOTP", "FN", "FP", "IDS", "sAMOTA", "MOTA", "MOTP", "HOTA")
+SHOWN = ("AMOTA", "AMOTP", "FN", "FP", "IDS", "sAMOTA", "MOTA", "MOTP", "HOTA", "HOTA, all")
 
 
-def ablate(
+def ablate(  # noqa: PLR0913  these are the command's options
     *,
     dataset: DatasetName,
     root: Root = None,
@@ -37,6 +39,7 @@ def ablate(
     option: Options = None,
     profile: Profile = None,
     classes: Classes = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Track a dataset with every choice of the four modules on and off: the sixteen rows of the paper's ablation.
@@ -69,10 +72,31 @@ def ablate(
             }
         )
         return
-    for label in source.classes:
-        print_table(_table(label, rows, [row.classes[label] for row in rows]))
+    tables = [(label, [row.classes[label] for row in rows]) for label in source.classes]
     if len(source.classes) > 1:
-        print_table(_table("all classes", rows, [row.overall for row in rows]))
+        tables.append(("all classes", [row.overall for row in rows]))
+    for title, figures in tables:
+        if markdown:
+            say(_markdown(title, rows, figures))
+        else:
+            print_table(_table(title, rows, figures))
+
+
+def _cells(row: "Row", figures: "Figures") -> list[str]:
+    values = figures.to_json()
+    return [
+        *("x" if getattr(row.modules, module) else "" for module in MODULES),
+        *(_shown(values[name]) for name in SHOWN),
+        f"{row.frames_per_second:.0f}",
+    ]
+
+
+def _markdown(title: str, rows: "Many[Row]", figures: "Many[Figures]") -> str:
+    names = (*(module.upper() for module in MODULES), *SHOWN, "FPS")
+    lines = [f"{title}:", "", "| " + " | ".join(names) + " |"]
+    lines.append("|" + " --- |" * len(MODULES) + " ---: |" * (len(names) - len(MODULES)))
+    lines += ["| " + " | ".join(_cells(row, one)) + " |" for row, one in zip(rows, figures, strict=True)]
+    return "\n".join([*lines, ""])
 
 
 def _table(title: str, rows: "Many[Row]", figures: "Many[Figures]") -> Table:
@@ -80,12 +104,7 @@ def _table(title: str, rows: "Many[Row]", figures: "Many[Figures]") -> Table:
     for name in (*(module.upper() for module in MODULES), *SHOWN, "FPS"):
         table.add_column(name, justify="right", no_wrap=True)
     for row, one in zip(rows, figures, strict=True):
-        values = one.to_json()
-        table.add_row(
-            *("x" if getattr(row.modules, module) else "" for module in MODULES),
-            *(_shown(values[name]) for name in SHOWN),
-            f"{row.frames_per_second:.0f}",
-        )
+        table.add_row(*_cells(row, one))
     return table
 
 

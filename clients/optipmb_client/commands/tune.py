@@ -166,9 +166,9 @@ def _calibration(refined: "Refined") -> str:
     told = "  ".join(
         f"{one.predicted:.2f} -> {one.observed:.2f} ({one.count})" for one in found.deciles if one.count >= LEAST_SHOWN
     )
-    whose = "left out" if refined.folds else "that chose the calibration"
+    whose = "each with the calibration of the others" if len(refined.sequences) > 1 else "that gave the calibration"
     return (
-        f"sequences {whose}: NEES {found.mean:.2f} ({low:.2f} to {high:.2f}, objects being independent), "
+        f"sequences, {whose}: NEES {found.mean:.2f} ({low:.2f} to {high:.2f}, objects being independent), "
         f"{100.0 * found.coverage:.1f} % of errors in the 95 % ellipse; existence told -> true: {told}"
     )
 

@@ -30,7 +30,7 @@ from optipmb_client.tuning.material import Clip, track_fully
 from optipmb_client.tuning.scoring import Scorer
 from optipmb_client.tuning.values import rounded, with_calibration
 
-__all__ = ["calibrate", "judge_calibration"]
+__all__ = ["calibrate", "cross_calibration", "judge_calibration"]
 
 MEMORIES = (0.3, 0.5, 0.7, 0.8)
 """Tried for the weight that evidence keeps over a nominal period."""
@@ -100,6 +100,26 @@ def judge_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Paramet
     for clip in clips:
         tracks, full = _tracked(clip, scorer, parameters)
         parts.append(calibration(clip.world, tracks, full, scorer.name, scorer.near))
+    return reduce(add, parts)
+
+
+def cross_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters) -> CalibrationResult:
+    """Return how well tracks know themselves where each sequence has the calibration that the others give.
+
+    The parameters are those found on all sequences, and so is the memory. With one sequence, or without a calibration,
+    the tracks are judged as they are.
+    """
+    told = parameters.classes[scorer.name].calibration
+    if told is None or len(clips) == 1:
+        return judge_calibration(clips, scorer, parameters)
+    rows = [_rows(clip, scorer, parameters, told.memory) for clip in clips]
+    parts = []
+    for i, clip in enumerate(clips):
+        rest = [one for j, one in enumerate(rows) if j != i]
+        everything = reduce(add, rest)
+        if everything.true.sum() >= LEAST_MATCHED:
+            found = _fitted(everything, told.memory, _widening(rest))
+            parts.append(judge_calibration([clip], scorer, with_calibration(parameters, scorer.name, found)))
     return reduce(add, parts)
 
 

@@ -124,7 +124,7 @@ def tune_all(
     scope = "all parameters" if plan.everything else "noise, birth spread, area, forgetting"
     judged = f"{plan.folds} groups left out in turn" if any(one.folds for one in results.values()) else "none left out"
     provenance = (
-        f"{_from(parameters)}\n{_by('tune')}: {source.title}; classes {' '.join(source.classes)}; {scope}; metric"
+        f"{_from(parameters, name)}\n{_by('tune')}: {source.title}; classes {' '.join(source.classes)}; {scope}; metric"
         f" {plan.metric}; {plan.trials} trials; {judged}, {plan.fold_trials} trials each; detections plain and in"
         f" {plan.copies} degraded copies; seed {plan.seed}."
     )
@@ -149,8 +149,12 @@ def _named(parameters: Parameters, what: str) -> str:
     return parameters.name if parameters.name.endswith(what) else f"{parameters.name}-{what}"
 
 
-def _from(parameters: Parameters) -> str:
-    return f"{parameters.provenance or 'No provenance.'} (profile {parameters.name})"
+def _from(parameters: Parameters, name: str | None = None) -> str:
+    """Return where the values came from that it began with; a profile that is tuned again loses the last time."""
+    before = parameters.provenance or "No provenance."
+    if parameters.name == name:
+        return "\n".join(line for line in before.strip().split("\n") if not line.startswith("optipmb "))
+    return f"{before} (profile {parameters.name})"
 
 
 def _by(step: str) -> str:

@@ -158,13 +158,19 @@ class Search:
         rng: np.random.Generator,
         score: Callable[[Mapping[str, Value]], float],
     ) -> Outcome:
-        if values:
-            self._memory.enqueue_trial(values)
+        if values:  # TPE is not asked: it models all trials so far, which takes longer than most trials do
+            found = score(values)
+            moved = self._optuna.trial.create_trial(
+                params=values, distributions=self._distributions, value=found, user_attrs={"values": json.dumps(values)}
+            )
+            self._memory.add_trial(moved)
+            self._study.add_trial(moved)
+            return Outcome(number, values, found)
         self._memory.sampler = self._optuna.samplers.TPESampler(
             seed=int(rng.integers(2**31)), n_startup_trials=_WARMUP, multivariate=True
         )
         trial = self._memory.ask(self._distributions)
-        chosen = values or {one.path: one.value(trial.params[one.path]) for one in self._space}
+        chosen = {one.path: one.value(trial.params[one.path]) for one in self._space}
         trial.set_user_attr("values", json.dumps(chosen))
         found = score(chosen)
         self._study.add_trial(self._memory.tell(trial, found))

@@ -8,9 +8,7 @@ sequences. Both are kept in one file; an interrupted session goes on where it wa
 import math
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import reduce
-from operator import add
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,7 @@ import numpy as np
 
 from optipmb import Parameters
 from optipmb_client.evaluation.calibration import CalibrationResult
-from optipmb_client.tuning.calibrate import calibrate, judge_calibration
+from optipmb_client.tuning.calibrate import calibrate, cross_calibration
 from optipmb_client.tuning.caution import Jury
 from optipmb_client.tuning.degrade import Degradation, degrade
 from optipmb_client.tuning.estimate import estimate
@@ -71,8 +69,6 @@ class FoldResult:
     after: tuple[Figures, ...]
     value_before: float
     value_after: float
-    calibration: CalibrationResult
-    """Of the tracks with what was found."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +92,7 @@ class Refined:
     value_after: float
     value_crossed: float | None
     calibration: CalibrationResult
-    """Of all sequences, each with what was found without it; without folds, with what they chose."""
+    """Of all sequences, each with the calibration that the others give; one alone with its own."""
     ranking: tuple[Ranking, ...]
     """Scores that tracks could be ranked by; empty without a calibration."""
     trials: int
@@ -135,7 +131,7 @@ class Refined:
                 for fold in self.folds
             ],
             "evidence": [asdict(one) for one in self.evidence],
-            "calibration": {"held out": bool(self.folds), **self.calibration.summary()},
+            "calibration": {"held out": len(self.sequences) > 1, **self.calibration.summary()},
             "ranking": [{**asdict(one), "figures": one.figures.to_json()} for one in self.ranking],
         }
 
@@ -183,6 +179,8 @@ def refine(
         watch.note(f"calibrating {name}")
         first = calibrate(clips, scorer, base)
         work = _Work(bench, base, plan, storage, dict(context), watch, first.memory if first else None)
+        told = work.told(base, everyone).classes[name].calibration
+        work = replace(work, by_evidence=told is not None and told.score_of_evidence)
         folds: list[FoldResult] = []
         crossed: dict[int, list[Measured]] = {}
         for number, group in enumerate(groups):
@@ -210,9 +208,7 @@ def refine(
             value_before=value_before,
             value_after=value_after,
             value_crossed=bench.value(together, everyone) if together else None,
-            calibration=reduce(add, [fold.calibration for fold in folds])
-            if folds
-            else judge_calibration(clips, scorer, found),
+            calibration=cross_calibration(clips, scorer, found),
             ranking=rank(clips, scorer, found, plan.metric) if known else (),
             trials=trials,
         )
@@ -241,6 +237,8 @@ class _Work:
     watch: Watch
     memory: float | None
     """Of the evidence, for all searches; None where there is too little to calibrate."""
+    by_evidence: bool | None = None
+    """What ranks tracks, for all searches: tracks that are ranked by different scores cannot be ranked together."""
 
     @property
     def name(self) -> str:
@@ -251,7 +249,7 @@ class _Work:
         plain = [self.bench.variants[0][i] for i in clips]
         estimated = estimate(plain, self.name, self.base, self.bench.scorer.rules).values
         seen = {path: value for path, value in estimated.items() if path in _SEEN}
-        base = self._told(with_values(self.base, self.name, seen), clips)
+        base = self.told(self._better(self.base, with_values(self.base, self.name, seen), clips), clips)
         space = dimensions(base, self.name, estimated, plain, everything=self.plan.everything)
         plan = asdict(self.plan)
         settings = {
@@ -301,17 +299,23 @@ class _Work:
             found = found.model_copy(update={"score_of_evidence": before.score_of_evidence})
         return with_calibration(parameters, self.name, found)
 
-    def _told(self, base: Parameters, clips: tuple[int, ...]) -> Parameters:
-        """Return the parameters with a calibration of their own, and with the score that ranks tracks better.
+    def _better(self, one: Parameters, other: Parameters, clips: tuple[int, ...]) -> Parameters:
+        """Return the better of two, the first of equals.
 
         It is one choice of two, and neither was made to fit: no caution is needed as for the best of a hundred trials.
         """
+        return other if other != one and Jury(self.bench, clips, one).gain(other).gain > 0.0 else one
+
+    def told(self, base: Parameters, clips: tuple[int, ...]) -> Parameters:
+        """Return the parameters with a calibration of their own, and with the score that ranks tracks better."""
         self.watch.note("calibrating")
         plain = self._calibrated(with_calibration(base, self.name, None), clips)
         if plain.classes[self.name].calibration is None:
             return plain
         other = with_values(plain, self.name, {"calibration.score_of_evidence": True})
-        return other if Jury(self.bench, clips, plain).gain(other).gain > 0.0 else plain
+        if self.by_evidence is not None:
+            return other if self.by_evidence else plain
+        return self._better(plain, other, clips)
 
     def _behind(self, parameters: Parameters, rival: Parameters, clips: tuple[int, ...]) -> float | None:
         """Return by how much parameters lose to the best so far where that shows early; None where it does not.
@@ -342,8 +346,7 @@ class _Work:
         for place, clip in enumerate(group):
             crossed[clip] = [variant[place] for variant in measured]
         names = tuple(self.bench.names[i] for i in group)
-        told = judge_calibration([self.bench.variants[0][i] for i in group], self.bench.scorer, found)
-        return FoldResult(names, found, before, after, value_before, value_after, told)
+        return FoldResult(names, found, before, after, value_before, value_after)
 
     def together(self, crossed: Mapping[int, list[Measured]], clips: tuple[int, ...]) -> tuple[Figures, ...]:
         """Return the figures of all sequences, each with the parameters found without it.
@@ -370,6 +373,6 @@ class _Choice:
 _EARLY, _LATE = 0.004, 0.002
 """By how much a trial may be behind, on half of the sequences and on all, and still be tried on degraded detections."""
 _SEEN = ("heading_sign_reliable",)
-"""What is taken from the estimate as it is: it is seen, not searched."""
+"""What is not searched: it is as estimated, or as it was, whichever is better."""
 _SETTLED = ("metric", "copies", "degradation", "seed", "everything", "penalty", "caution")
 """What of a plan the trials depend on; their number is not in it, so there can be more later."""

@@ -1,0 +1,79 @@
+"""A greedy tracker, the simplest that is used: each detection, the best first, takes the nearest track that is free.
+
+As the tracker that came with CenterPoint: a detection is carried back by its velocity, if it has one, to where the
+object was in the frame before, and takes the nearest track of its class within reach there, or starts one. A track that
+is not found stays where its velocity takes it and ends after three frames. A box is written when it is detected, with
+the score of its detection.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from optipmb_client.results import ResultTable
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from optipmb_client.tuning.material import Clip
+
+REACH = {
+    "car": 4.0,
+    "truck": 4.0,
+    "bus": 5.5,
+    "trailer": 3.0,
+    "pedestrian": 1.0,
+    "motorcycle": 13.0,
+    "bicycle": 3.0,
+}
+"""Farthest that a track of a class is sought, metres."""
+PATIENCE = 3
+
+
+@dataclass(frozen=True)
+class _Track:
+    id: int
+    place: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    missed: int = 0
+
+
+def greedy_tracks(clip: Clip, name: str) -> ResultTable:
+    """Track the detections of one class, in the world frame."""
+    tracks: list[_Track] = []
+    rows: list[tuple[int, int, int]] = []  # frame, id, detection
+    before, count = None, 0
+    for index, frame in enumerate(clip.frames):
+        dt = 0.0 if before is None else (frame.stamp_ns - before) * 1e-9
+        before = frame.stamp_ns
+        velocity = np.nan_to_num(frame.velocity)
+        free, found = list(tracks), []
+        for m in np.argsort(-frame.score, kind="stable").tolist():
+            place = frame.center[m, :2]
+            distance = [float(np.hypot(*(place - velocity[m] * dt - track.place))) for track in free]
+            if distance and min(distance) <= REACH[name]:
+                identity = free.pop(int(np.argmin(distance))).id
+            else:
+                count += 1
+                identity = count
+            found.append(_Track(identity, place, velocity[m]))
+            rows.append((index, identity, m))
+        lost = [replace(track, place=track.place + track.velocity * dt, missed=track.missed + 1) for track in free]
+        tracks = [*found, *(track for track in lost if track.missed < PATIENCE)]
+    boxes = [clip.frames[index] for index, _, _ in rows]
+    column = {
+        key: np.array([getattr(frame, key)[m] for frame, (_, _, m) in zip(boxes, rows, strict=True)])
+        for key in ("center", "size", "yaw", "score")
+    }
+    return ResultTable(
+        labels=(name,),
+        frame=np.array([index for index, _, _ in rows], dtype=np.int64),
+        id=np.array([identity for _, identity, _ in rows], dtype=np.int64),
+        label=np.zeros(len(rows), dtype=np.int64),
+        center=column["center"].reshape(-1, 3),
+        size=column["size"].reshape(-1, 3),
+        yaw=column["yaw"],
+        score=column["score"],
+        box2d=np.full((len(rows), 4), np.nan),
+    )
