@@ -3,7 +3,12 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test bench baseline figures load stack install lint types tests schemas wheel clean
+# The folder with kitti/ and nuscenes/, for `make tune` and `make ablate`.
+DATA ?= data
+KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
+NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
+
+.PHONY: help demo test bench baseline figures load stack install lint types tests schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    everything that CI runs: lint, types, tests, schemas, wheel, demo"
