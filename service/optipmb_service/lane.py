@@ -186,6 +186,11 @@ class Lane:
         return self.session is None and self._circle.steward.elsewhere(self.stream)
 
     @property
+    def proven(self) -> bool:
+        """Whether the stream has sent a valid message, as far as is known; may be called by any thread."""
+        return self.session is not None or self._circle.steward.standing(self.stream) is not Standing.NONE
+
+    @property
     def stands_by(self) -> bool:
         """Whether packets wait here for a takeover; may be called by any thread."""
         return self.session is None and bool(self._standby)

@@ -273,7 +273,7 @@ class Registry:
         """Lanes of streams that have not sent a valid message, as far as is known; called with the lock."""
         if len(self._lanes) < MAX_UNPROVEN:
             return 0
-        return sum(lane.session is None and not lane.stands_by for lane in self._lanes.values())
+        return sum(not lane.proven for lane in self._lanes.values())
 
     def _discard(self, lane: Lane) -> None:
         with self._lock:

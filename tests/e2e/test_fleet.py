@@ -1,0 +1,146 @@
+"""Several service processes on one router, with one store: killed, frozen, ended, cut off."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+from fleet import Fleet, freeze, thaw
+from optipmb_schemas import Keys, SessionState, Tracks
+from optipmb_service.checkpoint import digest_of
+from optipmb_service.records import Tracked
+from optipmb_service.session import Session
+from router import Node, Sensor, plain, until
+
+import optipmb
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+KEYS = Keys()
+SENSOR = Sensor()
+STATE = KEYS.query(SENSOR.stream, "state")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled() -> None:
+    optipmb.warm_up()
+
+
+def expected(frames: int) -> tuple[list[bytes], str]:
+    """Tracks and the digest of the state of a session that nothing happens to."""
+    session = Session(SENSOR.stream, optipmb.load_profile("nuscenes"))
+    outputs = [output for seq in range(frames) for output in session.on_detections(SENSOR.detections(seq), 0)]
+    return [plain(one.tracks) for one in outputs if isinstance(one, Tracked)], digest_of(session.snapshot())
+
+
+def distinct(node: Node) -> dict[int, set[bytes]]:
+    """What was published for each frame, repetitions set aside."""
+    found: dict[int, set[bytes]] = {}
+    for message in node.tracks(SENSOR.stream, 1):
+        found.setdefault(message.seq, set()).add(plain(message))
+    return found
+
+
+def send(node: Node, first: int, last: int, pace_s: float = 0.05) -> None:
+    """Publish frames at the rate of a sensor."""
+    for seq in range(first, last):
+        node.send(SENSOR.detections(seq))
+        time.sleep(pace_s)  # the rate of a sensor, not a wait for anything
+
+
+def check(node: Node, frames: int, *, owner: str) -> SessionState:
+    """All frames have been tracked as if nothing had happened, and one instance says that it owns the stream."""
+    tracks, digest = expected(frames)
+    until(lambda: len(distinct(node)) == frames, f"the tracks of {frames} frames", 30.0)
+    assert distinct(node) == {seq: {one} for seq, one in enumerate(tracks)}
+    until(lambda: node.alive(KEYS.all_owners()) == [KEYS.owner(SENSOR.stream, owner)], f"{owner} is the owner")
+    state = node.ask(STATE, SessionState)
+    assert (state.digest, state.frames, state.gaps) == (digest, frames, 0)
+    return state
+
+
+def published_by(node: Node, instance: str) -> list[Tracks]:
+    """What an instance has published."""
+    return [one for one in node.tracks(SENSOR.stream, 1) if one.delivery and one.delivery.instance == instance]
+
+
+@pytest.mark.timeout(300)
+def test_who_stands_by_takes_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Fault 17: SIGKILL of the owner, then SIGSTOP of its successor: each time another goes on, to the byte.
+
+    The frozen one finds its tenure lapsed when it wakes up, publishes nothing more and stands by.
+    """
+    with Fleet(tmp_path) as fleet, Node(fleet.endpoint) as node:
+        first = fleet.service("a")
+        send(node, 0, 10)
+        check(node, 10, owner="a")
+        frozen = fleet.service("b")
+        send(node, 10, 20)
+        check(node, 20, owner="a")
+        first.process.kill()
+        killed_ns = time.monotonic_ns()
+        send(node, 20, 40)
+        check(node, 40, owner="b")
+        at_once_s = _outage(node, killed_ns)
+        fleet.service("c")
+        send(node, 40, 45)
+        freeze(frozen)
+        frozen_ns = time.monotonic_ns()
+        send(node, 45, 100, 0.1)
+        check(node, 100, owner="c")
+        lease_s = _outage(node, frozen_ns)
+        before = len(published_by(node, "b"))
+        thaw(frozen)
+        frozen.wait_log("superseded")
+        send(node, 100, 110)
+        state = check(node, 110, owner="c")
+        assert len(published_by(node, "b")) == before
+        assert frozen.end()[0] == 0
+    accounted = state.frames + state.duplicates + state.late + state.refused + state.shed + state.queue
+    assert state.received == accounted
+    with capsys.disabled():
+        print(f"\ntakeover after a kill {at_once_s:.2f} s, after a freeze {lease_s:.2f} s (lease 2 s)")  # noqa: T201
+
+
+@pytest.mark.timeout(120)
+def test_terminated_in_the_middle(tmp_path: Path) -> None:
+    """Fault 18: SIGTERM among frames under way: status 0 in time, and the next process goes on to the byte."""
+    with Fleet(tmp_path) as fleet, Node(fleet.endpoint) as node:
+        service = fleet.service("a")
+        node.send(*(SENSOR.detections(seq) for seq in range(50)))
+        node.tracks(SENSOR.stream, 10)
+        status, seconds = service.end()
+        assert status == 0
+        assert '"drained": false' not in service.errors
+        assert seconds < 10.0
+        node.send(*(SENSOR.detections(seq) for seq in range(50, 60)))
+        fleet.service("a")
+        check(node, 60, owner="a")
+
+
+@pytest.mark.timeout(120)
+def test_a_router_that_is_killed(tmp_path: Path) -> None:
+    """Fault 16: no router for longer than the lease: the owner looks, goes on, recovers all, applies nothing twice."""
+    with Fleet(tmp_path, lease_s=1.0) as fleet, Node(fleet.endpoint) as node:
+        service = fleet.service("a")
+        send(node, 0, 10)
+        node.tracks(SENSOR.stream, 10)
+        fleet.router.kill()
+        send(node, 10, 40)
+        service.wait_log("tenure_lapsed")
+        fleet.router.start()
+        send(node, 40, 45)
+        state = check(node, 45, owner="a")
+        assert state.duplicates + state.frames == state.received
+
+
+def _outage(node: Node, since_ns: int) -> float:
+    key = KEYS.tracks(SENSOR.stream)
+    later = [
+        at
+        for at, (where, _, _) in zip(node.tracks_seen.times_ns, node.tracks_seen.items, strict=True)
+        if where == key and at > since_ns + 100_000_000
+    ]
+    return (min(later) - since_ns) / 1e9
