@@ -8,7 +8,7 @@ DATA ?= data
 KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
-.PHONY: help demo test bench baseline figures load stack install lint types tests schemas wheel clean tune ablate
+.PHONY: help demo test bench baseline figures load kills stack install lint types tests schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    everything that CI runs: lint, types, tests, schemas, wheel, demo"
@@ -93,6 +93,10 @@ tune: install
 ablate: install
 	$(BIN)/optipmb ablate $(KITTI) --markdown
 	$(BIN)/optipmb ablate $(NUSCENES) --markdown
+
+# A hundred SIGKILLs in the middle of recorded sequences, which CI does three times; needs the KITTI data.
+kills: install
+	OPTIPMB_TEST_KILLS=100 $(BIN)/pytest -q tests/e2e/test_kill.py --timeout 0
 
 clean:
 	rm -rf $(VENV) out build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import resource
 import time
 from typing import TYPE_CHECKING
 
 import pytest
 from fleet import Fleet, freeze, thaw
-from optipmb_schemas import Keys, SessionState, Tracks
+from optipmb_schemas import Keys, ServiceStatus, SessionState, Tracks
 from optipmb_service.checkpoint import digest_of
 from optipmb_service.records import Tracked
 from optipmb_service.session import Session
@@ -134,6 +135,35 @@ def test_a_router_that_is_killed(tmp_path: Path) -> None:
         send(node, 40, 45)
         state = check(node, 45, owner="a")
         assert state.duplicates + state.frames == state.received
+
+
+@pytest.mark.timeout(120)
+def test_a_full_disk(tmp_path: Path) -> None:
+    """Fault 19: no byte more can be written: tracking goes on, the status says degraded; with room again it is ready.
+
+    What was tracked meanwhile is kept then: the next process goes on to the byte.
+    """
+    with Fleet(tmp_path, checkpoint_s=0.1) as fleet, Node(fleet.endpoint) as node:
+        service = fleet.service("a")
+
+        def state() -> str:
+            return node.ask(KEYS.status("a"), ServiceStatus).state
+
+        send(node, 0, 10)
+        check(node, 10, owner="a")
+        pid = service.process.pid
+        soft, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (1, hard))
+        send(node, 10, 20)
+        until(lambda: state() == "degraded", "the status says degraded")
+        check(node, 20, owner="a")
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (soft, hard))
+        until(lambda: state() == "ready", "the store has healed")
+        service.process.kill()
+        service.process.wait()
+        fleet.service("a")
+        send(node, 20, 30)
+        check(node, 30, owner="a")
 
 
 def _outage(node: Node, since_ns: int) -> float:

@@ -111,33 +111,6 @@ def test_a_store_that_cannot_be_opened_degrades(start: Callable[..., Any], tmp_p
         assert node.ask(KEYS.status("test"), ServiceStatus).state == "degraded"
 
 
-def test_a_full_disk_degrades_and_heals(start: Callable[..., Any], tmp_path: Path) -> None:
-    """Fault 19: no byte can be written: tracking goes on, the state is degraded; with room again it is ready."""
-    service, endpoint = start(store=str(tmp_path), checkpoint_s=0.05)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with Node(endpoint) as node:
-        node.send(SENSOR.detections(0))
-        node.tracks(SENSOR.stream, 1)
-        until(lambda: service._keeper.written > 0, "a first checkpoint")
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1, hard))
-        try:
-            node.send(SENSOR.detections(1))
-            node.tracks(SENSOR.stream, 2)
-            until(lambda: service.status().state == "degraded", "the status says degraded")
-            node.send(SENSOR.detections(2))
-            assert node.tracks(SENSOR.stream, 3)[-1].gap == 0
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        until(lambda: service.status().state == "ready", "the store has healed")
-        digest = node.ask(KEYS.query(SENSOR.stream, "state"), SessionState).digest
-    assert service.stop()
-    _, endpoint = start(store=str(tmp_path))
-    with Node(endpoint) as node:
-        node.send(SENSOR.detections(2))
-        until(lambda: node.ask(KEYS.query(SENSOR.stream, "state"), SessionState).frames == 3, "the session is back")
-        assert node.ask(KEYS.query(SENSOR.stream, "state"), SessionState).digest == digest
-
-
 def test_the_wall_clock_may_jump(start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Fault 8: the wall clock jumps by hours, ahead and back, before every frame: the tracks are the same bytes."""
 
