@@ -32,7 +32,7 @@ _T = TypeVar("_T")
 STORE_FILE: Final = "sessions.db"
 
 SETTLE_S: Final = 0.25
-"""Between a checkpoint and its writing, time for the tracks to leave; a fifth of the interval if that is shorter."""
+"""Between a checkpoint and its writing, time for the tracks to leave."""
 
 
 PAUSE_S: Final = 0.003
@@ -116,7 +116,6 @@ class Keeper:
     def __init__(self, store: Store, interval_s: float, may_write: Callable[[str], bool]) -> None:
         self._store = store
         self._interval_s = interval_s
-        self._settle_s = min(SETTLE_S, interval_s / 5)
         self._gather: Callable[[], None] = lambda: None
         self._may_write = may_write
         self._lock = threading.Lock()
@@ -179,10 +178,10 @@ class Keeper:
 
     def _run(self) -> None:
         while not self._ended.is_set():
-            self._hurry.wait(self._interval_s - self._settle_s)
+            self._hurry.wait(max(0.0, self._interval_s - SETTLE_S))
             self._hurry.clear()
             self._gather()
-            if not self._ended.wait(self._settle_s):
+            if not self._ended.wait(SETTLE_S):
                 self._write()
 
     def _write(self) -> None:

@@ -25,6 +25,7 @@ KILLS = int(os.environ.get("OPTIPMB_TEST_KILLS", "3"))
 SEED = int(os.environ.get("OPTIPMB_TEST_SEED", "1"))
 FRAMES = 120
 FEW = 10
+RESTART_S = 200.0  # on a machine that is busy with other things
 SEQUENCES = ("0000", "0002", "0004", "0011")
 
 
@@ -33,7 +34,7 @@ def _compiled() -> None:
     optipmb.warm_up()
 
 
-@pytest.mark.timeout(60 + 60 * KILLS)
+@pytest.mark.timeout(240 + 60 * KILLS)
 def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Fault 1: four recorded streams, SIGKILL in the middle, a new process: state and tracks are those of no kill.
 
@@ -56,13 +57,13 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
             reader.start()
             replay.start()
             total = FRAMES * len(SEQUENCES)
-            replay.wait(moments.randrange(total // 10, total * 8 // 10), 60.0)
+            replay.wait(moments.randrange(total // 10, total * 8 // 10), RESTART_S)
             time.sleep(moments.uniform(0.0, 0.02))  # a moment in the life of a frame, not a wait for anything
             service.process.kill()
             killed = time.monotonic_ns()
             service.process.wait()
             service = fleet.service("one", wait=False)
-            replay.finish(60.0)
+            replay.finish(RESTART_S)
             outages.append(_outage(replay, killed))
             for recording in recordings:
                 tracks, digest = undisturbed(recording, "kitti")
