@@ -4,24 +4,21 @@ Conventions: `now_ns` is the local monotonic clock, handed in by the caller and 
 clouds and, after a restore, for frames that were missed; everything else follows from the messages. So the same
 messages give the same tracks, byte for byte, and those of the window give the same state in whatever order they come.
 
-The parts: `timing` says where a frame belongs, `history` holds the window and goes over it again when it must,
-`stepping` takes one frame through the tracker. What is here is what happens around them: holding frames until they are
-ready, commands, the state to be written down, and what is done when a step fails.
+The parts: `timing` says where a frame belongs, `waiting` holds frames until they are ready, `history` holds the window
+and goes over it again when it must, `stepping` takes one frame through the tracker. What is here is what happens around
+them: commands, the state to be written down, and what is done when a step fails.
 """
 
 from __future__ import annotations
 
 import time
 import weakref
-from bisect import insort
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Final, Literal, Self
-
-import optipmb_schemas as schemas
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import optipmb
 from optipmb_service import convert
-from optipmb_service.checkpoint import Checkpoint, CheckpointError, Recorded
+from optipmb_service.checkpoint import Checkpoint, Recorded
 from optipmb_service.clouds import Clouds
 from optipmb_service.complaints import Complaints
 from optipmb_service.history import History
@@ -40,33 +37,23 @@ from optipmb_service.records import (
     Tracked,
 )
 from optipmb_service.stepping import Outcome, Stepper, empty
+from optipmb_service.telling import counters_of, state_of
 from optipmb_service.timing import Decision, Mark, Timeline, Verdict, hold_until
+from optipmb_service.waiting import Held, Waiting
+from optipmb_service.window import window_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import optipmb_schemas as schemas
+
     from optipmb_service.history import Step
     from optipmb_service.records import Steps
-
-MAX_HELD: Final = 64
-"""Frames held for their clouds at once; beyond it the oldest goes on without."""
+    from optipmb_service.telling import Condition
+    from optipmb_service.waiting import Ready
 
 MAX_ERROR: Final = 400
 """Characters kept of an error."""
-
-MAX_RECOVERING: Final = 1024
-"""Frames held for missed ones at once; beyond it they go on with a gap."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Held:
-    message: schemas.Detections
-    mark: Mark
-    order: tuple[int, int, int]
-    frame: optipmb.Frame
-    ignored: int
-    deadline_ns: int | None
-    ticket: Any
 
 
 class Session:
@@ -105,9 +92,8 @@ class Session:
         self._history = History(empty(self._stepper, None, life.next_id, life.starts), _weakly(self._step))
         self._done = Timeline(self._policy.gap_limit_ns)
         self._arrived = self._done
-        self._held: list[_Held] = []
+        self._waiting = Waiting()
         self._clouds = Clouds(self._policy.clouds)
-        self._recovery_ns: int | None = None
         self._quarantine = ""
         self._run = 0
 
@@ -149,8 +135,7 @@ class Session:
             cloud_wait_ns=self._policy.cloud_wait_ns,
             cloud_memory_ns=self._policy.cloud_memory_ns,
         )
-        held = _Held(message, mark, decision.place.order(mark), frame, ignored, deadline_ns, ticket)
-        insort(self._held, held, key=lambda one: one.order)
+        self._waiting.add(Held(message, mark, decision.place.order(mark), frame, ignored, deadline_ns, ticket))
         return [*outputs, *self._advance(now_ns)]
 
     def on_points(self, message: schemas.Points, now_ns: int, *, ticket: Any = None) -> list[Output]:
@@ -176,14 +161,12 @@ class Session:
     @property
     def deadline_ns(self) -> int | None:
         """When `on_tick` is due (monotonic, ns); None while nothing is held."""
-        if not self._held:
-            return None
-        return self._recovery_ns if self._incomplete(self._held[0]) else self._held[0].deadline_ns
+        return self._waiting.deadline_ns(self._complete)
 
     @property
     def held(self) -> int:
         """Frames waiting, for their clouds or for frames that were missed."""
-        return len(self._held)
+        return len(self._waiting)
 
     def refuse(self) -> None:
         """Count a message of the stream that was none."""
@@ -299,11 +282,11 @@ class Session:
     @property
     def recovering(self) -> bool:
         """Whether frames behind a gap are held, because those missing may still come from the publisher's cache."""
-        return self._recovery_ns is not None
+        return self._waiting.recovery_ns is not None
 
     def recovered(self, now_ns: int) -> list[Output]:
         """End the waiting: all that the caches have is here. Returns what was held for it."""
-        self._recovery_ns = None
+        self._waiting.recovery_ns = None
         return self._advance(now_ns)
 
     # What it is
@@ -326,20 +309,7 @@ class Session:
     @property
     def counters(self) -> Counters:
         """What happened to the messages so far."""
-        deliveries, counts = self._deliveries, self._history.head.counts
-        return Counters(
-            frames=counts.frames,
-            duplicates=deliveries.duplicates,
-            late=deliveries.late,
-            inserted=deliveries.inserted,
-            corrected=deliveries.corrected,
-            refused=deliveries.refused + counts.astray,
-            gaps=counts.gaps,
-            new_epochs=counts.new_epochs,
-            clouds_used=counts.clouds_used,
-            clouds_missed=counts.clouds_missed,
-            repaired=counts.repaired,
-        )
+        return counters_of(self._deliveries, self._history.head.counts)
 
     @property
     def run(self) -> int:
@@ -368,72 +338,52 @@ class Session:
 
     def state(self, *, shed: int = 0, queue: int = 0, closed: bool = False) -> schemas.SessionState:
         """Return the state as the message that answers a query."""
-        head, counters = self._history.head, self.counters
-        density, last = head.density, head.last
-        state: Literal["new", "running", "recovering", "quarantined", "closed"] = "running"
-        if closed:
-            state = "closed"
-        elif self._quarantine:
-            state = "quarantined"
-        elif self.recovering:
-            state = "recovering"
-        elif not counters.frames:
-            state = "new"
-        return schemas.SessionState(
-            stream=self.stream,
-            session=head.session,
-            state=state,
-            profile=self.parameters.name,
-            epoch=last.epoch if last else None,
-            seq=last.seq if last else None,
-            stamp_ns=last.stamp_ns if last else None,
+        return state_of(
+            self.stream,
+            self.parameters.name,
+            self._history.head,
+            self.counters,
+            condition=self._condition(closed=closed),
             shed=shed,
-            **{field.name: getattr(counters, field.name) for field in fields(Counters)},
-            tracks=head.tracks,
-            bernoullis=len(density.bernoulli),
-            poissons=len(density.poisson),
-            next_id=density.next_id,
-            queue=queue + len(self._held),
+            queue=queue + len(self._waiting),
         )
+
+    def _condition(self, *, closed: bool) -> Condition:
+        if closed:
+            return "closed"
+        if self._quarantine:
+            return "quarantined"
+        if self.recovering:
+            return "recovering"
+        return "running" if self.counters.frames else "new"
 
     # The order of things
 
     def _advance(self, now_ns: int | None) -> list[Output]:
         """Process the frames that are ready, in order; None: all of them."""
         outputs: list[Output] = []
-        if now_ns is not None and self._recovery_ns is not None and now_ns >= self._recovery_ns:
-            self._recovery_ns = None
-        while self._held:
-            head = self._held[0]
-            if now_ns is not None and len(self._held) <= MAX_RECOVERING and self._incomplete(head):
-                break
-            points = self._cloud(head)
-            waits = points is None and head.deadline_ns is not None
-            many = len(self._held) > MAX_HELD and not self.recovering
-            if waits and now_ns is not None and now_ns < (head.deadline_ns or 0) and not many:
-                break
-            del self._held[0]
-            outputs += self._process(head, points, missed=waits)
+        while (ready := self._waiting.take(now_ns, self._complete, self._cloud)) is not None:
+            outputs += self._process(ready)
         return outputs
 
-    def _incomplete(self, held: _Held) -> bool:
-        """Whether a frame is to be held because frames before it may still come."""
-        return self.recovering and not self._done.complete_until(held.mark, self._history.head.tracked)
+    def _complete(self, mark: Mark) -> bool:
+        return self._done.complete_until(mark, self._history.head.tracked)
 
-    def _cloud(self, held: _Held) -> schemas.Points | None:
+    def _cloud(self, held: Held) -> schemas.Points | None:
         if held.message.has_points is False:
             return None
         return self._clouds.get(held.mark.epoch, held.mark.stamp_ns, self._arrived.knows)
 
-    def _process(self, held: _Held, points: schemas.Points | None, *, missed: bool) -> list[Output]:
+    def _process(self, ready: Ready) -> list[Output]:
         """Put a frame in its place; when a step raises, the session is quarantined as it was before."""
         began_ns = self._clock()
+        held, points = ready.held, ready.points
         mark = held.mark
         decision, done = self._done.judge(mark)
         if not decision.verdict.admitted:
             return self._refuse(mark, decision)
         weight = weigh(held.message, points)
-        entry = Entry(mark, decision.place, held.message, points, missed, 0, held.frame, held.ignored, weight)
+        entry = Entry(mark, decision.place, held.message, points, ready.missed, 0, held.frame, held.ignored, weight)
         placed = [*self._history.entries, entry] if decision.last else self._history.inserted(entry, done.places())
         before = self.session
         try:
@@ -488,8 +438,7 @@ class Session:
     def _fail(self, error: Exception, placed: list[Entry], mark: Mark) -> list[Output]:
         """Take no more frames; the one that failed and what is held go, unprocessed."""
         self._quarantine = f"{type(error).__name__}: {error}"[:MAX_ERROR]
-        self._deliveries.refused += 1 + len(self._held)
-        self._held.clear()
+        self._deliveries.refused += 1 + self._waiting.clear()
         self._done = self._arrived = self._done.note(mark)
         dump = dump_of(self._stepper, self._history.base, placed, self._policy, error)
         return [self._complain.failed(mark, self._quarantine), Quarantined(self._quarantine, dump)]
@@ -504,7 +453,7 @@ class Session:
             if base.last is not None:
                 self._clouds.forget_before(base.last.stamp_ns, self._policy.gap_limit_ns)
         self._done = done
-        if not self._held:
+        if not self._waiting:
             self._arrived = done
 
     def _begin(self, moment: Moment) -> None:
@@ -519,27 +468,11 @@ class Session:
         self._quarantine = checkpoint.quarantine
         self._deliveries = replace(checkpoint.deliveries)
         self._clouds.newest_ns = checkpoint.newest_cloud_ns
-        self._recovery_ns = now_ns + self._policy.recovery_wait_ns
+        self._waiting.recovery_ns = now_ns + self._policy.recovery_wait_ns
         self._run = checkpoint.run + 1
-        base = checkpoint.base
-        by_mark = {one.mark: one for one in checkpoint.window}
-        self._done = Timeline.resume(
-            self._policy.gap_limit_ns, checkpoint.epochs, base.course, base.last, frozenset(by_mark)
-        )
+        self._done, entries = window_of(checkpoint, self._policy.gap_limit_ns)
         self._arrived = self._done
-        places = self._done.places()
-        entries: list[Entry] = []
-        for mark, one in by_mark.items():
-            try:
-                frame, ignored = convert.frame_of(self.parameters, one.message)
-            except optipmb.FrameError as error:
-                raise CheckpointError(f"window: {error}") from error
-            weight = weigh(one.message, one.points)
-            entries.append(
-                Entry(mark, places[mark], one.message, one.points, one.missed, one.revision, frame, ignored, weight)
-            )
-        entries.sort(key=lambda one: one.order)
-        self._history = History(base, _weakly(self._step), entries, checkpoint.head)
+        self._history = History(checkpoint.base, _weakly(self._step), entries, checkpoint.head)
 
     def _wait(self, cloud_wait_ns: int) -> None:
         self._cloud_wait_ns = cloud_wait_ns
