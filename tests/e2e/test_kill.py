@@ -53,7 +53,7 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
             replay = Replay(connection, recordings, pace_s=0.004)
             inbox = Inbox(100_000)
             subscriptions = [connection.subscribe(KEYS.tracks(one.stream), inbox) for one in recordings]
-            reader = threading.Thread(target=_read, args=(inbox, replay))
+            reader = threading.Thread(target=_read, args=(inbox, replay), daemon=True)
             reader.start()
             replay.start()
             total = FRAMES * len(SEQUENCES)
