@@ -9,12 +9,12 @@ wall clock only for what delivery reports.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
 import structlog
 
+from optipmb_service.accounts import Accounts
 from optipmb_service.checkpoint import Checkpoint, digest_of, forgotten
 from optipmb_service.inbox import Inbox
 from optipmb_service.meter import Meter
@@ -22,93 +22,20 @@ from optipmb_service.outgoing import Outgoing, Ticket
 from optipmb_service.ownership import Standing
 from optipmb_service.ports import Packet
 from optipmb_service.problems import problem_of
-from optipmb_service.records import Begun, Counters, Life, Output, Policy, Quarantined, Tracked, Traffic
+from optipmb_service.records import Begun, Output, Quarantined, Tracked
 from optipmb_service.session import Session
-from optipmb_service.standby import Budget, Standby
+from optipmb_service.standby import Standby
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    import optipmb
-    from optipmb_service.keeper import Keeping
-    from optipmb_service.metrics import Metrics
-    from optipmb_service.ports import Outlet
-    from optipmb_service.problems import Desk
+    from optipmb_service.circle import Circle
+    from optipmb_service.records import Traffic
 
 log = structlog.get_logger("optipmb_service")
 
 BATCH: Final = 8
 """Items that a worker takes before the other streams have their turn."""
-
-
-class Seating(Protocol):
-    """What a lane needs of the steward."""
-
-    def standing(self, stream: str) -> Standing:
-        """Return what this instance is to a stream."""
-
-    def may_write(self, stream: str) -> bool:
-        """Whether this instance may publish and store for a stream now."""
-
-    def elsewhere(self, stream: str) -> bool:
-        """Whether another instance tracks a stream."""
-
-    def seek(self, stream: str) -> None:
-        """Ask for a stream."""
-
-    def leave(self, stream: str) -> None:
-        """Give up a stream."""
-
-
-@dataclass(frozen=True)
-class Circle:
-    """What all lanes share.
-
-    Attributes:
-        instance: name of the service.
-        limits: bounds on messages.
-        policy: waiting and restarting of sessions.
-        queue_frames: most frames waiting per stream.
-        queue_clouds: most clouds waiting per stream.
-        outlet: where results go.
-        desk: where problems go.
-        parameters_of: profile of a stream.
-        steward: says which streams this instance owns.
-        keeper: where checkpoints go and come from.
-        standby_ns: how long packets wait for a takeover.
-        budget: bytes that may wait for takeovers, over all streams.
-        dump: saves what is needed to see an error of a session again; returns the file.
-        room: whether a further session has room.
-        admit: asked before a session begins; returns what the stream had before, None when there is no room.
-        release: told when a session has ended.
-        discard: told when a lane without a session has nothing left to do.
-        submit: sends a worker to a lane.
-        arm: has `Lane.wake` called at a monotonic time (ns).
-        metrics: counts what is published.
-        tracker: makes trackers.
-    """
-
-    instance: str
-    limits: schemas.Limits
-    policy: Policy
-    queue_frames: int
-    queue_clouds: int
-    outlet: Outlet
-    desk: Desk
-    parameters_of: Callable[[str], optipmb.Parameters]
-    steward: Seating
-    keeper: Keeping
-    standby_ns: int
-    budget: Budget
-    dump: Callable[[str, bytes], str]
-    room: Callable[[], bool]
-    admit: Callable[[str], Life | None]
-    release: Callable[[Session], None]
-    discard: Callable[[Lane], None]
-    submit: Callable[[Lane], None]
-    arm: Callable[[Lane, int], None]
-    metrics: Metrics
-    tracker: Callable[[optipmb.Parameters], Any]
 
 
 class Lane:
@@ -125,18 +52,13 @@ class Lane:
         self.meter = Meter(time.monotonic_ns())
         self.session: Session | None = None
         self.stale = False
-        self.traffic = Traffic()
-        """What became of messages, but for what a session counts while it lasts."""
-        self._base = Counters()
-        self._opened = Traffic()
+        self._accounts = Accounts(self.inbox)
         self._circle = circle
         self._standby = Standby(circle.standby_ns, circle.budget)
         self._out = Outgoing(stream, circle.instance, circle.outlet, self.meter, circle.metrics, circle.steward)
         self._asking: list[Callable[[Lane], None]] = []
         self._changed = False
         self._armed_ns: int | None = None
-        self._shed_told = 0
-        self._clouds_shed_told = 0
 
     def wake(self) -> None:
         """Send a worker though nothing came: frames have waited long enough."""
@@ -211,7 +133,7 @@ class Lane:
 
     def _settle(self) -> None:
         """Let go what has waited long enough, and have the worker come back for what has not."""
-        if shed := self._count_shed():
+        if shed := self._accounts.shed():
             expected = f"at most {self._circle.queue_frames} frames waiting"
             self._report("shed", "", expected, f"{shed} more; the oldest were dropped", count=shed)
         session = self.session
@@ -225,16 +147,6 @@ class Lane:
             self._armed_ns = deadline_ns
             self._circle.arm(self, deadline_ns)
 
-    def _count_shed(self) -> int:
-        """Count what was shed since the last time; returns how much."""
-        shed, _, clouds = self.inbox.counts()
-        fresh, self._shed_told = shed - self._shed_told, shed
-        self.traffic.clouds_shed += clouds - self._clouds_shed_told
-        self._clouds_shed_told = clouds
-        self.traffic.shed += fresh
-        self.traffic.received += fresh
-        return fresh
-
     # Messages
 
     def _receive(self, packet: Packet, *, frame: bool) -> None:
@@ -244,7 +156,7 @@ class Lane:
             return
         began_ns = time.perf_counter_ns()
         self._changed = True
-        self.traffic.received += frame
+        self._accounts.receive(frame=frame)
         message = self._read(packet, frame=frame)
         if message is None:
             return
@@ -256,7 +168,8 @@ class Lane:
         ticket = Ticket(packet.wall_ns, packet.now_ns, time.perf_counter_ns() - began_ns)
         if isinstance(message, schemas.Points):
             outputs = session.on_points(message, now_ns, ticket=ticket)
-            self.traffic.clouds_refused += any(getattr(one, "code", "") == "invalid_value" for one in outputs)
+            if any(getattr(one, "code", "") == "invalid_value" for one in outputs):
+                self._accounts.refuse(session, frame=False)
         else:
             outputs = session.on_detections(message, now_ns, arrived_ns=packet.now_ns, ticket=ticket)
         self._deliver(outputs)
@@ -267,7 +180,7 @@ class Lane:
         try:
             return self._decode(packet, kind)
         except schemas.MessageError as error:
-            self._count_refused(frame=frame)
+            self._accounts.refuse(self.session, frame=frame)
             self._report(error.code, error.path, error.expected, error.received, what=kind.__name__)
             return None
 
@@ -286,15 +199,6 @@ class Lane:
         if message.stream != self.stream:
             raise schemas.MessageError("invalid_value", "stream", repr(self.stream), repr(message.stream))
         return message
-
-    def _count_refused(self, *, frame: bool) -> None:
-        if not frame:
-            self.traffic.clouds_refused += 1
-        elif self.session is not None:
-            self.session.refuse()
-        else:
-            self.traffic.received += 1
-            self.traffic.refused += 1
 
     def _deliver(self, outputs: Sequence[Output]) -> None:
         for output in outputs:
@@ -364,7 +268,7 @@ class Lane:
             if self.session is not None:
                 self._guard(self._receive, packet, frame=frame)
             else:
-                self._count_refused(frame=frame)
+                self._accounts.refuse(self.session, frame=frame)
 
     def give_seat(self) -> None:
         """Another instance owns the stream: what is here is no longer the newest state."""
@@ -392,7 +296,7 @@ class Lane:
     def _admitted(self, *, frame: bool) -> bool:
         if self._circle.room():
             return True
-        self._count_refused(frame=frame)
+        self._accounts.refuse(self.session, frame=frame)
         self._report(
             "refused", "", "a stream that is tracked already", "a new one; the service carries no more sessions"
         )
@@ -424,7 +328,7 @@ class Lane:
             # Its run has a new number: written soon, so that a crash just now does not give the next run the same one.
             circle.keeper.put(session.snapshot(), lambda: None)
         self.session, self._changed = session, False
-        self._base, self._opened = session.counters, replace(self.traffic)
+        self._accounts.open(session)
         return session
 
     def close_session(self, reason: str, then: Callable[[], None] = lambda: None) -> None:
@@ -462,7 +366,7 @@ class Lane:
             return
         self.session, self._armed_ns = None, None
         self._out.close()
-        self.traffic = self.traffic.since(self._base, session.counters)
+        self._accounts.close(session)
         self._circle.release(session)
         log.info(
             "session_closed", stream=self.stream, session=session.session, reason=reason, frames=session.counters.frames
@@ -477,22 +381,11 @@ class Lane:
         session = self.session
         if session is None:
             return None
-        return self._state(session).model_copy(update={"digest": digest_of(session.snapshot())})
-
-    def _state(self, session: Session) -> schemas.SessionState:
-        shed, waiting, _ = self.inbox.counts()
-        untold = shed - self._shed_told
-        base, opened = self._base, self._opened
-        before = base.frames + base.duplicates + base.late + base.refused
-        state = session.state(shed=self.traffic.shed - opened.shed + untold, queue=waiting)
-        received = before + self.traffic.received - opened.received + untold + waiting
-        clouds_refused = self.traffic.clouds_refused - opened.clouds_refused
-        return state.model_copy(update={"received": received, "clouds_refused": clouds_refused})
+        return self._accounts.state(session).model_copy(update={"digest": digest_of(session.snapshot())})
 
     def totals(self) -> Traffic:
         """Return what became of messages since the lane is there; may be called by any thread."""
-        session = self.session
-        return self.traffic if session is None else self.traffic.since(self._base, session.counters)
+        return self._accounts.totals(self.session)
 
     def summary(self, now_ns: int) -> schemas.SessionSummary | None:
         """Return the line of the service's status; may be called by any thread."""
@@ -500,7 +393,7 @@ class Lane:
         if session is None:
             return None
         p50, p99 = self.meter.latency_ms()
-        state = self._state(session)
+        state = self._accounts.state(session)
         return schemas.SessionSummary(
             stream=self.stream,
             profile=state.profile,

@@ -16,7 +16,8 @@ import structlog
 
 import optipmb
 from optipmb_service import quarantine
-from optipmb_service.lane import Circle, Lane, Seating
+from optipmb_service.circle import Circle, Member, Seating
+from optipmb_service.lane import Lane
 from optipmb_service.ownership import Change
 from optipmb_service.problems import problem_of
 from optipmb_service.records import SECOND, Life, Policy, Traffic
@@ -80,7 +81,7 @@ class Registry:
         pool: Pool,
         steward: Seating,
         keeper: Keeping,
-        arm: Callable[[Lane, int], None],
+        arm: Callable[[Member, int], None],
         metrics: Metrics,
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
         share: Share | None = None,
@@ -275,11 +276,11 @@ class Registry:
             return 0
         return sum(not lane.proven for lane in self._lanes.values())
 
-    def _discard(self, lane: Lane) -> None:
+    def _discard(self, lane: Member) -> None:
         with self._lock:
             if self._lanes.get(lane.stream) is lane:
                 del self._lanes[lane.stream]
-                self._past += lane.traffic
+                self._past += lane.totals()
 
     def _admit(self, stream: str) -> Life | None:
         with self._lock:

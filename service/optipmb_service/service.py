@@ -38,6 +38,7 @@ from optipmb_service.vitals import Vitals, shown
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from optipmb_service.circle import Member
     from optipmb_service.lane import Lane
     from optipmb_service.metrics import Value
     from optipmb_service.profiles import Profiles
@@ -72,7 +73,7 @@ class Service:
         self,
         settings: Settings,
         profiles: Profiles,
-        arm: Callable[[Lane, int], None],
+        arm: Callable[[Member, int], None],
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
         share: Share | None = None,
         metrics: Metrics | None = None,
@@ -282,7 +283,7 @@ async def _serve(settings: Settings, profiles: Profiles, asked: Asked, vitals: V
     """
     loop = asyncio.get_running_loop()
 
-    def arm(lane: Lane, at_ns: int) -> None:
+    def arm(lane: Member, at_ns: int) -> None:
         # The loop's time and the deadlines are one clock, the monotonic one.
         loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, lane.wake)
 

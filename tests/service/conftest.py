@@ -19,7 +19,7 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from optipmb_service.lane import Lane
+    from optipmb_service.circle import Member
 
     Start = Callable[..., tuple[Service, str]]
 
@@ -54,7 +54,7 @@ def node(start: Start) -> Iterator[Node]:
         yield one
 
 
-def arm(lane: Lane, at_ns: int) -> None:
+def arm(lane: Member, at_ns: int) -> None:
     """Wake a lane in time, as the control loop does."""
     timer = threading.Timer(max(0.0, at_ns - time.monotonic_ns()) / 1e9, lane.wake)
     timer.daemon = True
