@@ -48,8 +48,10 @@ lint: install
 types: install
 	$(BIN)/mypy
 
+# What only computes runs on two processors; what watches processes and clocks runs alone.
 tests: install
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile tests/clients tests/schemas tests/tracker tests/fuzz
+	$(BIN)/pytest tests/service tests/e2e tests/docker
 
 schemas: install
 	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md schemas/json

@@ -127,7 +127,9 @@ def config_command(  # noqa: PLR0913 - one argument per option of the command
         return
     plain = {name: value for name, value in values.items() if not isinstance(value, dict)}
     for name, value in plain.items():
-        typer.echo(f"{name} = {_toml(value)}  # {loaded.sources[name]}")
+        # TOML has no null: what is not set is a comment.
+        shown = f"# {name} is not set" if value is None else f"{name} = {_toml(value)}"
+        typer.echo(f"{shown}  # {loaded.sources[name]}")
     for name in values.keys() - plain.keys():
         typer.echo(f"\n[{name}]  # {loaded.sources[name]}")
         for key, value in values[name].items():

@@ -200,7 +200,7 @@ def follow_evidence(c: Any, evidence: float, since: float, score: float | None) 
     if score is None:
         odds = -c.calibration.missed
     else:
-        odds = 7.0 if score == 1.0 else max(-7.0, min(7.0, math.log(score / (1.0 - score))))
+        odds = 14.0 if score == 1.0 else max(-14.0, min(14.0, math.log(score / (1.0 - score))))
     kept = c.calibration.memory**since
     return float(kept * evidence + (1.0 - kept) * odds)
 
@@ -216,4 +216,4 @@ def calibrate(c: Any, b: Any) -> tuple[float, float, Array]:
     turn = np.array([[math.cos(b.mean[3]), -math.sin(b.mean[3])], [math.sin(b.mean[3]), math.cos(b.mean[3])]])
     covariance = b.covariance.copy()
     covariance[:2, :2] += turn @ np.diag([along**2, across**2]) @ turn.T
-    return existence, (b.evidence + 7.0) / 14.0 if known.score_of_evidence else b.score, covariance
+    return existence, (b.evidence + 14.0) / 28.0 if known.score_of_evidence else b.score, covariance
