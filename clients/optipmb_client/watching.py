@@ -2,8 +2,8 @@
 
 World frame: metres, z up. Entities of a stream stand below its name: `tracks` (boxes with id and existence
 probability), `tracks/velocity` (the way of the next second), `tracks/covariance` (two standard deviations of the
-position), `tracks/trails`, `detections`, `cloud`, `sensor`, and the figures `count/…`. Rerun is an extra of the
-installation.
+position), `tracks/trails`, `detections`, `cloud`, `sensor`, `poisson` (where objects are expected that are
+not detected yet) and `poisson/weight` (how many), and the figures `count/…`. Rerun is an extra of the installation.
 """
 
 import collections
@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from optipmb_schemas import Detections, Message, Points, Tracks
+from optipmb_schemas import Density, Detections, Message, Points, Tracks
 
 from optipmb_client.colours import rgb_of
 from optipmb_client.geometry import Floats, rotation_of
@@ -41,6 +41,10 @@ AXES_M: Final = (42.0, 34.0)
 GREY: Final = (130, 130, 130)
 INK: Final = (30, 30, 30)
 
+FAINT: Final = (235, 225, 235)
+EXPECTED: Final = (120, 90, 140)
+"""Colours of a Poisson component that expects next to nothing, and of one that expects an object or more."""
+
 SERIES: Final = (
     ("tracks", "tracks", (0, 114, 178)),
     ("surer_tracks", "of score 0.5 and more", (213, 94, 0)),
@@ -58,6 +62,7 @@ LEGEND: Final = """\
 | **grey box** | a detection |
 | **black arrow** | the sensor and where it looks |
 | **points** | the cloud |
+| **faint ellipse** | with `--poisson`: an object not yet detected may be here; the darker, the likelier |
 
 Axes in metres, the grid has lines every 10 m, x to the right and y up when seen from above.
 """
@@ -82,8 +87,8 @@ class View:
         recording.log("legend", rr.TextDocument(LEGEND, media_type="text/markdown"), static=True)
 
     def show(self, message: Message) -> None:
-        """Show a message; what is neither detections, points nor tracks is left out."""
-        if not isinstance(message, Detections | Points | Tracks):
+        """Show a message; what is neither detections, points, tracks nor a density with a stamp is left out."""
+        if not isinstance(message, Density | Detections | Points | Tracks) or message.stamp_ns is None:
             return
         if message.stamp_ns >= UNIX_NS:
             self._recording.set_time("stamp", timestamp=np.datetime64(message.stamp_ns, "ns"))
@@ -93,6 +98,8 @@ class View:
             self._show_tracks(message)
         elif isinstance(message, Detections):
             self._show_detections(message)
+        elif isinstance(message, Density):
+            self._show_density(message)
         else:
             points, _ = _to_world(message, message.xyz.astype(np.float64))
             self._recording.log(f"{message.stream}/cloud", rr.Points3D(points, colors=_by_height(points), radii=0.03))
@@ -157,6 +164,23 @@ class View:
             w, x, y, z = pose.quaternion
             place = rr.Transform3D(translation=pose.translation, quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
             self._recording.log(f"{name}/sensor", place, rr.Arrows3D(vectors=[[3.0, 0.0, 0.0]], colors=INK, radii=0.15))
+
+    def _show_density(self, density: Density) -> None:
+        """Show where objects are expected; square roots, because most weights are small."""
+        share = np.sqrt(np.minimum(density.weight, 1.0))
+        centers = np.column_stack([density.mean[:, :2], density.z])
+        colours = np.rint(np.array(FAINT) * (1 - share[:, None]) + np.array(EXPECTED) * share[:, None]).astype(np.uint8)
+        deviations, turns = _ellipses(density.covariance[:, :2, :2])
+        path = f"{density.stream}/poisson"
+        ellipses = rr.Ellipsoids3D(
+            centers=centers,
+            half_sizes=np.column_stack([SIGMAS * deviations, np.full(len(share), 0.01)]),
+            quaternions=_turned(turns),
+            colors=colours,
+            line_radii=0.4 * LINE,
+        )
+        self._recording.log(path, ellipses)
+        self._recording.log(f"{path}/weight", rr.Points3D(centers, colors=colours, radii=share))
 
     def _lay_out(self, stream: str, middle: Floats) -> None:
         """Send the layout once, for the first stream or the one that was named, and keep numbered axes near it."""

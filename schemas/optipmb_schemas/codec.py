@@ -15,7 +15,7 @@ from optipmb_schemas.blocks import block_of, pack_large, read_array
 from optipmb_schemas.control import MoveRequest, Problem, ResetRequest, ServiceStatus, SessionParameters, SessionState
 from optipmb_schemas.errors import MessageError, show
 from optipmb_schemas.limits import DEFAULT, Limits
-from optipmb_schemas.messages import Detections, Points, Tracks
+from optipmb_schemas.messages import Density, Detections, Points, Tracks
 from optipmb_schemas.model import Message
 from optipmb_schemas.structure import Span, check_json, check_msgpack
 
@@ -26,6 +26,7 @@ MESSAGES: Final[tuple[type[Message], ...]] = (
     Points,
     Tracks,
     SessionState,
+    Density,
     SessionParameters,
     ResetRequest,
     MoveRequest,

@@ -24,11 +24,11 @@ class Limits:
     max_text: int = _limit(4096, "bytes of one text, in UTF-8")
     max_points: int = _limit(1_000_000, "points of one cloud (P)")
     max_detections: int = _limit(5_000, "detections of one message (M)")
-    max_tracks: int = _limit(20_000, "tracks of one message (N)")
+    max_tracks: int = _limit(20_000, "tracks, or components of a density, of one message (N)")
     max_labels: int = _limit(256, "labels of one message")
 
     def rows(self, dimension: str) -> int:
-        """Return the limit of the symbolic dimension `M` (detections), `N` (tracks) or `P` (points)."""
+        """Return the limit of the symbolic dimension `M` (detections), `N` (tracks, components) or `P` (points)."""
         return {"M": self.max_detections, "N": self.max_tracks, "P": self.max_points}[dimension]
 
     def described(self) -> list[tuple[str, int, str]]:

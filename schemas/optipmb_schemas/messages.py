@@ -1,4 +1,4 @@
-"""Messages of a stream: detections and points towards the service, tracks back.
+"""Messages of a stream: detections and points towards the service, tracks and, when asked for, densities back.
 
 World frame: fixed, right-handed, z up; metres, seconds, radians. Yaw is counter-clockwise from x. The centre of a box
 is its geometric centre; its size is length, width, height. Stamps are nanoseconds of the sensor's time. The fields are
@@ -190,6 +190,38 @@ class Tracks(Header):
         if steps.size and steps.min() <= 0:
             at = int(np.argmax(steps <= 0)) + 1
             raise invalid(f"id[{at}]", f"an id above {self.id[at - 1]}, in ascending order", self.id[at])
+
+
+class Density(Message):
+    """Reply of `q/density`: where the tracker expects objects that nobody has detected yet, one row per component.
+
+    These are the Poisson components after the newest frame, N of them, with the values that the tracker holds.
+    """
+
+    stream: Stream = Field(description="Name of the stream.")
+    session: SessionId = Field(description="32 hexadecimal digits, as in the tracks; all 0: without a session.")
+    stamp_ns: Stamp | None = Field(default=None, description="Stamp of the newest frame. Absent: no frame yet.")
+    labels: Labels = Field(description="Names of the classes that `label` counts.")
+    label: Annotated[NDArray[np.int64], Array("i8", ("N",), 0, 255)] = Field(
+        description="Class, an index into `labels`."
+    )
+    weight: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1e30)] = Field(
+        description="Expected number of objects."
+    )
+    mean: Annotated[NDArray[np.float64], Array("f8", ("N", 6), -1e30, 1e30)] = Field(
+        description="Mean of [x, y, speed, heading, turn rate, acceleration]: world frame, metres, seconds, radians."
+    )
+    covariance: Annotated[NDArray[np.float64], Array("f8", ("N", 6, 6), -1e30, 1e30)] = Field(
+        description="Covariance of the same."
+    )
+    z: Annotated[NDArray[np.float64], Array("f8", ("N",), -1e30, 1e30)] = Field(
+        description="Height of the centre in metres, world frame."
+    )
+
+    def check(self) -> None:
+        """Labels must be in the list."""
+        super().check()
+        _check_labels(self.label, self.labels)
 
 
 def _check_labels(label: NDArray[np.int64], labels: tuple[str, ...]) -> None:

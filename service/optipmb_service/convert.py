@@ -76,6 +76,24 @@ def unknown_labels(parameters: optipmb.Parameters, message: schemas.Detections) 
     return unknown
 
 
+def density_of(
+    density: optipmb.Density, *, stream: str, session: str, parameters: optipmb.Parameters
+) -> schemas.Density:
+    """Return the message for the Poisson components of a density."""
+    poisson = density.poisson
+    return schemas.Density(
+        stream=stream,
+        session=session,
+        stamp_ns=density.stamp_ns if density.stamp_ns >= 0 else None,
+        labels=tuple(parameters.classes),
+        label=poisson.label,
+        weight=poisson.weight,
+        mean=poisson.mean,
+        covariance=poisson.covariance,
+        z=poisson.auxiliary[:, 3],
+    )
+
+
 def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
     tracks: optipmb.Tracks,
     *,

@@ -1,8 +1,8 @@
-"""Answers to queries: the state of sessions, resets, parameters, the status of the service.
+"""Answers to queries: the state and density of sessions, resets, parameters, the status of the service.
 
 What concerns a session is run by the worker of its stream, so that nothing else happens to it meanwhile: a question
-about the state goes before the frames that wait, a reset or a change of parameters takes its turn among them. The query
-thread itself only sorts. An error is a reply too: a `Problem`, as an error reply.
+about the state or the density goes before the frames that wait, a reset or a change of parameters takes its turn among
+them. The query thread itself only sorts. An error is a reply too: a `Problem`, as an error reply.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Literal, TypeVar
 import optipmb_schemas as schemas
 import structlog
 
+import optipmb
+from optipmb_service.convert import density_of
 from optipmb_service.ports import TransportError
 from optipmb_service.problems import problem_of
 from optipmb_service.records import RefusedError
@@ -21,7 +23,6 @@ from optipmb_service.records import RefusedError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import optipmb
     from optipmb_service.lane import Lane
     from optipmb_service.ports import Request
     from optipmb_service.registry import Registry
@@ -83,6 +84,7 @@ class Queries:
             return
         commands: dict[str, tuple[Callable[[Lane, Request], None], bool]] = {
             "state": (self._state, True),
+            "density": (self._density, True),
             "reset": (self._reset, False),
             "parameters": (self._parameters, False),
         }
@@ -143,6 +145,16 @@ class Queries:
 
     def _state(self, lane: Lane, request: Request) -> None:
         request.answer(self._keys.query(lane.stream, "state"), lane.state() or self._nothing(lane.stream, "new"))
+
+    def _density(self, lane: Lane, request: Request) -> None:
+        session = lane.session
+        message = density_of(
+            session.density if session else optipmb.Density.empty(),
+            stream=lane.stream,
+            session=session.session if session else NO_SESSION,
+            parameters=session.parameters if session else self._registry.profiles.of(lane.stream),
+        )
+        request.answer(self._keys.query(lane.stream, "density"), message)
 
     def _reset(self, lane: Lane, request: Request) -> None:
         asked = self._payload(lane, request, schemas.ResetRequest, schemas.ResetRequest())

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from pathlib import Path
@@ -11,11 +12,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from commands import start
+from optipmb_client.asking import DensityAsker
 from optipmb_client.cli import run
 from optipmb_client.colours import COLOURS, colour_of, rgb_of
 from optipmb_client.mcap_files.writing import RecordingWriter
+from optipmb_client.transport import Answer, Inbox
 from optipmb_client.watching import LEGEND, View
-from optipmb_schemas import Detections, Keys, Points, Pose, Tracks, encode, encoding_of
+from optipmb_schemas import Density, Detections, Keys, Points, Pose, Tracks, encode, encoding_of
 from routers import free_endpoint
 
 STREAM = "garage/robot-1/lidar"
@@ -99,6 +102,23 @@ def detections() -> Detections:
     )
 
 
+def density() -> Density:
+    """Two components, one that expects next to nothing and one that expects a quarter of an object."""
+    covariance = np.tile(100 * np.eye(6), (2, 1, 1))
+    covariance[:, 0, 0], covariance[:, 1, 1] = 4.0, 9.0
+    return Density(
+        stream=STREAM,
+        session="0" * 32,
+        stamp_ns=0,
+        labels=["Car"],
+        label=[0, 0],
+        weight=[0.0001, 0.25],
+        mean=[[1.0, 2.0, 9.0, 9.0, 9.0, 9.0], [3.0, 4.0, 9.0, 9.0, 9.0, 9.0]],
+        covariance=covariance,
+        z=[0.5, -0.5],
+    )
+
+
 def cloud() -> Points:
     """Two points in the sensor's frame."""
     xyz = np.array([[1, 0, 0], [0, 1, 0]], np.float32)
@@ -160,6 +180,51 @@ def test_detections_and_clouds_are_shown_in_the_world() -> None:
     assert places[0] == pytest.approx([100.0, 51.0, 2.0], abs=1e-4)
     assert places[1] == pytest.approx([99.0, 50.0, 2.0], abs=1e-4)
     assert log.column(f"{STREAM}/sensor", "translation")[0] == [100.0, 50.0, 2.0]
+
+
+def test_components_are_faint_ellipses_on_a_path_of_their_own() -> None:
+    """Place and covariance are those of the message; weight is the size of the point, and how dark both are."""
+    log = Log()
+    view = View(log)  # type: ignore[arg-type]  # as above
+    view.show(density())
+    path = f"{STREAM}/poisson"
+    assert set(log.entities) == {"/", "legend", path, f"{path}/weight"}
+    assert log.column(path, "centers") == [[1.0, 2.0, 0.5], [3.0, 4.0, -0.5]]
+    assert sorted(log.column(path, "half_sizes")[0])[1:] == pytest.approx([4.0, 6.0])
+    assert log.column(f"{path}/weight", "positions") == [[1.0, 2.0, 0.5], [3.0, 4.0, -0.5]]
+    assert log.column(f"{path}/weight", "radii") == pytest.approx([0.01, 0.5])
+    faint, dark = log.column(path, "colors")
+    assert faint > dark
+    view.show(density().model_copy(update={"stamp_ns": None}))
+    assert len(log.times) == 1
+
+
+class Answering:
+    """Stands for a connection: answers every question about a density, and says who asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, str]] = []
+
+    def query(self, key: str, **_options: float) -> tuple[Answer, ...]:
+        """Answer."""
+        self.asked.append((key, threading.current_thread().name))
+        encoding = encoding_of(Density)
+        return (Answer(key, b"no", encoding, ok=False), Answer(key, encode(density()), encoding, ok=True))
+
+
+def test_only_streams_with_new_tracks_are_asked() -> None:
+    """One question for a stream, however many tracks came, and none again while it is silent; never on our thread."""
+    connection, inbox = Answering(), Inbox(9)
+    with DensityAsker(connection, inbox) as asker:  # type: ignore[arg-type]  # stands for a connection
+        for stream in ("a/b/c", "a/b/c", "a/b/d"):
+            asker.note(stream)
+        arrivals = [inbox.get(DEADLINE_S) for _ in range(2)]
+        asker.note("a/b/e")
+        arrivals.append(inbox.get(DEADLINE_S))
+    keys = [Keys().query(stream, "density") for stream in ("a/b/c", "a/b/d", "a/b/e")]
+    assert [arrival.key for arrival in arrivals if arrival] == keys
+    assert [arrival.payload for arrival in arrivals if arrival] == [encode(density())] * 3
+    assert connection.asked == [(key, "densities") for key in keys]
 
 
 def test_the_layout_is_sent_once_and_axes_have_metres() -> None:
@@ -255,6 +320,7 @@ def test_the_viewer_is_served_to_a_browser(incident: Path) -> None:
     [
         (("no.mcap", "--save", "a.rrd"), "no.mcap"),
         (("--web", "--save", "a.rrd"), "--save"),
+        (("some.mcap", "--poisson", "--save", "a.rrd"), "--poisson"),
         (("--streams", "a/b", "--save", "a.rrd"), "a/b"),
     ],
 )

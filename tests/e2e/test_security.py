@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import zenoh
 from optipmb_client import Publisher, Subscriber
-from optipmb_schemas import Keys, ServiceStatus, SessionState, decode
+from optipmb_schemas import Density, Keys, ServiceStatus, SessionState, decode
 from protected import MAKE, Network, Party, make
 from routers import free_endpoint
 
@@ -244,6 +244,8 @@ def test_a_viewer_reads_and_asks_but_changes_nothing(
     (status,) = viewer.ask(KEYS.all_status())
     assert decode(status, ServiceStatus).instance == "tracker"
     assert b"optipmb_info" in viewer.ask(KEYS.metrics("tracker"))[0]
+    (density,) = viewer.ask(KEYS.query(LIDAR, "density"))
+    assert decode(density, Density).stream == LIDAR
     assert viewer.ask(KEYS.query(LIDAR, "reset"), timeout=1.0) == []
     with Party(network.config(VIEWER)) as writer:
         writer.put(KEYS.detections(LIDAR), b"forged")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from optipmb_schemas import (
     Delivery,
+    Density,
     Detections,
     Message,
     MoveRequest,
@@ -73,6 +74,17 @@ def _examples() -> list[Message]:
         stamp_ns=8,
         frames=9,
     )
+    density = Density(
+        stream=HEADER["stream"],
+        session="f" * 32,
+        stamp_ns=8,
+        labels=("car", "pedestrian"),
+        label=np.array([1, 0]),
+        weight=np.array([0.25, 1e-9]),
+        mean=np.arange(12.0).reshape(2, 6),
+        covariance=np.stack([np.eye(6), 2 * np.eye(6)]),
+        z=np.array([1.0, -0.5]),
+    )
     parameters = SessionParameters(
         profile="kitti",
         cloud_wait_s=0.05,
@@ -110,6 +122,7 @@ def _examples() -> list[Message]:
         points,
         tracks,
         state,
+        density,
         parameters,
         ResetRequest(close=True),
         MoveRequest(stream="a/b/c", worker=1),

@@ -11,6 +11,7 @@ from hypothesis.extra.numpy import arrays
 from optipmb_schemas import (
     MESSAGES,
     Delivery,
+    Density,
     Detections,
     Message,
     MoveRequest,
@@ -150,6 +151,23 @@ def tracks(draw: st.DrawFn) -> Tracks:
     )
 
 
+@st.composite
+def densities(draw: st.DrawFn) -> Density:
+    """Return densities."""
+    n, names = draw(st.integers(0, 5)), draw(labels)
+    return Density(
+        stream=draw(stream),
+        session=draw(session),
+        stamp_ns=draw(st.none() | count),
+        labels=tuple(names),
+        label=draw(whole(n, 0, len(names) - 1)),
+        weight=draw(rows((n,), 0, 1e30)),
+        mean=draw(rows((n, 6), -1e30, 1e30)),
+        covariance=draw(rows((n, 6, 6), -1e30, 1e30)),
+        z=draw(rows((n,), -1e30, 1e30)),
+    )
+
+
 problems = st.builds(
     Problem,
     stream=text,
@@ -187,6 +205,7 @@ messages: dict[type[Message], st.SearchStrategy[Message]] = {
         frames=count,
         queue=count,
     ),
+    Density: densities(),
     SessionParameters: st.builds(
         SessionParameters,
         profile=st.none() | chunk,

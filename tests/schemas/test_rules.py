@@ -147,6 +147,8 @@ RULES: list[tuple[str, str, Any, str]] = [
     ("ResetRequest", "close", 1, "close"),
     ("SessionState", "state", "old", "state"),
     ("SessionState", "epoch", "", "epoch"),
+    ("Density", "weight", [0.5, -1.0], "weight[1]"),
+    ("Density", "label", [0, 2], "label[1]"),
     ("Problem", "message", "x" * 501, "message"),
     ("Problem", "instance", "a/b", "instance"),
     ("Problem", "instance", "", "instance"),

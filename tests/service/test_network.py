@@ -14,6 +14,7 @@ import pytest
 import zenoh
 import zenoh.ext
 from optipmb_schemas import (
+    Density,
     Detections,
     Keys,
     Problem,
@@ -282,6 +283,29 @@ def test_state_of_a_stream(node: Node) -> None:
     assert node.ask(KEYS.query("no/such/stream", "state"), SessionState).state == "new"
     answers = node.query(KEYS.all_queries("state"))
     assert sorted(decode(payload, SessionState).stream for _, _, payload in answers) == [SENSOR.stream, other.stream]
+
+
+def test_density_of_a_stream(node: Node) -> None:
+    """q/density gives the Poisson components that the tracker holds, to the bit; none without a session."""
+    parameters = optipmb.load_profile("kitti")  # makes Poisson components of what it detects for the first time
+    frame = SENSOR.detections(0, labels=("Car", "Cyclist"), score=np.full(3, 0.4))
+    session = Session(SENSOR.stream, parameters)
+    session.on_detections(frame, 0)
+    node.ask(KEYS.query(SENSOR.stream, "parameters"), SessionParameters, SessionParameters(profile="kitti"))
+    node.send(frame)
+    tracks = node.tracks(SENSOR.stream, 1)[-1]
+    answer = node.ask(KEYS.query(SENSOR.stream, "density"), Density)
+    assert (answer.stream, answer.session, answer.stamp_ns) == (SENSOR.stream, tracks.session, tracks.stamp_ns)
+    assert answer.labels == tuple(parameters.classes)
+    poisson = session.density.poisson
+    assert len(poisson) > 0
+    for name in ("label", "weight", "mean", "covariance"):
+        assert np.array_equal(getattr(answer, name), getattr(poisson, name)), name
+    assert np.array_equal(answer.z, poisson.auxiliary[:, 3])
+    state = node.ask(KEYS.query(SENSOR.stream, "state"), SessionState)
+    assert state.poissons == len(answer.weight)
+    nothing = node.ask(KEYS.query("no/such/stream", "density"), Density)
+    assert (len(nothing.weight), nothing.session, nothing.stamp_ns) == (0, "0" * 32, None)
 
 
 def test_questions_that_are_none_are_refused(node: Node) -> None:
