@@ -8,7 +8,7 @@ From the outside in:
     supervisor, child, whole, worker, share    several processes as one instance
     service, loops          the control loop: start, signals, timers, end
     vitals, metrics, figures, http, health    how it is, for those who ask from outside
-    transport               Zenoh, behind the protocols of ports
+    transport/              Zenoh, behind the protocols of ports
     registry, queries       streams and questions, found and sorted
     lane, inbox             one stream: its queue, its worker's turn
     session, timing         one density and all decisions about it; pure

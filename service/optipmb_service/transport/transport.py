@@ -1,26 +1,11 @@
-"""Zenoh, and nothing else: the one module of the service that imports it.
-
-Conventions: payloads are bytes, keys are text. Rules that avoid Zenoh's known traps:
-
-- Nothing runs in Zenoh's callbacks. Every subscription is a FIFO channel that one thread always drains; what it calls
-  must only put the message into a queue. The thread reads the channel's handler, not the subscription: a subscription
-  that is being read cannot be undeclared.
-- References to publishers, tokens and subscriptions are kept: Zenoh withdraws what nobody refers to.
-- Closing goes from the outside in: the alive token, subscriptions and queryables (their threads read on until the
-  channels are closed and empty), publishers and owner tokens, the session.
-- Implicit shared memory is off unless asked for: it loses messages when a receiver stalls, and leaves files behind.
-- Messages wait 50 ms before congestion drops them (500 ms for large ones): with the defaults, large messages are lost
-  whenever the machine is busy.
-"""
+"""A Zenoh session with what the service declares on it: what it reads, what it sends, who it is; and their end."""
 
 from __future__ import annotations
 
 import contextlib
-import json
-import re
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
 import optipmb_schemas as schemas
 import structlog
@@ -28,13 +13,15 @@ import zenoh
 import zenoh.ext
 
 from optipmb_service.ports import Packet, TransportError
+from optipmb_service.transport.handles import Claim, Question, Token, undeclare
+from optipmb_service.transport.opening import close, line, opened
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
-    from pathlib import Path
 
     from optipmb_service.ports import Request
     from optipmb_service.settings import Settings
+    from optipmb_service.transport.handles import Undeclared
 
 CHANNEL: Final = 4096
 """Messages between Zenoh and a draining thread; more than any publisher's history."""
@@ -57,98 +44,9 @@ TOKENS: Final = 2**20
 OWNERS_S: Final = 1.0
 """How long the network may take to say who owns a stream; it takes less than a millisecond."""
 
-WAIT_BEFORE_DROP_US: Final = 50_000
-WAIT_BEFORE_DROP_FRAGMENTS_US: Final = 500_000
-
-RETRY_MS: Final = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2}
-
-MESSAGE_HEADROOM: Final = 4
-"""A message up to this many times the limit is received and answered by a problem; a larger one is dropped by Zenoh."""
-
-
 log = structlog.get_logger("optipmb_service")
 
 _T = TypeVar("_T")
-
-
-# What is used of Zenoh's objects, typed: its own stubs leave parts untyped.
-class _Undeclared(Protocol):
-    def undeclare(self) -> object: ...
-
-
-class _Closed(Protocol):
-    def close(self) -> object: ...
-
-
-class _Dropped(Protocol):
-    def drop(self) -> object: ...
-
-
-class _Publisher(_Undeclared, Protocol):
-    def put(self, payload: bytes) -> object: ...
-
-
-def configuration(settings: Settings) -> zenoh.Config:
-    """Return Zenoh's configuration for the settings.
-
-    Raises:
-        TransportError: an endpoint or a file that Zenoh cannot use.
-    """
-    values: dict[str, object] = {
-        "mode": "router" if settings.is_router else "client",
-        "listen/endpoints": list(settings.endpoints),
-        "connect/endpoints": list(settings.connect),
-        "connect/timeout_ms": -1,
-        "connect/retry": RETRY_MS,
-        "scouting/multicast/enabled": False,
-        "scouting/delay": 0,
-        "timestamping/enabled": True,
-        "transport/shared_memory/enabled": settings.shared_memory,
-        "transport/link/tx/lease": round(settings.lease_s * 1e3),
-        "transport/link/rx/max_message_size": MESSAGE_HEADROOM * settings.limits.max_bytes,
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
-        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": WAIT_BEFORE_DROP_FRAGMENTS_US,
-    }
-    if settings.is_router:
-        values["connect/exit_on_failure"] = False  # a router starts without the routers that it looks for
-    config = _base(settings.zenoh_config)
-    for key, value in values.items():
-        try:
-            config.insert_json5(key, json.dumps(value))
-        except zenoh.ZError as error:
-            raise TransportError(f"setting {key}: {_line(error)}") from error
-    return config
-
-
-def _base(file: Path | None) -> zenoh.Config:
-    """Return what the settings are laid over."""
-    try:
-        return zenoh.Config() if file is None else zenoh.Config.from_file(file)
-    except (zenoh.ZError, OSError) as error:
-        reason = _line(error) if isinstance(error, zenoh.ZError) else str(error)
-        raise TransportError(f"Zenoh configuration {file}: {reason}") from error
-
-
-class Router:
-    """A Zenoh router and nothing else.
-
-    Args:
-        settings: endpoints, and the file with everything else.
-
-    Raises:
-        TransportError: an endpoint is in use or unusable, or the file is.
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        try:
-            self._session = zenoh.open(configuration(settings))
-        except zenoh.ZError as error:
-            raise TransportError(_opening(settings, error)) from error
-
-    def close(self) -> None:
-        """Close the router; who is linked to it looks for another one."""
-        with contextlib.suppress(zenoh.ZError):
-            cast("_Closed", self._session).close()
 
 
 class Transport:
@@ -167,14 +65,11 @@ class Transport:
         self._instance = settings.instance
         self._max_bytes = settings.limits.max_bytes
         self._is_router = settings.is_router
-        try:
-            self._session = zenoh.open(configuration(settings))
-        except zenoh.ZError as error:
-            raise TransportError(_opening(settings, error)) from error
-        self._readers: list[tuple[_Undeclared, threading.Thread]] = []
+        self._session = opened(settings)
+        self._readers: list[tuple[Undeclared, threading.Thread]] = []
         self._claims: set[Claim] = set()
         self._lock = threading.Lock()
-        self._alive: _Undeclared | None = None
+        self._alive: Undeclared | None = None
 
     # Receiving
 
@@ -226,7 +121,7 @@ class Transport:
         Raises:
             TransportError: the session is closed.
         """
-        taps: list[_Undeclared] = []
+        taps: list[Undeclared] = []
 
         def follow(topic: Literal["tracks", "detections"]) -> None:
             def hand_over(samples: Iterable[zenoh.Sample]) -> None:
@@ -241,14 +136,14 @@ class Transport:
 
         def release() -> None:
             for subscriber in taps:
-                _undeclare(subscriber)
+                undeclare(subscriber)
 
         try:
             follow("tracks")
             follow("detections")
         except zenoh.ZError as error:
             release()
-            raise TransportError(_line(error)) from error
+            raise TransportError(line(error)) from error
         return release
 
     def watch(self) -> None:
@@ -258,7 +153,7 @@ class Transport:
         )
         self._read("links", listener, listener.handler, _log_link)
 
-    def _read(self, name: str, declared: _Undeclared, handler: Iterable[_T], receive: Callable[[_T], None]) -> None:
+    def _read(self, name: str, declared: Undeclared, handler: Iterable[_T], receive: Callable[[_T], None]) -> None:
         def drain() -> None:
             with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
                 for item in handler:
@@ -305,7 +200,7 @@ class Transport:
                 publisher_detection=True,
             )
         except zenoh.ZError as error:
-            raise TransportError(_line(error)) from error
+            raise TransportError(line(error)) from error
         claim = Claim(publisher, self._forget)
         with self._lock:
             self._claims.add(claim)
@@ -382,10 +277,10 @@ class Transport:
     def stop(self, timeout: float) -> None:
         """Receive nothing any more; what was received before is handed over within `timeout` seconds."""
         if self._alive is not None:
-            _undeclare(self._alive)
+            undeclare(self._alive)
             self._alive = None
         for declared, _ in self._readers:
-            _undeclare(declared)
+            undeclare(declared)
         for _, thread in self._readers:
             thread.join(timeout)
         self._readers.clear()
@@ -397,99 +292,11 @@ class Transport:
             claims = tuple(self._claims)
         for claim in claims:
             claim.release()
-        with contextlib.suppress(zenoh.ZError):
-            cast("_Closed", self._session).close()
+        close(self._session)
 
     def _forget(self, claim: Claim) -> None:
         with self._lock:
             self._claims.discard(claim)
-
-
-class Claim:
-    """The publisher of a stream's tracks."""
-
-    def __init__(self, publisher: _Publisher, forget: Callable[[Claim], None]) -> None:
-        self._publisher = publisher
-        self._forget = forget
-
-    def publish(self, payload: bytes) -> None:
-        """Send encoded tracks.
-
-        Raises:
-            TransportError: the publisher is withdrawn.
-        """
-        try:
-            self._publisher.put(payload)
-        except zenoh.ZError as error:
-            raise TransportError(_line(error)) from error
-
-    def release(self) -> None:
-        """Withdraw the publisher."""
-        _undeclare(self._publisher)
-        self._forget(self)
-
-
-class Token:
-    """A liveliness token; it vanishes with its process and its link too."""
-
-    def __init__(self, declared: _Undeclared) -> None:
-        self._declared = declared
-
-    def withdraw(self) -> None:
-        """Take it back."""
-        _undeclare(self._declared)
-
-
-class Question:
-    """A query; not finished, it keeps its asker waiting until the timeout."""
-
-    def __init__(self, query: zenoh.Query) -> None:
-        self._query = query
-        self.key = str(query.key_expr)
-        payload = query.payload
-        self.payload = None if payload is None else payload.to_bytes()
-        self.encoding = "" if query.encoding is None else str(query.encoding)
-
-    def matches(self, key: str) -> bool:
-        """Tell whether the key expression that was asked includes a key."""
-        return bool(self._query.key_expr.intersects(zenoh.KeyExpr(key)))
-
-    def answer(self, key: str, message: schemas.Message) -> None:
-        """Reply.
-
-        Raises:
-            TransportError: the asker or the session is gone.
-        """
-        try:
-            self._query.reply(key, schemas.encode(message), encoding=schemas.encoding_of(message))
-        except zenoh.ZError as error:
-            raise TransportError(_line(error)) from error
-
-    def answer_text(self, key: str, text: bytes, encoding: str) -> None:
-        """Reply with text that is no message.
-
-        Raises:
-            TransportError: the asker or the session is gone.
-        """
-        try:
-            self._query.reply(key, text, encoding=encoding)
-        except zenoh.ZError as error:
-            raise TransportError(_line(error)) from error
-
-    def refuse(self, problem: schemas.Problem) -> None:
-        """Reply with an error.
-
-        Raises:
-            TransportError: the asker or the session is gone.
-        """
-        try:
-            self._query.reply_err(schemas.encode(problem), encoding=schemas.encoding_of(problem))
-        except zenoh.ZError as error:
-            raise TransportError(_line(error)) from error
-
-    def finish(self) -> None:
-        """Tell the asker that nothing follows."""
-        cast("_Dropped", self._query).drop()
 
 
 def _answering(answer: Callable[[Request], None]) -> Callable[[zenoh.Query], None]:
@@ -501,23 +308,3 @@ def _log_link(event: zenoh.TransportEvent) -> None:
     log.info(
         "peer_connected" if came else "peer_lost", peer=str(event.transport.zid), kind=str(event.transport.whatami)
     )
-
-
-def _undeclare(declared: _Undeclared) -> None:
-    with contextlib.suppress(zenoh.ZError):  # the session may be closed already
-        declared.undeclare()
-
-
-def _line(error: zenoh.ZError) -> str:
-    """Return Zenoh's words without the places in its sources."""
-    text = re.sub(r" at /\S+?:\d+\.?", "", str(error))
-    return " ".join(text.split()).rstrip(".")[:300]
-
-
-def _opening(settings: Settings, error: zenoh.ZError) -> str:
-    """Return one line for a session that could not be opened."""
-    text = _line(error)
-    where = ", ".join((*settings.endpoints, *settings.connect))
-    if "Address already in use" in text:
-        return f"cannot listen on {where}: the address is in use; is another optipmb-service running?"
-    return f"cannot open {where}: {text}"
