@@ -263,12 +263,12 @@ class Lane:
             return  # given up meanwhile, or lost again, which will be told too
         if self.session is None and self._open() is None:
             self._circle.steward.leave(self.stream)
-        self._answer()
         for packet, frame in self._standby.take():
             if self.session is not None:
                 self._guard(self._receive, packet, frame=frame)
             else:
                 self._accounts.refuse(self.session, frame=frame)
+        self._answer()
 
     def give_seat(self) -> None:
         """Another instance owns the stream: what is here is no longer the newest state."""
@@ -279,8 +279,16 @@ class Lane:
         """The session has ended and its state is kept: whoever gets the next message of the stream may go on."""
         if self.session is None:
             self._circle.steward.leave(self.stream)
-            if self._standby:
+            if self._standby or self._asking:
                 self._circle.steward.seek(self.stream)
+
+    def hand_over(self, then: Callable[[], None] = lambda: None) -> None:
+        """End the session because another worker has the stream now; `then` is called when its state is kept.
+
+        While it is not known yet who owns the stream, its first packets wait here and nowhere else: they are tracked
+        first.
+        """
+        self.ask(lambda lane: lane.close_session("moved", then), seek=False)
 
     def trim(self) -> None:
         """Drop what has waited too long for a takeover."""

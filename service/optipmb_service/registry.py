@@ -202,8 +202,11 @@ class Registry:
     # What the control loop has done now and then
 
     def sweep(self, now_ns: int) -> None:
-        """Log streams that fell silent, close sessions that have been idle for long."""
+        """Log streams that fell silent, close sessions that have been idle for long, or are another worker's."""
         for lane in self.lanes():
+            if not self.share.has(lane.stream):
+                # What was on its way while the stream was moved began a session once more.
+                self.command(lane.stream, Lane.hand_over, urgent=False)
             age_s = lane.meter.age_s(now_ns)
             if age_s is not None and age_s > self._settings.stale_s and not lane.stale:
                 lane.stale = True

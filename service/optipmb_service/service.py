@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from optipmb_service.circle import Member
-    from optipmb_service.lane import Lane
     from optipmb_service.metrics import Value
     from optipmb_service.profiles import Profiles
     from optipmb_service.settings import Settings
@@ -143,12 +142,8 @@ class Service:
         return ended
 
     def give_up(self, stream: str, then: Callable[[], None]) -> bool:
-        """End the session of a stream after what was received, then call `then`; False when there is none."""
-
-        def end(lane: Lane) -> None:
-            lane.close_session("moved", then)
-
-        return self._registry.lane(stream) is not None and self._registry.command(stream, end, urgent=False)
+        """End the session of a stream after what was received, then call `then`; False when there can be none."""
+        return self._registry.command(stream, lambda lane: lane.hand_over(then), urgent=False)
 
     @property
     def state(self) -> str:

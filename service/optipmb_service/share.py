@@ -41,13 +41,14 @@ class Share:
         """Whether this worker tracks a stream; may be called by any thread."""
         if self.count == 1:
             return True
-        known = self._known.get(stream)
-        if known is None:
-            known = self._moved.get(stream, worker_of(stream, self.count)) == self.index
-            if len(self._known) >= MAX_KNOWN:
-                self._known = {}
-            self._known[stream] = known
-        return known
+        known = self._known  # of one moment: an answer from before a move goes into the table that the move threw away
+        answer = known.get(stream)
+        if answer is None:
+            answer = self._moved.get(stream, worker_of(stream, self.count)) == self.index
+            if len(known) >= MAX_KNOWN:
+                known.clear()
+            known[stream] = answer
+        return answer
 
     def move(self, stream: str, index: int) -> None:
         """Give a stream to a worker, whichever had it."""

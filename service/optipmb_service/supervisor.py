@@ -41,7 +41,10 @@ STEADY_S: Final = 60.0
 END_S: Final = 3.0
 """Beyond the grace, how long workers may take to end before they are killed."""
 
-ORDER_S: Final = 10.0
+OVERLAP_S: Final = 0.25
+"""How much later than the new worker of a stream the old one may receive a message, without a loss."""
+
+ORDER_S: Final = 9.0
 """Longest wait for an order to be carried out."""
 
 State = Literal["starting", "ready", "down"]
@@ -108,8 +111,9 @@ class Supervisor:
     async def move(self, stream: str, worker: int) -> None:
         """Give a stream to a worker, from whichever has it.
 
-        The new one is told first: it keeps what arrives from then on. The old one gives the stream up after what it has
-        received, and the new one goes on from there.
+        The new one is told first: it keeps what arrives from then on. For a moment both receive, so that a message which
+        reaches one of them later than the other is not lost between them. Then the old one gives the stream up after
+        what it has received, and the new one goes on from there.
 
         Raises:
             TimeoutError: a worker did not follow; all are told nevertheless.
@@ -118,6 +122,7 @@ class Supervisor:
             self._moved[stream] = worker
             others = [index for index in range(self.count) if index != worker]
             await self._ordered([worker], stream, worker)
+            await asyncio.sleep(OVERLAP_S)
             await self._ordered(others, stream, worker)
             log.info("stream_moved", stream=stream, to=worker)
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from optipmb_service.circle import Member
+    from optipmb_service.share import Share
 
     Start = Callable[..., tuple[Service, str]]
 
@@ -31,14 +32,16 @@ def _compiled() -> None:
 
 @pytest.fixture
 def start(_compiled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
-    """Start services; each is stopped at the end. Options are settings; `tracker` makes the trackers."""
+    """Start services; each is stopped at the end. Options are settings; `tracker` and `share` are the service's own."""
     with contextlib.ExitStack() as stack:
 
-        def begin(*, tracker: Any = optipmb.Tracker, **options: Any) -> tuple[Service, str]:
+        def begin(
+            *, tracker: Any = optipmb.Tracker, share: Share | None = None, **options: Any
+        ) -> tuple[Service, str]:
             endpoint = free_endpoint()
             given = {"listen": [endpoint], "instance": "test", "threads": 2, "grace_s": 0.2, "store": "none"} | options
             settings = load(None, given).settings
-            service = Service(settings, Profiles.read(settings.profile, settings.profiles), arm, tracker)
+            service = Service(settings, Profiles.read(settings.profile, settings.profiles), arm, tracker, share)
             stack.callback(service.stop)
             service.start()
             return service, (settings.endpoints or settings.connect)[0]
