@@ -8,13 +8,15 @@ DATA ?= data
 KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
-.PHONY: help demo test bench baseline figures load kills stack install lint types tests schemas wheel clean tune ablate
+.PHONY: help demo test bench baseline figures load kills soak stack install lint types tests schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    everything that CI runs: lint, types, tests, schemas, wheel, demo"
 	@echo "make bench   time the tracker, its kernels, the codec and the service, beside the saved baseline"
 	@echo "make figures measure the tracker's figures of docs/performance.md, beside other trackers, and write the page"
 	@echo "make load    measure what the service carries on this machine, as docs/performance.md has it"
+	@echo "make kills   kill the service a hundred times while recorded frames stream through it, and compare (needs DATA)"
+	@echo "make soak    load the service for an hour, and see that nothing grows and every message is counted"
 	@echo "make stack   run the compose file's stack as processes and show that it works (needs Debian's prometheus)"
 	@echo "make tune    make the tuned profiles anew from DATA=... (out/tune-*/tuned.toml) and compare them with those that ship"
 	@echo "make ablate  print the tables of docs/ablation.md anew from DATA=..."
@@ -99,6 +101,10 @@ ablate: install
 # A hundred SIGKILLs in the middle of recorded sequences, which CI does three times; needs the KITTI data.
 kills: install
 	OPTIPMB_TEST_KILLS=100 $(BIN)/pytest -q tests/e2e/test_kill.py --timeout 0
+
+# An hour of load, which CI does for seconds.
+soak: install
+	OPTIPMB_TEST_SOAK_S=3600 OPTIPMB_TEST_SOAK_STREAMS=20 $(BIN)/pytest -q tests/e2e/test_soak.py --timeout 0
 
 clean:
 	rm -rf $(VENV) out build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -111,9 +111,9 @@ class Supervisor:
     async def move(self, stream: str, worker: int) -> None:
         """Give a stream to a worker, from whichever has it.
 
-        The new one is told first: it keeps what arrives from then on. For a moment both receive, so that a message which
-        reaches one of them later than the other is not lost between them. Then the old one gives the stream up after
-        what it has received, and the new one goes on from there.
+        The new one is told first: it keeps what arrives from then on. For a moment both receive, so that a message
+        which reaches one of them later than the other is not lost between them. Then the old one gives the stream up
+        after what it has received, and the new one goes on from there.
 
         Raises:
             TimeoutError: a worker did not follow; all are told nevertheless.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING, Any
 
-import pytest
 from optipmb_schemas import Keys
 from optipmb_service.share import Share
 from optipmb_service.transport import Transport
@@ -14,6 +13,8 @@ from router import Node, Sensor, until
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from pathlib import Path
+
+    import pytest
 
 KEYS = Keys()
 SENSOR = Sensor()
