@@ -20,21 +20,19 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from optipmb_service.moments import Entry, Moment
-    from optipmb_service.records import Policy
     from optipmb_service.stepping import Stepper
 
 SUFFIX: Final = ".dump"
 MAX_TRACE: Final = 100_000
 
 
-def dump_of(stepper: Stepper, base: Moment, placed: Sequence[Entry], policy: Policy, error: Exception) -> bytes:
+def dump_of(stepper: Stepper, base: Moment, placed: Sequence[Entry], error: Exception) -> bytes:
     """Return what `optipmb track --dump` replays to the same error.
 
     Args:
         stepper: of the session.
         base: the moment before the window.
         placed: the frames of the window with the one that failed, in the order of processing.
-        policy: of the session.
         error: what was raised.
     """
     frames: list[schemas.DumpedFrame] = []
@@ -42,7 +40,7 @@ def dump_of(stepper: Stepper, base: Moment, placed: Sequence[Entry], policy: Pol
     for entry in placed:
         anew = begins_with(moment, entry)
         try:
-            moment, outcome = stepper.step(moment, entry, policy)
+            moment, outcome = stepper.step(moment, entry)
         except Exception:  # noqa: BLE001 - the very one
             frames.append(schemas.DumpedFrame(entry.message, entry.points, anew))
             break

@@ -12,7 +12,6 @@ them: commands, the state to be written down, and what is done when a step fails
 from __future__ import annotations
 
 import time
-import weakref
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -20,15 +19,13 @@ import optipmb
 from optipmb_service import convert
 from optipmb_service.checkpoint import Checkpoint, Recorded
 from optipmb_service.clouds import Clouds
-from optipmb_service.complaints import Complaints
-from optipmb_service.history import History
-from optipmb_service.moments import Entry, Moment, Whereabouts, weigh
+from optipmb_service.moments import Entry, Moment, Whereabouts
+from optipmb_service.past import Past
 from optipmb_service.quarantine import dump_of
 from optipmb_service.records import (
     SECOND,
     Begun,
     Counters,
-    Deliveries,
     Life,
     Output,
     Policy,
@@ -36,18 +33,16 @@ from optipmb_service.records import (
     RefusedError,
     Tracked,
 )
-from optipmb_service.stepping import Outcome, Stepper, empty
-from optipmb_service.telling import counters_of, state_of
-from optipmb_service.timing import Decision, Mark, Timeline, Verdict, hold_until
+from optipmb_service.stepping import Outcome, Stepper
+from optipmb_service.telling import Telling
+from optipmb_service.timing import Mark, Timeline, hold_until
 from optipmb_service.waiting import Held, Waiting
-from optipmb_service.window import window_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     import optipmb_schemas as schemas
 
-    from optipmb_service.history import Step
     from optipmb_service.records import Steps
     from optipmb_service.telling import Condition
     from optipmb_service.waiting import Ready
@@ -81,17 +76,13 @@ class Session:
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> None:
         self.stream = stream
-        self._deliveries = Deliveries()
         self._policy = policy or Policy()
         self._cloud_wait_ns: int | None = None
-        self._complain = Complaints(stream, instance)
+        self._telling = Telling(stream, instance, self._policy)
         self._clock = clock
         self._make = tracker
-        self._stepper = Stepper(stream, parameters, tracker(parameters))
-        life = life or Life()
-        self._history = History(empty(self._stepper, None, life.next_id, life.starts), _weakly(self._step))
-        self._done = Timeline(self._policy.gap_limit_ns)
-        self._arrived = self._done
+        self._past = Past(self._stepper(parameters), self._policy, life or Life())
+        self._arrived = self._past.timeline
         self._waiting = Waiting()
         self._clouds = Clouds(self._policy.clouds)
         self._quarantine = ""
@@ -113,19 +104,20 @@ class Session:
         mark = Mark(message.epoch, message.seq, message.stamp_ns)
         outputs: list[Output] = []
         if self._quarantine:
-            if self._done.knows(mark.epoch):
-                self._deliveries.refused += 1
-                return [self._complain.quarantined(mark, self._quarantine)]
+            if self._past.timeline.knows(mark.epoch):
+                self._telling.deliveries.refused += 1
+                return [self._telling.complain.quarantined(mark, self._quarantine)]
             outputs += self.reset("quarantine")
         decision, arrived = self._arrived.judge(mark)
         if not decision.verdict.admitted:
-            return [*outputs, *self._refuse(mark, decision)]
+            return [*outputs, *self._telling.refused(mark, decision)]
         try:
             frame, ignored = convert.frame_of(self.parameters, message)
         except optipmb.FrameError as error:
-            self._deliveries.refused += 1
-            self._done, self._arrived = self._done.note(mark), self._arrived.note(mark)
-            return [*outputs, self._complain.invalid(mark, error)]
+            self._telling.deliveries.refused += 1
+            self._past.note(mark)
+            self._arrived = self._arrived.note(mark)
+            return [*outputs, self._telling.complain.invalid(mark, error)]
         self._arrived = arrived
         deadline_ns = hold_until(
             has_points=message.has_points,
@@ -149,7 +141,7 @@ class Session:
         try:
             convert.cloud_of(message)
         except optipmb.FrameError as error:
-            return [self._complain.invalid(Mark(message.epoch, message.seq, message.stamp_ns), error)]
+            return [self._telling.complain.invalid(Mark(message.epoch, message.seq, message.stamp_ns), error)]
         self._clouds.add(message)
         outputs = self._amend(message, ticket) if self._policy.late_clouds and not self._quarantine else []
         return [*outputs, *self._advance(now_ns)]
@@ -161,7 +153,7 @@ class Session:
     @property
     def deadline_ns(self) -> int | None:
         """When `on_tick` is due (monotonic, ns); None while nothing is held."""
-        return self._waiting.deadline_ns(self._complete)
+        return self._waiting.deadline_ns(self._past.complete_until)
 
     @property
     def held(self) -> int:
@@ -170,7 +162,7 @@ class Session:
 
     def refuse(self) -> None:
         """Count a message of the stream that was none."""
-        self._deliveries.refused += 1
+        self._telling.deliveries.refused += 1
 
     # Commands
 
@@ -182,13 +174,13 @@ class Session:
         """Forget the density and begin anew; frames seen before stay seen, track ids go on, a quarantine ends."""
         outputs = self.flush()
         self._quarantine = ""
-        head = self._history.head
+        head = self._past.head
         starts = head.starts + 1
         self._begin(
             replace(
                 head,
                 density=optipmb.Density.empty(head.density.next_id),
-                session=self._stepper.name(head.last, starts),
+                session=self._past.stepper.name(head.last, starts),
                 starts=starts,
                 tracks=0,
                 reported=frozenset(),
@@ -217,13 +209,12 @@ class Session:
             self._wait(round(cloud_wait_s * SECOND))
         if parameters is not None and changes:
             # Frames are given to the tracker by the classes of the old profile: they cannot be gone over again.
-            self._begin(self._history.head)
-            self._stepper = Stepper(self.stream, parameters, self._make(parameters))
+            self._begin(self._past.head, self._stepper(parameters))
         if restart:
             outputs += self.reset("parameters")
         elif changes:
-            head = self._history.head
-            self._begin(replace(head, session=self._stepper.name(None, head.starts)))
+            head = self._past.head
+            self._begin(replace(head, session=self._past.stepper.name(None, head.starts)))
         return outputs
 
     # To be written down and taken up again
@@ -233,17 +224,17 @@ class Session:
 
         Frames that are held are not in it: they come again from the publisher's cache.
         """
-        base, entries = self._history.portable(self._policy.checkpoint_bytes)
+        base, entries = self._past.portable()
         return Checkpoint(
             stream=self.stream,
             parameters=self.parameters,
             cloud_wait_ns=self._cloud_wait_ns,
             quarantine=self._quarantine,
-            epochs=self._done.epochs,
+            epochs=self._past.timeline.epochs,
             base=base,
             window=tuple(Recorded(one.message, one.points, one.missed, one.revision, one.packed) for one in entries),
-            head=self._history.head,
-            deliveries=replace(self._deliveries),
+            head=self._past.head,
+            deliveries=replace(self._telling.deliveries),
             newest_cloud_ns=self._clouds.newest_ns,
             run=self._run,
         )
@@ -294,22 +285,22 @@ class Session:
     @property
     def parameters(self) -> optipmb.Parameters:
         """The profile."""
-        return self._stepper.parameters
+        return self._past.stepper.parameters
 
     @property
     def session(self) -> str:
         """The id of the present life of the density."""
-        return self._history.head.session
+        return self._past.head.session
 
     @property
     def density(self) -> optipmb.Density:
         """The density after the last frame."""
-        return self._history.head.density
+        return self._past.head.density
 
     @property
     def counters(self) -> Counters:
         """What happened to the messages so far."""
-        return counters_of(self._deliveries, self._history.head.counts)
+        return self._telling.counters(self._past.head)
 
     @property
     def run(self) -> int:
@@ -333,16 +324,14 @@ class Session:
     @property
     def life(self) -> Life:
         """What a later session of the stream has to know."""
-        head = self._history.head
+        head = self._past.head
         return Life(head.starts, head.density.next_id)
 
     def state(self, *, shed: int = 0, queue: int = 0, closed: bool = False) -> schemas.SessionState:
         """Return the state as the message that answers a query."""
-        return state_of(
-            self.stream,
+        return self._telling.state(
             self.parameters.name,
-            self._history.head,
-            self.counters,
+            self._past.head,
             condition=self._condition(closed=closed),
             shed=shed,
             queue=queue + len(self._waiting),
@@ -362,12 +351,9 @@ class Session:
     def _advance(self, now_ns: int | None) -> list[Output]:
         """Process the frames that are ready, in order; None: all of them."""
         outputs: list[Output] = []
-        while (ready := self._waiting.take(now_ns, self._complete, self._cloud)) is not None:
+        while (ready := self._waiting.take(now_ns, self._past.complete_until, self._cloud)) is not None:
             outputs += self._process(ready)
         return outputs
-
-    def _complete(self, mark: Mark) -> bool:
-        return self._done.complete_until(mark, self._history.head.tracked)
 
     def _cloud(self, held: Held) -> schemas.Points | None:
         if held.message.has_points is False:
@@ -375,120 +361,82 @@ class Session:
         return self._clouds.get(held.mark.epoch, held.mark.stamp_ns, self._arrived.knows)
 
     def _process(self, ready: Ready) -> list[Output]:
-        """Put a frame in its place; when a step raises, the session is quarantined as it was before."""
-        began_ns = self._clock()
-        held, points = ready.held, ready.points
-        mark = held.mark
-        decision, done = self._done.judge(mark)
+        """Put a frame in its place."""
+        began_ns, mark = self._clock(), ready.held.mark
+        decision, timeline = self._past.timeline.judge(mark)
         if not decision.verdict.admitted:
-            return self._refuse(mark, decision)
-        weight = weigh(held.message, points)
-        entry = Entry(mark, decision.place, held.message, points, ready.missed, 0, held.frame, held.ignored, weight)
-        placed = [*self._history.entries, entry] if decision.last else self._history.inserted(entry, done.places())
-        before = self.session
-        try:
-            outcomes = self._history.append(entry) if decision.last else self._history.redo(placed)
-        except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
-            return self._fail(error, placed, mark)
-        self._settle(done)
-        self._deliveries.inserted += not decision.last
-        return self._report(outcomes, before, held.ticket, began_ns)
+            return self._telling.refused(mark, decision)
+        placed = self._past.placed(ready, decision, timeline)
+        return self._go(placed, timeline, mark, ready.held.ticket, began_ns, behind=decision.last)
 
     def _amend(self, message: schemas.Points, ticket: Any) -> list[Output]:
         """Put a cloud that came after its frame into the window."""
-        began_ns, before = self._clock(), self.session
-        placed = self._history.amended(message, self._done.knows)
-        if all(new is old for new, old in zip(placed, self._history.entries, strict=True)):
-            return []
+        began_ns, mark = self._clock(), Mark(message.epoch, message.seq, message.stamp_ns)
+        placed = self._past.amended(message)
+        return [] if placed is None else self._go(placed, self._past.timeline, mark, ticket, began_ns, behind=False)
+
+    def _go(
+        self, placed: list[Entry], timeline: Timeline, mark: Mark, ticket: Any, began_ns: int, *, behind: bool
+    ) -> list[Output]:
+        """Go through frames with what is new among them; when a step raises, the session is quarantined as it was."""
+        before = self.session
         try:
-            outcomes = self._history.redo(placed)
-        except Exception as error:  # noqa: BLE001 - as above
-            return self._fail(error, placed, Mark(message.epoch, message.seq, message.stamp_ns))
-        self._settle(self._done)
-        self._deliveries.inserted += 1
+            outcomes = self._past.go(placed, behind=behind)
+        except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
+            return self._fail(error, placed, mark)
+        self._settle(timeline)
+        self._telling.deliveries.inserted += not behind
         return self._report(outcomes, before, ticket, began_ns)
 
     def _report(self, outcomes: list[Outcome], before: str, ticket: Any, began_ns: int) -> list[Output]:
         """Return what is to be told of frames that were gone through."""
-        outputs: list[Output] = []
-        begins = next((one.begins for one in reversed(outcomes) if one.begins), None)
-        if begins is not None and self.session != before:
-            outputs.append(Begun(self.session, begins.reason, begins.jump_ns))
+        outputs = self._telling.begun(outcomes, before, self.session)
         step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
         for one in outcomes:
-            if one.entry.revision == 0:
-                outputs += self._complain.unknown(one.entry.mark, one.unknown, self.parameters)
-                if one.tracks is None:
-                    outputs.append(self._complain.astray(one.entry, self._policy))
+            outputs += self._telling.left_out(one, self.parameters)
             if one.tracks is not None:
-                self._deliveries.corrected += one.entry.revision > 0
+                self._telling.deliveries.corrected += one.entry.revision > 0
                 outputs.append(Tracked(one.tracks, ticket, step_ns, self._run))
         return outputs
-
-    def _refuse(self, mark: Mark, decision: Decision) -> list[Output]:
-        if decision.verdict is Verdict.DUPLICATE:
-            self._deliveries.duplicates += 1
-            return []
-        if decision.verdict is Verdict.RETIRED:
-            self._deliveries.refused += 1
-            return [self._complain.retired(mark)]
-        self._deliveries.late += 1
-        return [self._complain.late(mark, decision.place.jump_ns)]
 
     def _fail(self, error: Exception, placed: list[Entry], mark: Mark) -> list[Output]:
         """Take no more frames; the one that failed and what is held go, unprocessed."""
         self._quarantine = f"{type(error).__name__}: {error}"[:MAX_ERROR]
-        self._deliveries.refused += 1 + self._waiting.clear()
-        self._done = self._arrived = self._done.note(mark)
-        dump = dump_of(self._stepper, self._history.base, placed, self._policy, error)
-        return [self._complain.failed(mark, self._quarantine), Quarantined(self._quarantine, dump)]
+        self._telling.deliveries.refused += 1 + self._waiting.clear()
+        self._past.note(mark)
+        self._arrived = self._past.timeline
+        dump = dump_of(self._past.stepper, self._past.base, placed, error)
+        return [self._telling.complain.failed(mark, self._quarantine), Quarantined(self._quarantine, dump)]
 
-    def _settle(self, done: Timeline) -> None:
+    def _settle(self, timeline: Timeline) -> None:
         """Take over the timeline with a frame, and let go what the window does not hold any more."""
-        gone = self._history.trim(self._policy)
-        base = self._history.base
+        gone, base = self._past.settle(timeline), self._past.base
         if gone:
-            done = done.settle(base.course, base.last, gone)
             self._arrived = self._arrived.settle(base.course, base.last, gone)
             if base.last is not None:
                 self._clouds.forget_before(base.last.stamp_ns, self._policy.gap_limit_ns)
-        self._done = done
         if not self._waiting:
-            self._arrived = done
+            self._arrived = self._past.timeline
 
-    def _begin(self, moment: Moment) -> None:
+    def _begin(self, moment: Moment, stepper: Stepper | None = None) -> None:
         """Go on from a moment without a way back behind it."""
-        self._history = History(moment, _weakly(self._step))
-        self._done = self._done.settle(moment.course, moment.last, frozenset(self._done.marks))
-        self._arrived = self._done
+        self._past.begin(moment, stepper)
+        self._arrived = self._past.timeline
 
     def _resume(self, checkpoint: Checkpoint, now_ns: int) -> None:
         if checkpoint.cloud_wait_ns is not None:
             self._wait(checkpoint.cloud_wait_ns)
         self._quarantine = checkpoint.quarantine
-        self._deliveries = replace(checkpoint.deliveries)
+        self._telling.deliveries = replace(checkpoint.deliveries)
         self._clouds.newest_ns = checkpoint.newest_cloud_ns
         self._waiting.recovery_ns = now_ns + self._policy.recovery_wait_ns
         self._run = checkpoint.run + 1
-        self._done, entries = window_of(checkpoint, self._policy.gap_limit_ns)
-        self._arrived = self._done
-        self._history = History(checkpoint.base, _weakly(self._step), entries, checkpoint.head)
+        self._past.resume(checkpoint)
+        self._arrived = self._past.timeline
 
     def _wait(self, cloud_wait_ns: int) -> None:
         self._cloud_wait_ns = cloud_wait_ns
         self._policy = replace(self._policy, cloud_wait_ns=cloud_wait_ns)
 
-    def _step(self, before: Moment, entry: Entry) -> tuple[Moment, Outcome]:
-        return self._stepper.step(before, entry, self._policy)
-
-
-def _weakly(step: Step) -> Step:
-    """Return a method without hold on its session: in a circle, a session that has ended would keep its clouds."""
-    method = weakref.WeakMethod(step)
-
-    def call(before: Moment, entry: Entry) -> tuple[Moment, Outcome]:
-        bound = method()
-        assert bound is not None  # noqa: S101 - whoever calls has the session: said for the type checker
-        return bound(before, entry)
-
-    return call
+    def _stepper(self, parameters: optipmb.Parameters) -> Stepper:
+        return Stepper(self.stream, parameters, self._make(parameters), self._policy)

@@ -68,12 +68,14 @@ class Stepper:
         stream: `site/node/sensor`.
         parameters: the profile.
         tracker: steps the density.
+        policy: where a sensor can be.
     """
 
-    def __init__(self, stream: str, parameters: optipmb.Parameters, tracker: Steps) -> None:
+    def __init__(self, stream: str, parameters: optipmb.Parameters, tracker: Steps, policy: Policy) -> None:
         self.stream = stream
         self.parameters = parameters
         self._tracker = tracker
+        self._policy = policy
         values = json.dumps(parameters.model_dump(mode="json"))
         self._digest = hashlib.blake2b(values.encode(), digest_size=16).digest()
 
@@ -84,7 +86,7 @@ class Stepper:
         digest.update(json.dumps([self.stream, starts, *where]).encode())
         return digest.hexdigest()
 
-    def step(self, before: Moment, entry: Entry, policy: Policy) -> tuple[Moment, Outcome]:
+    def step(self, before: Moment, entry: Entry) -> tuple[Moment, Outcome]:
         """Go on by one frame.
 
         Raises:
@@ -93,7 +95,7 @@ class Stepper:
         mark, place = entry.mark, entry.place
         begins = _begins(before, entry)
         known = Whereabouts() if begins else before.whereabouts
-        whereabouts, where = judge(known, mark.stamp_ns, position_of(entry.message), policy)
+        whereabouts, where = judge(known, mark.stamp_ns, position_of(entry.message), self._policy)
         counts = replace(
             before.counts,
             new_epochs=before.counts.new_epochs + (place.opens in (Verdict.NEW_EPOCH, Verdict.RESTART)),

@@ -1,4 +1,4 @@
-"""What a session tells of itself: its counters, and the message that answers a query."""
+"""What a session tells: of the frames it took and of those it did not, its counters, and the answer to a query."""
 
 from __future__ import annotations
 
@@ -7,60 +7,102 @@ from typing import TYPE_CHECKING, Literal
 
 import optipmb_schemas as schemas
 
-from optipmb_service.records import Counters
+from optipmb_service.complaints import Complaints
+from optipmb_service.records import Begun, Counters, Deliveries
+from optipmb_service.timing import Verdict
 
 if TYPE_CHECKING:
-    from optipmb_service.moments import Counts, Moment
-    from optipmb_service.records import Deliveries
+    from collections.abc import Sequence
+
+    import optipmb
+    from optipmb_service.moments import Moment
+    from optipmb_service.records import Output, Policy
+    from optipmb_service.stepping import Outcome
+    from optipmb_service.timing import Decision, Mark
 
     Condition = Literal["new", "running", "recovering", "quarantined", "closed"]
 
 
-def counters_of(deliveries: Deliveries, counts: Counts) -> Counters:
-    """Return what happened to the messages: what depends on their delivery, and what follows from the frames alone."""
-    return Counters(
-        frames=counts.frames,
-        duplicates=deliveries.duplicates,
-        late=deliveries.late,
-        inserted=deliveries.inserted,
-        corrected=deliveries.corrected,
-        refused=deliveries.refused + counts.astray,
-        gaps=counts.gaps,
-        new_epochs=counts.new_epochs,
-        clouds_used=counts.clouds_used,
-        clouds_missed=counts.clouds_missed,
-        repaired=counts.repaired,
-    )
-
-
-def state_of(
-    stream: str, profile: str, head: Moment, counters: Counters, *, condition: Condition, shed: int, queue: int
-) -> schemas.SessionState:
-    """Return the state as the message that answers a query.
+class Telling:
+    """Says what became of messages, and counts it.
 
     Args:
         stream: `site/node/sensor`.
-        profile: name of the parameters.
-        head: the present moment.
-        counters: what happened to the messages.
-        condition: what the session does at present.
-        shed: frames dropped before they came to the session.
-        queue: frames that wait.
+        instance: name of the service, for problems.
+        policy: where a sensor can be.
     """
-    density, last = head.density, head.last
-    return schemas.SessionState(
-        stream=stream,
-        session=head.session,
-        state=condition,
-        profile=profile,
-        epoch=last.epoch if last else None,
-        seq=last.seq if last else None,
-        stamp_ns=last.stamp_ns if last else None,
-        shed=shed,
-        **{field.name: getattr(counters, field.name) for field in fields(Counters)},
-        tracks=head.tracks,
-        bernoullis=len(density.bernoulli),
-        poissons=len(density.poisson),
-        next_id=density.next_id,
-        queue=queue,
-    )
+
+    def __init__(self, stream: str, instance: str, policy: Policy) -> None:
+        self._stream = stream
+        self._policy = policy
+        self.complain = Complaints(stream, instance)
+        self.deliveries = Deliveries()
+
+    def refused(self, mark: Mark, decision: Decision) -> list[Output]:
+        """Tell of a frame that is not admitted; of a duplicate there is nothing to tell."""
+        if decision.verdict is Verdict.DUPLICATE:
+            self.deliveries.duplicates += 1
+            return []
+        if decision.verdict is Verdict.RETIRED:
+            self.deliveries.refused += 1
+            return [self.complain.retired(mark)]
+        self.deliveries.late += 1
+        return [self.complain.late(mark, decision.place.jump_ns)]
+
+    def begun(self, outcomes: Sequence[Outcome], before: str, session: str) -> list[Output]:
+        """Tell of the life that frames began, the last one if there were several; of none when the id is as before."""
+        begins = next((one.begins for one in reversed(outcomes) if one.begins), None)
+        return [] if begins is None or session == before else [Begun(session, begins.reason, begins.jump_ns)]
+
+    def left_out(self, outcome: Outcome, parameters: optipmb.Parameters) -> list[Output]:
+        """Tell what of a frame was not tracked: objects of unknown classes, or all of it; once, not at corrections."""
+        if outcome.entry.revision > 0:
+            return []
+        unknown = self.complain.unknown(outcome.entry.mark, outcome.unknown, parameters)
+        astray = [self.complain.astray(outcome.entry, self._policy)] if outcome.tracks is None else []
+        return [*unknown, *astray]
+
+    def counters(self, head: Moment) -> Counters:
+        """Return what happened to the messages: what depends on delivery, and what follows from the frames alone."""
+        deliveries, counts = self.deliveries, head.counts
+        return Counters(
+            frames=counts.frames,
+            duplicates=deliveries.duplicates,
+            late=deliveries.late,
+            inserted=deliveries.inserted,
+            corrected=deliveries.corrected,
+            refused=deliveries.refused + counts.astray,
+            gaps=counts.gaps,
+            new_epochs=counts.new_epochs,
+            clouds_used=counts.clouds_used,
+            clouds_missed=counts.clouds_missed,
+            repaired=counts.repaired,
+        )
+
+    def state(self, profile: str, head: Moment, *, condition: Condition, shed: int, queue: int) -> schemas.SessionState:
+        """Return the state as the message that answers a query.
+
+        Args:
+            profile: name of the parameters.
+            head: the present moment.
+            condition: what the session does at present.
+            shed: frames dropped before they came to the session.
+            queue: frames that wait.
+        """
+        density, last, counters = head.density, head.last, self.counters(head)
+        return schemas.SessionState(
+            stream=self._stream,
+            session=head.session,
+            state=condition,
+            profile=profile,
+            epoch=last.epoch if last else None,
+            seq=last.seq if last else None,
+            stamp_ns=last.stamp_ns if last else None,
+            shed=shed,
+            **{field.name: getattr(counters, field.name) for field in fields(Counters)},
+            tracks=head.tracks,
+            bernoullis=len(density.bernoulli),
+            poissons=len(density.poisson),
+            next_id=density.next_id,
+            queue=queue,
+        )

@@ -102,7 +102,7 @@ def test_large_clouds_shorten_the_window_not_the_checkpoint() -> None:
         one.on_points(SENSOR.points(seq, count=3000), 0)
         feed(one, [seq], SENSOR)
     checkpoint = one.snapshot()
-    assert len(one._history.entries) == 6
+    assert len(one._past.entries) == 6
     assert [entry.mark.seq for entry in checkpoint.window] == [5, 6]
     assert len(encode_checkpoint(checkpoint)) < 130_000
     two = Session.restore(checkpoint, 0, policy)
