@@ -13,9 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import sys
-import tempfile
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import structlog
@@ -24,11 +22,14 @@ from optipmb_service import __version__
 from optipmb_service.child import Child
 from optipmb_service.loops import Asked, beat, say_ready, unless
 from optipmb_service.ports import HttpError, TransportError
+from optipmb_service.private import private_folder
 from optipmb_service.transport import Transport
 from optipmb_service.vitals import shown
 from optipmb_service.whole import Whole
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
@@ -193,8 +194,8 @@ async def supervise(settings: Settings) -> int:
     """
     asked = Asked()
     log.info("starting", instance=settings.instance, version=__version__, workers=settings.workers)
-    with tempfile.TemporaryDirectory(prefix="optipmb-", ignore_cleanup_errors=True) as folder:
-        socket = f"unixsock-stream/{Path(folder) / 'router'}"
+    with private_folder() as folder:
+        socket = f"unixsock-stream/{folder / 'router'}"
         own, workers = divided(settings, socket)
         if not settings.is_router:
             log.info("connecting", endpoints=settings.connect)
@@ -202,7 +203,7 @@ async def supervise(settings: Settings) -> int:
             transport = await unless(asked, lambda: Transport(own))
             if transport is None:
                 return 0
-            return await _supervised(settings, workers, transport, asked, Path(folder) / "lock")
+            return await _supervised(settings, workers, transport, asked, folder / "lock")
         except (TransportError, HttpError) as error:
             print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
             return 1

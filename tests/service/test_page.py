@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import ast
 import re
+import socket
 from pathlib import Path
 from typing import get_args
 
 import optipmb_service
+import pytest
 from optipmb_schemas import Code
+from optipmb_service import cli
 from optipmb_service.logs import EVENTS
 from optipmb_service.problems import CODES
 from optipmb_service.reference import main, page
@@ -70,6 +73,21 @@ def test_every_problem_is_described() -> None:
         reported |= texts(code) if isinstance(code, ast.Constant) else set()
         reported |= {text for keyword in call.keywords if keyword.arg == "code" for text in texts(keyword.value)}
     assert reported == set(CODES)
+
+
+def test_the_exit_statuses_are_those_of_the_table(capsys: pytest.CaptureFixture[str]) -> None:
+    """The table has each status that a command ends with: a printed answer, nobody there, a wrong option."""
+    (table,) = re.findall(r"\| exit status \|.*?\n\n", FILE.read_text(encoding="utf-8"), re.DOTALL)
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))  # and does not listen
+        address = f"127.0.0.1:{nobody.getsockname()[1]}"
+        commands = {0: ["config"], 1: ["health", "--http", address], 2: ["--wrong"]}
+        assert [int(status) for status in re.findall(r"^\| (\d+) \|", table, re.MULTILINE)] == list(commands)
+        for status, command in commands.items():
+            with pytest.raises(SystemExit) as ended:
+                cli.main(command)
+            assert ended.value.code == status
+    assert "No such option: --wrong" in capsys.readouterr().err
 
 
 def test_the_example_is_a_settings_file(tmp_path: Path) -> None:
