@@ -1,4 +1,4 @@
-"""Text files read with errors that name the place, and written so that nobody sees half a file."""
+"""Files read with errors that name the place, and written so that nobody sees half a file."""
 
 import os
 import tempfile
@@ -41,6 +41,19 @@ def read_bytes(path: Path, what: str) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise DatasetError(path, what, error.strerror or "an unreadable file") from error
+
+
+def read_points(path: Path, what: str, columns: int) -> NDArray[np.float32]:
+    """Return x, y, z (P, 3) of a file of 32-bit numbers, so many per point.
+
+    Raises:
+        DatasetError: the file cannot be read, or its size is that of no number of points.
+
+    """
+    data = read_bytes(path, what)
+    if len(data) % (4 * columns):
+        raise DatasetError(path, f"{4 * columns} bytes per point", f"{len(data)} bytes")
+    return np.ascontiguousarray(np.frombuffer(data, dtype="<f4").reshape(-1, columns)[:, :3])
 
 
 def read_rows(path: Path, what: str, separator: str | None = None) -> list[tuple[int, list[str]]]:

@@ -9,8 +9,9 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
+from inspect import Parameter, Signature, signature
+from pathlib import Path  # noqa: TC003 - typer reads the annotations at run time
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TypedDict, Unpack, get_type_hints
 
 import typer
 from typer.main import get_command
@@ -21,7 +22,7 @@ from optipmb_service.router import route
 from optipmb_service.settings import Loaded, Settings, SettingsInvalidError, load
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
 WRONG_USE: Final = 2
 PASSED_ON: Final = {"allow_extra_args": True, "ignore_unknown_options": True}
@@ -32,94 +33,79 @@ app = typer.Typer(
     help="Track objects in detections that come in over Zenoh. Without a command: run.",
 )
 
-SettingsFile = Annotated[Path | None, typer.Option("--settings", metavar="FILE", help="Settings, a TOML file.")]
-Router = Annotated[
-    bool | None,
-    typer.Option("--router/--no-router", help="Be a Zenoh router oneself. Default: yes unless --connect is given."),
-]
-Listen = Annotated[
-    list[str] | None, typer.Option(metavar="ENDPOINT", help="Endpoint to listen on, repeatable; as tcp/127.0.0.1:7447.")
-]
-Connect = Annotated[
-    list[str] | None, typer.Option(metavar="ENDPOINT", help="Router to connect to, repeatable; as tcp/10.0.0.1:7447.")
-]
-Instance = Annotated[str | None, typer.Option(metavar="NAME", help="Name of this instance.")]
-Profile = Annotated[
-    str | None, typer.Option(metavar="NAME|FILE", help="Profile of streams that no pattern in the settings names.")
-]
-Workers = Annotated[int | None, typer.Option(metavar="N", help="Processes that track, each a share of the streams.")]
-Http = Annotated[str | None, typer.Option(metavar="ADDRESS", help="Serve health and metrics there; as 127.0.0.1:8080.")]
-ZenohConfig = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Zenoh configuration (JSON5): TLS, access control, limits.")
-]
-LogFormat = Annotated[str | None, typer.Option(metavar="console|json", help="Form of the log lines on stderr.")]
-LogLevel = Annotated[str | None, typer.Option(metavar="LEVEL", help="debug, info, warning or error.")]
+
+class RouterOptions(TypedDict, total=False):
+    """What a router and the service take; None: not given."""
+
+    settings: Annotated[Path | None, typer.Option("--settings", metavar="FILE", help="Settings, a TOML file.")]
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", help="Endpoint to listen on, repeatable; as tcp/127.0.0.1:7447."),
+    ]
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", help="Router to connect to, repeatable; as tcp/10.0.0.1:7447."),
+    ]
+    zenoh_config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Zenoh configuration (JSON5): TLS, access control, limits.")
+    ]
+    instance: Annotated[str | None, typer.Option(metavar="NAME", help="Name of this instance.")]
+    http: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Serve health and metrics there; as 127.0.0.1:8080.")
+    ]
+    log_format: Annotated[str | None, typer.Option(metavar="console|json", help="Form of the log lines on stderr.")]
+    log_level: Annotated[str | None, typer.Option(metavar="LEVEL", help="debug, info, warning or error.")]
+
+
+class Options(RouterOptions, total=False):
+    """What the service takes beyond that."""
+
+    router: Annotated[
+        bool | None,
+        typer.Option("--router/--no-router", help="Be a Zenoh router oneself. Default: yes unless --connect is given."),
+    ]
+    profile: Annotated[
+        str | None, typer.Option(metavar="NAME|FILE", help="Profile of streams that no pattern in the settings names.")
+    ]
+    workers: Annotated[int | None, typer.Option(metavar="N", help="Processes that track, each a share of the streams.")]
+
+
+def _taking(options: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Let a command with `**given` have the options of a class: typer reads a command's signature, and no `Unpack`."""
+
+    def spread(command: Callable[..., None]) -> Callable[..., None]:
+        own = [
+            one
+            for one in signature(command, eval_str=True).parameters.values()
+            if one.kind is not Parameter.VAR_KEYWORD
+        ]
+        shared = [
+            Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+            for name, annotation in get_type_hints(options, include_extras=True).items()
+        ]
+        command.__signature__ = Signature([*shared, *own])  # type: ignore[attr-defined]  # read by inspect.signature
+        return command
+
+    return spread
 
 
 @app.command("run")
-def run_command(  # noqa: PLR0913 - one argument per option of the command
-    *,
-    settings: SettingsFile = None,
-    router: Router = None,
-    listen: Listen = None,
-    connect: Connect = None,
-    zenoh_config: ZenohConfig = None,
-    instance: Instance = None,
-    profile: Profile = None,
-    workers: Workers = None,
-    http: Http = None,
-    log_format: LogFormat = None,
-    log_level: LogLevel = None,
-) -> None:
+@_taking(Options)
+def run_command(**given: Unpack[Options]) -> None:
     """Run the service until SIGINT or SIGTERM. Prints one line, `ready …`, when it can be used; logs go to stderr."""
-    loaded = _load(
-        settings,
-        router=router,
-        listen=listen or None,
-        connect=connect or None,
-        zenoh_config=zenoh_config,
-        instance=instance,
-        profile=profile,
-        workers=workers,
-        http=http,
-        log_format=log_format,
-        log_level=log_level,
-    )
-    logs.configure(loaded.settings.log_format, loaded.settings.log_level)
-    logs.unknown_environment(loaded.unknown)
-    leave(_run_one(loaded.settings) if loaded.settings.workers == 1 else _run_many(loaded.settings))
+    settings = _begin(_load(given))
+    leave(_run_one(settings) if settings.workers == 1 else _run_many(settings))
 
 
 @app.command("config")
-def config_command(  # noqa: PLR0913 - one argument per option of the command
+@_taking(Options)
+def config_command(
     *,
-    settings: SettingsFile = None,
-    router: Router = None,
-    listen: Listen = None,
-    connect: Connect = None,
-    zenoh_config: ZenohConfig = None,
-    instance: Instance = None,
-    profile: Profile = None,
-    workers: Workers = None,
-    http: Http = None,
-    log_format: LogFormat = None,
-    log_level: LogLevel = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with where each value came from.")] = False,
+    **given: Unpack[Options],
 ) -> None:
     """Print the settings in force as TOML, each with where it came from, and do nothing else."""
-    loaded = _load(
-        settings,
-        router=router,
-        listen=listen or None,
-        connect=connect or None,
-        zenoh_config=zenoh_config,
-        instance=instance,
-        profile=profile,
-        workers=workers,
-        http=http,
-        log_format=log_format,
-        log_level=log_level,
-    )
+    loaded = _load(given)
     values = loaded.settings.model_dump(mode="json")
     values |= {"router": loaded.settings.is_router, "listen": list(loaded.settings.endpoints)}
     if as_json:
@@ -137,32 +123,10 @@ def config_command(  # noqa: PLR0913 - one argument per option of the command
 
 
 @app.command("router")
-def router_command(
-    *,
-    settings: SettingsFile = None,
-    listen: Listen = None,
-    connect: Connect = None,
-    zenoh_config: ZenohConfig = None,
-    instance: Instance = None,
-    http: Http = None,
-    log_format: LogFormat = None,
-    log_level: LogLevel = None,
-) -> None:
+@_taking(RouterOptions)
+def router_command(**given: Unpack[RouterOptions]) -> None:
     """Run a Zenoh router alone, without tracking, until SIGINT or SIGTERM."""
-    loaded = _load(
-        settings,
-        router=True,
-        listen=listen or None,
-        connect=connect or None,
-        zenoh_config=zenoh_config,
-        instance=instance,
-        http=http,
-        log_format=log_format,
-        log_level=log_level,
-    )
-    logs.configure(loaded.settings.log_format, loaded.settings.log_level)
-    logs.unknown_environment(loaded.unknown)
-    leave(route(loaded.settings))
+    leave(route(_begin(_load({**given, "router": True}))))
 
 
 @app.command("health", add_help_option=False, context_settings=PASSED_ON)
@@ -191,8 +155,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run_one(settings: Settings) -> int:
-    # Imported here, for it takes the tracker along: 150 MB and seconds that neither a parent nor a question needs.
-    from optipmb_service.worker import run_alone  # noqa: PLC0415
+    # It takes the tracker along: 150 MB and seconds.
+    from optipmb_service.worker import run_alone  # noqa: PLC0415 - neither a parent nor a question needs it
 
     return run_alone(settings)
 
@@ -203,12 +167,21 @@ def _run_many(settings: Settings) -> int:
     return asyncio.run(supervise(settings))
 
 
-def _load(file: Path | None, **options: Any) -> Loaded:
-    """Return the settings; an option that is None was not given."""
+def _load(given: Mapping[str, Any]) -> Loaded:
+    """Return the settings in force with what the command line gives; None and no endpoints: not given."""
+    options = {name: value or None if name in {"listen", "connect"} else value for name, value in given.items()}
+    file = options.pop("settings")
     try:
         return load(file, options)
     except SettingsInvalidError as error:
         _wrong(str(error))
+
+
+def _begin(loaded: Loaded) -> Settings:
+    """Let logs go where the settings want them."""
+    logs.configure(loaded.settings.log_format, loaded.settings.log_level)
+    logs.unknown_environment(loaded.unknown)
+    return loaded.settings
 
 
 def _wrong(message: str) -> NoReturn:

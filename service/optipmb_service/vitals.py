@@ -126,8 +126,7 @@ def shown(settings: Settings, source: Shown) -> Iterator[None]:
     if not settings.http:
         yield
         return
-    # A third of a second that only this needs.
-    from optipmb_service.http import Server, application, page  # noqa: PLC0415
+    from optipmb_service.http import Server, application, page  # noqa: PLC0415 - a third of a second that only this needs
 
     server = Server(application(source, page(source)), settings.http)
     log.info("http", address=server.address)

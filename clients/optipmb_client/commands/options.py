@@ -26,11 +26,15 @@ __all__ = [
     "Full",
     "Options",
     "Out",
+    "Patience",
     "Prefix",
     "Profile",
     "Root",
     "Sequences",
+    "Speed",
     "Tracks",
+    "Wait",
+    "Window",
     "mcap_needed",
     "open_sequences",
     "print_json",
@@ -74,6 +78,12 @@ Connect = Annotated[
     ),
 ]
 Config = Annotated[Path | None, typer.Option("--config", help="Zenoh configuration file, for TLS and passwords.")]
+Speed = Annotated[
+    str, typer.Option("--speed", help="1: as recorded, 10: ten times as fast, max: as fast as tracks come back.")
+]
+Window = Annotated[int, typer.Option("--window", min=1, help="Frames under way at most, with --speed max.")]
+Wait = Annotated[float, typer.Option("--wait", min=0.0, help="Seconds to wait for a service at the start.")]
+Patience = Annotated[float, typer.Option("--patience", min=1.0, help="End when no tracks come for so many seconds.")]
 Prefix = Annotated[str, typer.Option("--prefix", help="First part of all keys, as the service has it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 

@@ -12,7 +12,11 @@ from optipmb_client.commands.options import (
     Config,
     Connect,
     Full,
+    Patience,
     Prefix,
+    Speed,
+    Wait,
+    Window,
     mcap_needed,
     print_json,
     say,
@@ -47,12 +51,10 @@ def play(  # noqa: PLR0913  these are the command's options
     full: Full = False,
     connect: Connect = None,
     config: Config = None,
-    speed: Annotated[
-        str, typer.Option(help="1: as recorded, 10: ten times as fast, max: as fast as tracks come back.")
-    ] = "max",
-    window: Annotated[int, typer.Option(min=1, help="Frames under way at most, with --speed max.")] = 8,
-    wait: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a service at the start.")] = 10.0,
-    patience: Annotated[float, typer.Option(min=1.0, help="End when no tracks come for so many seconds.")] = 30.0,
+    speed: Speed = "max",
+    window: Window = 8,
+    wait: Wait = 10.0,
+    patience: Patience = 30.0,
     prefix: Prefix = PREFIX,
     as_json: AsJson = False,
 ) -> None:

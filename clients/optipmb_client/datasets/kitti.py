@@ -33,7 +33,7 @@ from optipmb_client.datasets.kitti_files import (
     read_oxts,
     read_poses,
 )
-from optipmb_client.files import DatasetError, read_bytes, read_rows
+from optipmb_client.files import DatasetError, read_points, read_rows
 from optipmb_client.geometry import Floats, Ints, Pose, pose_of, stack_poses, to_world
 from optipmb_client.results import KittiResultWriter, ResultWriter
 
@@ -203,10 +203,7 @@ def read_scan(path: Path) -> Points:
         DatasetError: the file cannot be read, or is no list of four 32-bit numbers per point.
 
     """
-    data = read_bytes(path, "a velodyne scan")
-    if len(data) % (4 * _SCAN_COLUMNS):
-        raise DatasetError(path, "16 bytes per point", f"{len(data)} bytes")
-    return np.ascontiguousarray(np.frombuffer(data, dtype="<f4").reshape(-1, _SCAN_COLUMNS)[:, :3])
+    return read_points(path, "a velodyne scan", _SCAN_COLUMNS)
 
 
 class KittiDataset:

@@ -23,7 +23,7 @@ import numpy as np
 from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFrame, Points, Regions, Truth
 from optipmb_client.datasets.nuscenes_splits import SPLITS, own_splits, scenes_of_split
 from optipmb_client.datasets.nuscenes_tables import Annotations, Keyframe, NuScenesTables, SceneSamples
-from optipmb_client.files import DatasetError, read_bytes
+from optipmb_client.files import DatasetError, read_points
 from optipmb_client.geometry import Bools, Floats, Ints, Pose
 from optipmb_client.results import ResultWriter
 from optipmb_client.results.nuscenes import NuScenesRun
@@ -245,10 +245,7 @@ def read_sweep(path: Path) -> Points:
         DatasetError: the file cannot be read, or is no list of five 32-bit numbers per point (x y z intensity ring).
 
     """
-    data = read_bytes(path, "a LiDAR scan")
-    if len(data) % (4 * _SCAN_COLUMNS):
-        raise DatasetError(path, "20 bytes per point", f"{len(data)} bytes")
-    return np.ascontiguousarray(np.frombuffer(data, dtype="<f4").reshape(-1, _SCAN_COLUMNS)[:, :3])
+    return read_points(path, "a LiDAR scan", _SCAN_COLUMNS)
 
 
 class NuScenesDataset:
