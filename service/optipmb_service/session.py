@@ -4,9 +4,9 @@ Conventions: `now_ns` is the local monotonic clock, handed in by the caller and 
 clouds and, after a restore, for frames that were missed; everything else follows from the messages. So the same
 messages give the same tracks, byte for byte, and those of the window give the same state in whatever order they come.
 
-The parts: `timing` says where a frame belongs, `waiting` holds frames until they are ready, `history` holds the window
-and goes over it again when it must, `stepping` takes one frame through the tracker. What is here is what happens around
-them: commands, the state to be written down, and what is done when a step fails.
+The parts: `waiting` holds frames until they are ready, `past` has those that were gone through, `telling` says and
+counts what became of them. What is here is what happens around these: commands, the state to be written down, and what
+is done when a step fails.
 """
 
 from __future__ import annotations

@@ -189,7 +189,8 @@ def test_a_signal_ends_a_replay_cleanly(endpoint: str, tmp_path: Path, number: i
             *("--connect", endpoint, "--out", tmp_path),
         )
         deadline = time.monotonic() + 60.0
-        while not service.seen.detections and time.monotonic() < deadline:
+        while not service.seen.detections:
+            assert time.monotonic() < deadline, "no frame was sent"
             time.sleep(0.01)  # the fake has no event for its first frame
         process.send_signal(number)
         out, err = process.communicate(timeout=20)

@@ -35,7 +35,7 @@ def test_an_empty_file_is_a_table_without_rows(tmp_path: Path) -> None:
 
 
 def test_a_missing_file_and_bytes_that_are_no_text_are_dataset_errors(tmp_path: Path) -> None:
-    """Both name the file."""
+    """Neither raises anything else, and the error names the file."""
     (tmp_path / "b.txt").write_bytes(b"\xff\xfe\x00")
     for name in ("a.txt", "b.txt"):
         with pytest.raises(DatasetError, match=name):

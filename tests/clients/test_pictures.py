@@ -78,7 +78,7 @@ def test_a_sequence_without_tracks_or_truth_is_drawn_too(tmp_path: Path) -> None
 
 
 def test_without_matplotlib_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The extra is named."""
+    """One clear error, which names the extra of the installation, and no import error."""
     sequence, _, tracks = scene()
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ClientError, match=r"optipmb\[plot\]"):

@@ -102,7 +102,7 @@ def test_who_stands_by_takes_over(tmp_path: Path, capsys: pytest.CaptureFixture[
     accounted = state.frames + state.duplicates + state.late + state.refused + state.shed + state.queue
     assert state.received == accounted
     with capsys.disabled():
-        print(f"\ntakeover after a kill {at_once_s:.2f} s, after a freeze {lease_s:.2f} s (lease 2 s)")  # noqa: T201
+        print(f"\ntakeover after a kill {at_once_s:.2f} s, after a freeze {lease_s:.2f} s (lease 2 s)")  # noqa: T201 - the figure
 
 
 @pytest.mark.timeout(120)

@@ -75,7 +75,7 @@ def publish(network: Network, role: str, stream: str, frames: int) -> Publisher:
     for k in range(frames):
         car: dict[str, Any] = {"label": ["car"], "center": [[k, 0, 0.8]], "size": [[4.5, 1.9, 1.6]], "yaw": [0.0]}
         publisher.publish(stamp_ns=10**18 + k * 10**8, **car, score=[0.9])
-        time.sleep(PACE_S)
+        time.sleep(PACE_S)  # below the limit of the rate, not a wait for anything
     return publisher
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import resource
 import signal
 import socket
-import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -214,12 +214,13 @@ def test_what_config_prints_is_a_settings_file(tmp_path: Path) -> None:
 
 
 def test_starting_takes_no_long_time() -> None:
-    """With compiled kernels in the cache the service is ready within ten seconds, even on a busy machine."""
+    """With compiled kernels in the cache a start takes less than ten seconds of the processor; compiling takes more."""
     with ServiceProcess() as service:
         service.wait_ready()
         service.end()
-    began = time.monotonic()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with ServiceProcess() as service:
         service.wait_ready()
-        assert time.monotonic() - began < 10
         service.end()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert 0.1 < after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 10

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from optipmb_schemas import Keys, ServiceStatus, SessionState
 from optipmb_service.keeper import STORE_FILE
 from optipmb_service.store import SqliteStore
@@ -85,7 +84,7 @@ def test_a_torn_checkpoint_is_set_aside(start: Callable[..., Any], tmp_path: Pat
             node.send(SENSOR.detections(seq))
             node.tracks(SENSOR.stream, seq + 1)
             kept = store.load(SENSOR.stream)
-            until(lambda kept=kept: store.load(SENSOR.stream) != kept, "a checkpoint of the frame")  # type: ignore[misc]
+            until(lambda kept=kept: store.load(SENSOR.stream) != kept, "a checkpoint of the frame")  # type: ignore[misc]  # bound now
         before = node.ask(state, SessionState)
     assert service.stop()
     whole = store.load(SENSOR.stream)
@@ -245,6 +244,5 @@ def test_fifty_sessions_are_restored_in_time(start: Callable[..., Any], tmp_path
             node.tracks(sensor.stream, 1)
         busy_s, took_s = time.process_time() - busy_s, time.monotonic() - began_s
         assert all(node.tracks(sensor.stream, 1)[0].gap == 0 for sensor in sensors)
-    print(f"50 sessions restored and stepped in {took_s:.2f} s, {busy_s:.2f} s of the processor")  # noqa: T201
+    print(f"50 sessions restored and stepped in {took_s:.2f} s, {busy_s:.2f} s of the processor")  # noqa: T201 - the figure
     assert busy_s < 2.0
-    assert np.isfinite(took_s)

@@ -122,8 +122,9 @@ def freeze(service: ServiceProcess) -> None:
     """SIGSTOP, and wait until it has stopped."""
     service.process.send_signal(signal.SIGSTOP)
     deadline = time.monotonic() + START_S
-    while _state(service.process.pid) != "T" and time.monotonic() < deadline:
-        time.sleep(0.001)
+    while _state(service.process.pid) != "T":
+        assert time.monotonic() < deadline, "the process does not stop"
+        time.sleep(0.001)  # another process: there is nothing to wait on
 
 
 def thaw(service: ServiceProcess) -> None:
