@@ -139,7 +139,7 @@ def stages() -> dict[str, dict[str, float]]:
 
 
 def share_of_kernels() -> dict[int, dict[str, float]]:
-    """Microseconds of a step spent in compiled code, in numpy and the interpreter, and in scipy's assignment."""
+    """Microseconds of a step spent in compiled code, in calling it, and in numpy and the interpreter."""
     from profiled import shares  # noqa: PLC0415 - it replaces functions of the tracker, after everything else
 
     return {objects: shares(*settled(objects)) for objects in (10, 100, 800)}
@@ -208,10 +208,10 @@ def tables(found: dict[str, Any]) -> str:
     ]
     for stage in STAGES:
         lines.append(f"| `{stage}` | " + " | ".join(f"{one[stage]:.0f}" for one in found["stages"].values()) + " |")
-    lines += ["", "| objects | kernels us | calls of kernels us | interpreter and numpy us | assignment (scipy) us |"]
-    lines += ["| ---: | ---: | ---: | ---: | ---: |"]
+    lines += ["", "| objects | kernels us | calls of kernels us | interpreter and numpy us |"]
+    lines += ["| ---: | ---: | ---: | ---: |"]
     for n, one in found["shares"].items():
-        lines.append(f"| {n} | " + " | ".join(f"{one[k]:.0f}" for k in ("kernels", "calls", "python", "scipy")) + " |")
+        lines.append(f"| {n} | " + " | ".join(f"{one[k]:.0f}" for k in ("kernels", "calls", "python")) + " |")
     return "\n".join(lines) + "\n"
 
 

@@ -15,8 +15,6 @@ import numba
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from optipmb import association
-
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -43,24 +41,23 @@ def cost_of_a_call(arguments: int) -> float:
 
 
 def shares(tracker: optipmb.Tracker, density: optipmb.Density, frame: optipmb.Frame) -> dict[str, float]:
-    """Median microseconds per step: in kernels, in calling them, in scipy, and the rest."""
-    spent = {"kernels": 0.0, "scipy": 0.0}
+    """Median microseconds per step: in kernels, in calling them, and the rest."""
+    spent = 0
     calls: list[int] = []
 
-    def clocked(kind: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def clocked(function: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*arguments: Any) -> Any:
+            nonlocal spent
             begun = time.thread_time_ns()
             result = function(*arguments)
-            spent[kind] += time.thread_time_ns() - begun
-            if kind == "kernels":
-                calls.append(len(arguments))
+            spent += time.thread_time_ns() - begun
+            calls.append(len(arguments))
             return result
 
         return timed
 
     modules = [module for name, module in sys.modules.items() if name.startswith("optipmb.")]
     replaced = [(m, n, v) for m in modules for n, v in vars(m).items() if isinstance(v, Dispatcher)]
-    replaced.append((association, "linear_sum_assignment", association.linear_sum_assignment))
     plain = []
     for _ in range(STEPS):
         begun = time.thread_time_ns()
@@ -69,21 +66,20 @@ def shares(tracker: optipmb.Tracker, density: optipmb.Density, frame: optipmb.Fr
     rows = []
     try:
         for module, name, function in replaced:
-            setattr(module, name, clocked("kernels" if isinstance(function, Dispatcher) else "scipy", function))
+            setattr(module, name, clocked(function))
         for _ in range(STEPS):
-            spent.update(kernels=0.0, scipy=0.0)
+            spent = 0
             calls.clear()
             tracker.step(density, frame)
-            rows.append((spent["kernels"], spent["scipy"]))
+            rows.append(spent)
     finally:
         for module, name, function in replaced:
             setattr(module, name, function)
-    in_calls, scipy = np.median(rows, axis=0)
+    in_calls = float(np.median(rows))
     calling = min(sum(cost_of_a_call(count) for count in calls), in_calls)
     total = float(np.median(plain))
     return {
         "kernels": (in_calls - calling) / 1e3,
         "calls": calling / 1e3,
-        "scipy": scipy / 1e3,
-        "python": max(total - in_calls - scipy, 0.0) / 1e3,
+        "python": max(total - in_calls, 0.0) / 1e3,
     }

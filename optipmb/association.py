@@ -1,19 +1,25 @@
 """The best global hypothesis (Section IV.E).
 
-Each measurement goes to one object, or is a first-time detection of its own.
+Each measurement goes to one object, or is a first-time detection of its own. A pair lowers the total cost only when it
+is cheaper than the first-time detection of its measurement; no other pair is in the best hypothesis. Of those that are,
+the assignment of least cost is found by shortest augmenting paths, after Jonker and Volgenant (1987): objects come in
+one after the other, and each comes by the cheapest chain of moves, which ends at a free measurement or at an object
+that is then missed. Prices on objects and measurements keep all lengths non-negative, so that Dijkstra's algorithm
+finds the chain. A search goes along pairs, so it never leaves the cluster that shares gates with its object; most end
+after one step. The total cost is that of the Hungarian algorithm on the whole matrix of the paper's Fig. 3.
 
-A pair can only be in the best hypothesis when it is cheaper than the first-time detection of its measurement. The
-pairs that are fall into connected clusters; most have one object or one measurement and are settled by a minimum,
-the others by the Hungarian algorithm on their own small matrices. The total cost is that of the algorithm on the
-whole matrix of the paper's Fig. 3.
+Where several hypotheses have the least cost, the order of objects and measurements decides, and nothing else: an object
+that comes later takes nothing from an earlier one unless the total becomes lower, and of measurements that cost the
+same it takes the first. Objects are ordered by id and measurements by score, so the older track gets the better
+detection.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from optipmb.compiled import kernel
 
@@ -25,7 +31,8 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
 
-UNASSIGNED = -1
+UNASSIGNED: Final = -1
+"""No measurement of an object, no object of a measurement."""
 
 
 def associate(hypotheses: Hypotheses, n_objects: int) -> Index:
@@ -38,140 +45,81 @@ def associate(hypotheses: Hypotheses, n_objects: int) -> Index:
     Returns:
         (N,) the measurement of each object, `UNASSIGNED` for the missed ones.
     """
-    row, measurement, cost = hypotheses.row, hypotheses.measurement, hypotheses.detection_cost
     assigned = np.empty(n_objects, np.int64)
-    pairs, start = np.empty_like(row), np.empty(row.shape[0] + 1, np.int64)
-    ambiguous = settle(row, measurement, cost, hypotheses.first_cost, assigned, pairs, start)
-    for c in range(ambiguous):
-        cluster = pairs[start[c] : start[c + 1]]
-        objects, measurements, gain = gain_matrix(cluster, row, measurement, cost, hypotheses.first_cost)
-        i, j = linear_sum_assignment(gain)
-        won = gain[i, j] < 0.0
-        assigned[objects[i[won]]] = measurements[j[won]]
+    assign(hypotheses.row, hypotheses.measurement, hypotheses.detection_cost, hypotheses.first_cost, assigned)
     return assigned
 
 
 @kernel
-def settle(
-    row: Index, measurement: Index, cost: Array, first_cost: Array, assigned: Index, pairs_out: Index, start_out: Index
-) -> int:
-    """Settle what a minimum settles, and list the clusters that need the Hungarian algorithm.
+def assign(row: Index, measurement: Index, cost: Array, first_cost: Array, assigned: Index) -> None:
+    """Assign measurements to objects at least total cost, by shortest augmenting paths over the pairs.
+
+    The gain of a pair is what it costs more than the first-time detection of its measurement; a missed object gains
+    zero. Prices u of objects and v of measurements keep ``gain - u - v >= 0`` on every pair that lowers the total, with
+    equality on those assigned, ``u <= 0``, and ``v = 0`` on free measurements.
 
     Args:
-        row: (K,) object of each pair.
+        row: (K,) object of each pair, ascending.
         measurement: (K,) measurement of each pair.
         cost: (K,) w of each pair.
         first_cost: (M,) w of the first-time detection of each measurement.
-        assigned: (N,) receives the measurement of each settled object, `UNASSIGNED` for the others.
-        pairs_out: (K,) receives the pairs of the clusters that are left, cluster after cluster.
-        start_out: (K + 1,) receives where each of those clusters starts and the last one ends.
-
-    Returns:
-        The number of clusters that are left.
+        assigned: (N,) receives the measurement of each object, `UNASSIGNED` for the missed ones.
     """
+    n_objects, n_measurements = assigned.shape[0], first_cost.shape[0]
     assigned[:] = UNASSIGNED
-    useful = np.empty(row.shape[0], np.int64)
+    start = np.zeros(n_objects + 1, np.int64)  # where the pairs of each object start
+    for n in row:
+        start[n + 1] += 1
+    start = np.cumsum(start)
     gain = np.empty(row.shape[0])
-    count = 0
     for k in range(row.shape[0]):
-        gain[count] = cost[k] - first_cost[measurement[k]]
-        if gain[count] < 0.0:
-            useful[count] = k
-            count += 1
-    useful = useful[:count]
-    rows, columns = row[useful], measurement[useful]
-    order, start = clusters(rows, columns, assigned.shape[0], first_cost.shape[0])
-    left = settle_small(rows, columns, gain, order, start, assigned)
-    start_out[0] = 0
-    for c in range(left.shape[0]):
-        start_out[c + 1] = start_out[c]
-        for k in range(start[left[c]], start[left[c] + 1]):
-            pairs_out[start_out[c + 1]] = useful[order[k]]
-            start_out[c + 1] += 1
-    clusters_left: int = left.shape[0]
-    return clusters_left
+        gain[k] = cost[k] - first_cost[measurement[k]]
 
+    owner = np.full(n_measurements, UNASSIGNED)
+    u, v = np.zeros(n_objects), np.zeros(n_measurements)
+    length = np.full(n_measurements, math.inf)  # of the shortest path to each measurement; infinite: not reached
+    before = np.empty(n_measurements, np.int64)  # the object in front of it on that path
+    reached = np.empty(n_measurements, np.int64)  # measurements in the order in which they were reached
+    settled = np.zeros(n_measurements, np.bool_)
+    for newcomer in range(n_objects):
+        count = 0
+        n, here = newcomer, 0.0  # the object that the search stands at, and how far that is
+        missed, shortest_miss = newcomer, math.inf
+        while True:
+            if here - u[n] < shortest_miss:
+                missed, shortest_miss = n, here - u[n]
+            for k in range(start[n], start[n + 1]):
+                m = measurement[k]
+                if gain[k] < 0.0 and not settled[m]:
+                    through = here + (gain[k] - u[n] - v[m])
+                    if through < length[m]:
+                        if length[m] == math.inf:
+                            reached[count] = m
+                            count += 1
+                        length[m], before[m] = through, n
+            end, here = UNASSIGNED, shortest_miss
+            for i in range(count):
+                m = reached[i]
+                if not settled[m] and length[m] < here:
+                    end, here = m, length[m]
+            if end == UNASSIGNED or owner[end] == UNASSIGNED:
+                break
+            settled[end] = True
+            n = owner[end]
 
-@kernel
-def gain_matrix(
-    cluster: Index, row: Index, measurement: Index, cost: Array, first_cost: Array
-) -> tuple[Index, Index, Array]:
-    """Lay out one cluster as a matrix of what each pair saves; zero: the measurement keeps its first-time detection.
+        u[newcomer] += here
+        for i in range(count):
+            m = reached[i]
+            if settled[m]:
+                u[owner[m]] += here - length[m]
+                v[m] -= here - length[m]
+                settled[m] = False
+            length[m] = math.inf
 
-    Returns:
-        (I,) objects, (J,) measurements, both ascending, and (I, J) gains, none positive.
-    """
-    objects, measurements = np.unique(row[cluster]), np.unique(measurement[cluster])
-    gain = np.zeros((objects.shape[0], measurements.shape[0]))
-    for k in cluster:
-        i, j = np.searchsorted(objects, row[k]), np.searchsorted(measurements, measurement[k])
-        gain[i, j] = cost[k] - first_cost[measurement[k]]
-    return objects, measurements, gain
-
-
-@kernel
-def _root(parent: Index, node: int) -> int:
-    while parent[node] != node:
-        parent[node] = parent[parent[node]]
-        node = parent[node]
-    return node
-
-
-@kernel
-def clusters(rows: Index, columns: Index, n_objects: int, n_measurements: int) -> tuple[Index, Index]:
-    """Split pairs into connected clusters.
-
-    Args:
-        rows: (K,) object of each pair.
-        columns: (K,) measurement of each pair.
-        n_objects: number of objects.
-        n_measurements: number of measurements.
-
-    Returns:
-        (K,) pairs ordered by cluster (and as given within one), and (number of clusters + 1,) where each cluster
-        starts.
-    """
-    parent = np.arange(n_objects + n_measurements)
-    for k in range(rows.shape[0]):
-        a, b = _root(parent, rows[k]), _root(parent, n_objects + columns[k])
-        parent[max(a, b)] = min(a, b)
-    number = np.full(n_objects + n_measurements, -1)
-    cluster = np.empty(rows.shape[0], np.int64)
-    size = np.zeros(rows.shape[0] + 1, np.int64)
-    count = 0
-    for k in range(rows.shape[0]):
-        root = _root(parent, rows[k])
-        if number[root] < 0:
-            number[root] = count
-            count += 1
-        cluster[k] = number[root]
-        size[cluster[k] + 1] += 1
-    start = np.cumsum(size[: count + 1])
-    fill = start.copy()
-    order = np.empty(rows.shape[0], np.int64)
-    for k in range(rows.shape[0]):
-        order[fill[cluster[k]]] = k
-        fill[cluster[k]] += 1
-    return order, start
-
-
-@kernel
-def settle_small(rows: Index, columns: Index, gain: Array, order: Index, start: Index, assigned: Index) -> Index:
-    """Settle the clusters with one object or one measurement by their best pair; return the other clusters."""
-    left = np.empty(start.shape[0], np.int64)
-    count = 0
-    for c in range(start.shape[0] - 1):
-        best = order[start[c]]
-        one_row, one_column = True, True
-        for k in range(start[c] + 1, start[c + 1]):
-            pair = order[k]
-            one_row = one_row and rows[pair] == rows[best]
-            one_column = one_column and columns[pair] == columns[best]
-            if gain[pair] < gain[best]:
-                best = pair
-        if one_row or one_column:
-            assigned[rows[best]] = columns[best]
-        else:
-            left[count] = c
-            count += 1
-    return left[:count].copy()
+        # Along the path every object takes the measurement behind it, and leaves the one in front to its successor.
+        if end == UNASSIGNED:
+            end, assigned[missed] = assigned[missed], UNASSIGNED
+        while end != UNASSIGNED:
+            n = before[end]
+            owner[end] = n
+            end, assigned[n] = assigned[n], end

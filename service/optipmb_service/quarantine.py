@@ -52,7 +52,7 @@ def dump_of(stepper: Stepper, base: Moment, placed: Sequence[Entry], error: Exce
             stream=stepper.stream,
             error=f"{type(error).__name__}: {error}",
             trace="".join(traceback.format_exception(error))[-MAX_TRACE:],
-            versions={name: version(name) for name in ("optipmb", "numpy", "numba", "scipy")}
+            versions={name: version(name) for name in ("optipmb", "numpy", "numba")}
             | {"python": platform.python_version()},
             parameters=stepper.parameters.model_dump(mode="json"),
             stamp_ns=base.density.stamp_ns,

@@ -24,6 +24,7 @@ import optipmb
 from optipmb_service import __version__, figures
 from optipmb_service.inbox import Pool
 from optipmb_service.keeper import open_keeper
+from optipmb_service.lean import warm_up
 from optipmb_service.loops import Asked, beat, say_ready, unless
 from optipmb_service.metrics import Metrics
 from optipmb_service.ports import HttpError, TransportError
@@ -233,7 +234,7 @@ class Alone:
 
     def warm_up(self) -> None:
         """Compile the kernels, or load them."""
-        optipmb.warm_up()
+        warm_up()
 
     def ready(self, service: Service) -> None:
         """Print the line that starters wait for."""

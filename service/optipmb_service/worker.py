@@ -22,6 +22,7 @@ import structlog
 
 import optipmb
 from optipmb_service import logs
+from optipmb_service.lean import warm_up
 from optipmb_service.loops import leave
 from optipmb_service.profiles import Profiles
 from optipmb_service.service import run
@@ -64,7 +65,7 @@ class Family:
         """Compile the kernels, or load them: after an installation one worker compiles, and the others wait for it."""
         with self._lock.open("a") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
-            optipmb.warm_up()
+            warm_up()
 
     def ready(self, service: Service) -> None:
         """Say that streams are served."""

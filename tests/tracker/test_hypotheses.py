@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise, permutations
+from itertools import permutations
 
 import numpy as np
 import oracle_formulas as textbook
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from optipmb.association import UNASSIGNED, associate, clusters
+from optipmb.association import UNASSIGNED, associate
 from optipmb.hypotheses import (
     CLUTTER,
     FROM_POISSON,
@@ -172,7 +173,7 @@ def test_no_global_hypothesis_is_cheaper(seed: int) -> None:
 
 @pytest.mark.parametrize("density", [0.02, 0.1, 0.5, 1.0])
 @pytest.mark.parametrize("seed", range(4))
-def test_clusters_give_the_optimum_of_the_full_matrix(seed: int, density: float) -> None:
+def test_the_pairs_give_the_optimum_of_the_full_matrix(seed: int, density: float) -> None:
     """The same assignment as the Hungarian algorithm on [costs | diagonal of first-time costs], infinite elsewhere."""
     rng = np.random.default_rng(seed)
     cost, first = sparse_costs(rng, 50, 60, density)
@@ -193,19 +194,72 @@ def test_a_pair_that_is_not_cheaper_is_not_used() -> None:
     np.testing.assert_array_equal(assigned, [0])
 
 
+def least(cost: Array, first: Array) -> float:
+    """The least cost of a global hypothesis, by scipy on the whole matrix of the paper's Fig. 3."""
+    matrix = np.full((first.size, cost.shape[0] + first.size), np.inf)
+    matrix[:, : cost.shape[0]] = cost.T
+    np.fill_diagonal(matrix[:, cost.shape[0] :], first)
+    return float(matrix[linear_sum_assignment(matrix)].sum())
+
+
 @given(
-    pairs=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=25, unique=True).map(sorted)
+    cost=arrays(
+        np.float64,
+        array_shapes(min_dims=2, max_dims=2, max_side=12),
+        elements=st.one_of(st.integers(-4, 4).map(float), st.floats(-1e3, 1e3), st.just(math.inf)),
+    ),
+    data=st.data(),
 )
-@settings(deadline=None)  # the first call compiles
-def test_clusters_are_the_connected_components(pairs: list[tuple[int, int]]) -> None:
-    """Two pairs share a cluster exactly when a chain of common objects and measurements links them."""
-    rows, columns = (np.array(side) for side in zip(*pairs, strict=True))
-    order, start = clusters(rows, columns, 10, 10)
-    assert sorted(order.tolist()) == list(range(len(pairs)))
-    found = {frozenset(order[a:b].tolist()) for a, b in pairwise(start)}
-    linked = (rows[:, None] == rows) | (columns[:, None] == columns)
-    for _ in pairs:
-        linked = linked @ linked
-    assert found == {frozenset(np.flatnonzero(row).tolist()) for row in linked}
-    for a, b in pairwise(start):
-        assert sorted(order[a:b].tolist()) == order[a:b].tolist()
+@settings(deadline=None, max_examples=300)  # the first call compiles
+def test_the_total_is_that_of_the_hungarian_algorithm(cost: Array, data: st.DataObject) -> None:
+    """Any matrix, wide or tall, with ties, closed gates and costs of all sizes: scipy finds no lower total."""
+    wanted = st.lists(
+        st.integers(-4, 4).map(float) | st.floats(-1e3, 1e3), min_size=cost.shape[1], max_size=cost.shape[1]
+    )
+    first = np.array(data.draw(wanted))
+    assigned = associate(hypotheses(cost, first), cost.shape[0])
+    used = assigned[assigned != UNASSIGNED]
+    assert len(set(used.tolist())) == len(used)
+    assert total(cost, first, assigned) == pytest.approx(least(cost, first), rel=1e-12, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_crowd_of_hundreds_has_the_total_of_the_hungarian_algorithm(seed: int) -> None:
+    """All gates overlap: one cluster, and paths of many moves."""
+    rng = np.random.default_rng(seed)
+    places, seen = rng.uniform(0, 10, (200, 2)), rng.uniform(0, 10, (220, 2))
+    cost = np.linalg.norm(places[:, None] - seen, axis=2)
+    cost[cost > 6] = np.inf
+    first = rng.uniform(0.2, 8, 220)
+    assigned = associate(hypotheses(cost, first), 200)
+    assert total(cost, first, assigned) == pytest.approx(least(cost, first), rel=1e-12)
+
+
+def test_at_equal_cost_the_earlier_object_gets_the_earlier_measurement() -> None:
+    """Ties are settled by the order of objects and measurements, whatever the chains between them."""
+    none = UNASSIGNED
+    for cost, wanted in (
+        ([[1, 1, 1]], [0]),
+        ([[1], [1], [1]], [0, none, none]),
+        ([[1, 1], [1, 1]], [0, 1]),
+        ([[1, 1, 9], [1, 1, 9], [1, 1, 9]], [0, 1, none]),
+        ([[1, 2], [2, 3]], [0, 1]),  # the other way round costs as much
+        ([[2, 1], [9, 1]], [0, 1]),  # a later object takes what is cheaper in total
+        ([[9, 1, 9], [9, 1, 1]], [1, 2]),
+    ):
+        matrix = np.array(cost, np.float64)
+        assigned = associate(hypotheses(matrix, np.full(matrix.shape[1], 4.0)), len(cost))
+        np.testing.assert_array_equal(assigned, wanted, err_msg=str(cost))
+
+
+@given(cost=arrays(np.float64, (6, 6), elements=st.integers(-2, 2).map(float)))
+@settings(deadline=None)
+def test_ties_depend_on_the_matrix_alone(cost: Array) -> None:
+    """What came before, and what other clusters there are, changes no assignment."""
+    first = np.zeros(6)
+    alone = associate(hypotheses(cost, first), 6)
+    two = np.full((13, 12), np.inf)
+    two[:6, :6] = cost[::-1]
+    two[7:, 6:] = cost
+    beside = associate(hypotheses(two, np.zeros(12)), 13)[7:]
+    np.testing.assert_array_equal(np.where(beside == UNASSIGNED, UNASSIGNED, beside - 6), alone)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from optipmb.association import UNASSIGNED, gain_matrix
+from optipmb.association import UNASSIGNED
 from optipmb.birth import announced_states, fill_components, select_births
 from optipmb.calibration import SURE
 from optipmb.density import whole_periods
@@ -143,16 +143,6 @@ def test_components_within_their_limit_are_predicted(seed: int) -> None:
         predict_state(mean[n], covariance[n], 0.2, noise[label[n]], *buffers, alone, alone_spread)
         np.testing.assert_array_equal(out[k], alone)
         np.testing.assert_array_equal(spread[k], alone_spread)
-
-
-def test_a_cluster_is_laid_out_with_its_gains() -> None:
-    """Rows and columns ascend; what is no pair stays zero."""
-    row, measurement = np.array([9, 2, 5, 5, 8]), np.array([9, 7, 3, 7, 1])
-    cost, first = np.array([0.0, -1.0, -2.0, -4.0, 0.0]), np.arange(10) / 8
-    objects, measurements, gain = gain_matrix(np.array([1, 2, 3]), row, measurement, cost, first)
-    np.testing.assert_array_equal(objects, [2, 5])
-    np.testing.assert_array_equal(measurements, [3, 7])
-    np.testing.assert_array_equal(gain, [[0, -1 - 7 / 8], [-2 - 3 / 8, -4 - 7 / 8]])
 
 
 @SEEDS
