@@ -118,7 +118,7 @@ class Tracker:
             │ predict            eq. PPP_prediction, MB_prediction
             │ preprocess         eta_sf, NMS
             │ hypotheses         eq. Misdetect, Detection, First-Time Detection Hypothesis Update; HABM
-            │ associate          Hungarian algorithm on clusters
+            │ associate          shortest augmenting paths
             │ prune              r, misses
             │ update             UKF for the pairs of the best global hypothesis, light-weight filter
             ▼ extract, calibrate eta_ext1, eta_ext2, eta_cnt

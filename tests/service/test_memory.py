@@ -1,4 +1,4 @@
-"""What a process that tracks takes, and that what a session holds is free when it ends, not when a collection comes by."""
+"""What a process that tracks takes; what a session holds is free at its end, not when a garbage collection comes by."""
 
 from __future__ import annotations
 

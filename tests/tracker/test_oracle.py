@@ -76,7 +76,7 @@ def test_random_parameters_equal_algorithm_1(seed: int) -> None:
 
 
 def test_crowds_are_decided_like_the_full_matrix() -> None:
-    """Where dozens of objects share their gates, the clusters give the assignment of the full cost matrix."""
+    """Where dozens of objects share their gates, the shortest paths give the assignment of the full cost matrix."""
     document = random_parameters(3)
     for values in document["classes"].values():
         values.update(gate=6.0, max_misses=10, survival=1.0)
