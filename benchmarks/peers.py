@@ -36,19 +36,16 @@ START = dt.datetime(2026, 1, 1)  # noqa: DTZ001 - Stone Soup compares naive time
 
 def stone_soup(_: int) -> tuple[Callable[[SceneFrame], Any], Step]:
     """Global nearest neighbour by the 2D assignment, unscented Kalman filter, constant velocity on the plane."""
-    from stonesoup.dataassociator.neighbour import GNNWith2DAssignment  # noqa: PLC0415 - peers are optional
-    from stonesoup.hypothesiser.distance import DistanceHypothesiser  # noqa: PLC0415
-    from stonesoup.measures import Mahalanobis  # noqa: PLC0415
-    from stonesoup.models.measurement.linear import LinearGaussian  # noqa: PLC0415
-    from stonesoup.models.transition.linear import (  # noqa: PLC0415
-        CombinedLinearGaussianTransitionModel,
-        ConstantVelocity,
-    )
-    from stonesoup.predictor.kalman import UnscentedKalmanPredictor  # noqa: PLC0415
-    from stonesoup.types.detection import Detection  # noqa: PLC0415
-    from stonesoup.types.state import GaussianState  # noqa: PLC0415
-    from stonesoup.types.track import Track  # noqa: PLC0415
-    from stonesoup.updater.kalman import UnscentedKalmanUpdater  # noqa: PLC0415
+    from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
+    from stonesoup.hypothesiser.distance import DistanceHypothesiser
+    from stonesoup.measures import Mahalanobis
+    from stonesoup.models.measurement.linear import LinearGaussian
+    from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
+    from stonesoup.predictor.kalman import UnscentedKalmanPredictor
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.state import GaussianState
+    from stonesoup.types.track import Track
+    from stonesoup.updater.kalman import UnscentedKalmanUpdater
 
     motion = CombinedLinearGaussianTransitionModel([ConstantVelocity(1.0), ConstantVelocity(1.0)])
     measurement = LinearGaussian(4, (0, 2), np.diag([0.04, 0.04]))
@@ -85,7 +82,7 @@ def stone_soup(_: int) -> tuple[Callable[[SceneFrame], Any], Step]:
 
 def motpy(_: int) -> tuple[Callable[[SceneFrame], Any], Step]:
     """Constant velocity, Hungarian algorithm on the overlap of boxes that are parallel to the axes."""
-    from motpy import Detection, MultiObjectTracker  # noqa: PLC0415 - peers are optional
+    from motpy import Detection, MultiObjectTracker
 
     logging.getLogger("motpy").setLevel(logging.ERROR)
     model = {"order_pos": 1, "dim_pos": 2, "order_size": 0, "dim_size": 2, "q_var_pos": 10.0, "r_var_pos": 0.1}
@@ -101,7 +98,7 @@ def motpy(_: int) -> tuple[Callable[[SceneFrame], Any], Step]:
 
 def norfair(_: int) -> tuple[Callable[[SceneFrame], Any], Step]:
     """Constant velocity of points, greedy association by Euclidean distance."""
-    from norfair import Detection, Tracker  # noqa: PLC0415 - peers are optional
+    from norfair import Detection, Tracker
 
     tracker = Tracker(distance_function="mean_euclidean", distance_threshold=GATE, initialization_delay=1)
 

@@ -44,7 +44,7 @@ def birth_states(
     mean_out: Array,
     covariance_out: Array,
 ) -> None:
-    """Compute m^0 and P^0 of the measurements in `rows`.
+    """Compute m^0 and P^0 of the measurements in `rows` (eq. Newborn Hypothesis).
 
     Args:
         rows: (K,) measurements.
@@ -103,7 +103,7 @@ def adaptive_births(measurements: Measurements, hypotheses: Hypotheses, table: C
 def select_births(
     first_kind: Index, association: Array, label: Index, birth_rate: Array, rows: Index, weight: Array
 ) -> int:
-    """Write the measurements of lambda_b and their weights; return how many they are."""
+    """Write the measurements of lambda_b and their weights ``mu_ab (1 - p_a)`` (eq. HABM); return how many they are."""
     count = 0
     for m in range(first_kind.shape[0]):
         born = birth_rate[label[m]] * (1.0 - association[m])
@@ -159,28 +159,21 @@ def with_births(
         poisson.auxiliary,
         poisson.born_ns,
         rows,
+        measurements.position,
+        measurements.yaw,
+        measurements.velocity,
         measurements.label,
         measurements.auxiliary,
         stamp_ns,
+        table.birth_heading_speed,
+        table.birth_known,
+        table.birth_unknown,
         joined.mean,
         joined.covariance,
         joined.label,
         joined.auxiliary,
         joined.born_ns,
     )
-    if old < count:
-        birth_states(
-            rows,
-            measurements.position,
-            measurements.yaw,
-            measurements.velocity,
-            measurements.label,
-            table.birth_heading_speed,
-            table.birth_known,
-            table.birth_unknown,
-            joined.mean[old:],
-            joined.covariance[old:],
-        )
     return joined
 
 
@@ -193,22 +186,41 @@ def fill_components(
     auxiliary: Array,
     born_ns: Index,
     rows: Index,
+    position: Array,
+    yaw: Array,
+    velocity: Array,
     measured_label: Index,
     measured_auxiliary: Array,
     stamp_ns: int,
+    heading_speed: Array,
+    known: Array,
+    unknown: Array,
     mean_out: Array,
     covariance_out: Array,
     label_out: Index,
     auxiliary_out: Array,
     born_ns_out: Index,
 ) -> None:
-    """Copy the components that stay, and behind them what the measurements in `rows` say of theirs but the state."""
-    for k in range(kept.shape[0]):
+    """Copy the components in `kept`, and put behind them those that the measurements in `rows` make."""
+    old = kept.shape[0]
+    for k in range(old):
         j = kept[k]
         mean_out[k], covariance_out[k], auxiliary_out[k] = mean[j], covariance[j], auxiliary[j]
         label_out[k], born_ns_out[k] = label[j], born_ns[j]
+    birth_states(
+        rows,
+        position,
+        yaw,
+        velocity,
+        measured_label,
+        heading_speed,
+        known,
+        unknown,
+        mean_out[old:],
+        covariance_out[old:],
+    )
     for b in range(rows.shape[0]):
-        k, m = kept.shape[0] + b, rows[b]
+        k, m = old + b, rows[b]
         auxiliary_out[k] = measured_auxiliary[m]
         label_out[k], born_ns_out[k] = measured_label[m], stamp_ns
 
@@ -239,19 +251,7 @@ def first_detected_states(
     Returns:
         How many covariances had to be repaired.
     """
-    birth_states(
-        rows,
-        measurements.position,
-        measurements.yaw,
-        measurements.velocity,
-        measurements.label,
-        table.birth_heading_speed,
-        table.birth_known,
-        table.birth_unknown,
-        mean_out,
-        covariance_out,
-    )
-    repaired: int = announced_states(
+    repaired: int = first_states(
         rows,
         hypotheses.first_kind,
         hypotheses.component,
@@ -263,6 +263,9 @@ def first_detected_states(
         measurements.velocity,
         measurements.yaw,
         measurements.label,
+        table.birth_heading_speed,
+        table.birth_known,
+        table.birth_unknown,
         table.noise_position,
         table.noise_velocity,
         table.noise_heading,
@@ -274,7 +277,7 @@ def first_detected_states(
 
 
 @kernel
-def announced_states(
+def first_states(
     rows: Index,
     first_kind: Index,
     component: Index,
@@ -286,6 +289,9 @@ def announced_states(
     velocity: Array,
     yaw: Array,
     label: Index,
+    heading_speed: Array,
+    known: Array,
+    unknown: Array,
     noise_position: Array,
     noise_velocity: Array,
     noise_heading: Array,
@@ -293,7 +299,9 @@ def announced_states(
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
-    """Write the moment-matched posteriors of the components in J^m over the states of the announced objects.
+    """Write the births m^0 and P^0 of the newborn, and the moment-matched posteriors of the components in J^m.
+
+    Equations Newborn Hypothesis and First-Time Detection Hypothesis Update 1; the weights are ``e^j / e``.
 
     Args:
         rows: (K,) measurements.
@@ -303,21 +311,25 @@ def announced_states(
         log_e: (L,) ln e^j of each pair.
         mean: (J, 6) predicted means of the components.
         covariance: (J, 6, 6) their covariances.
-        position: (M, 2) z_xy; this and what follows as in `ukf_updates`.
+        position: (M, 2) z_xy.
         velocity: (M, 2) z_v.
         yaw: (M,) z_phi.
         label: (M,) z_c.
-        noise_position: (C,).
+        heading_speed: (C,) this and the next two as in `birth_states`.
+        known: (C, 6).
+        unknown: (C, 6).
+        noise_position: (C,) this and the next three as in `ukf_updates`.
         noise_velocity: (C,).
         noise_heading: (C,).
         heading_sign_reliable: (C,).
-        mean_out: (K, 6) receives the means of the announced objects.
-        covariance_out: (K, 6, 6) receives their covariances.
+        mean_out: (K, 6) receives the means.
+        covariance_out: (K, 6, 6) receives the covariances.
 
     Returns:
         How many covariances had to be repaired.
     """
-    wanted = np.array([k for k in range(rows.shape[0]) if first_kind[rows[k]] == FROM_POISSON], np.int64)
+    birth_states(rows, position, yaw, velocity, label, heading_speed, known, unknown, mean_out, covariance_out)
+    wanted = np.flatnonzero(first_kind[rows] == FROM_POISSON)
     if wanted.shape[0] == 0:
         return 0
     # The pairs of each measurement, one measurement after the other.
@@ -370,7 +382,6 @@ def announced_states(
     )
     matched, matched_spread = np.empty((wanted.shape[0], STATE)), np.empty((wanted.shape[0], STATE, STATE))
     moment_match(start, weight, parts, spreads, matched, matched_spread)
-    mean_out[wanted] = matched
     for i in range(wanted.shape[0]):
-        covariance_out[wanted[i]] = matched_spread[i]
+        mean_out[wanted[i]], covariance_out[wanted[i]] = matched[i], matched_spread[i]
     return repaired

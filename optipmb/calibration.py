@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from optipmb.density import Bernoullis
-    from optipmb.table import ClassTable
-
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
 
@@ -43,28 +40,6 @@ def log_odds(score: float) -> float:
     """Return ln[z_s / (1 - z_s)] of a score in (0, 1], bounded by `SURE`."""
     odds = math.log(score) - math.log1p(-score)  # a score of one has infinite log odds
     return min(max(odds, -SURE), SURE)
-
-
-def calibrated(bernoulli: Bernoullis, rows: Index, table: ClassTable) -> tuple[Array, Array, Array]:
-    """Return existence (K,), score (K,) and covariance (K, 6, 6) of the objects in `rows`, as they are told."""
-    existence, score, covariance = bernoulli.existence[rows], bernoulli.score[rows], bernoulli.covariance[rows]
-    if table.calibrated:
-        calibrate_rows(
-            rows,
-            bernoulli.label,
-            bernoulli.evidence,
-            bernoulli.mean,
-            table.knots,
-            table.knot_evidence,
-            table.knot_existence,
-            table.knot_along,
-            table.knot_across,
-            table.score_of_evidence,
-            existence,
-            score,
-            covariance,
-        )
-    return existence, score, covariance
 
 
 @kernel

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optipmb.calibration import calibrated
+from optipmb.calibration import calibrate_rows
 from optipmb.compiled import kernel
-from optipmb.density import OMEGA, PHI, A, V, X, Y, whole_periods
+from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, whole_periods
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -99,42 +99,67 @@ def extract(
         rows,
     )
     rows = rows[:count]
-    existence, score, covariance = calibrated(bernoulli, rows, table)
     tracks = Tracks(
-        id=bernoulli.id[rows],
-        label=bernoulli.label[rows],
+        id=np.empty(count, np.int64),
+        label=np.empty(count, np.int64),
         center=np.empty((count, 3)),
         size=np.empty((count, 3)),
         yaw=np.empty(count),
         velocity=np.empty((count, 2)),
         yaw_rate=np.empty(count),
         acceleration=np.empty(count),
-        existence=existence,
-        score=score,
-        covariance=covariance,
+        existence=np.empty(count),
+        score=np.empty(count),
+        covariance=np.empty((count, STATE, STATE)),
         age=np.empty(count),
         time_since_detection=np.empty(count),
         detection=np.empty(count, np.int64),
     )
     read_tracks(
         rows,
+        bernoulli.id,
+        bernoulli.label,
         bernoulli.mean,
+        bernoulli.covariance,
+        bernoulli.existence,
+        bernoulli.score,
         bernoulli.auxiliary,
         bernoulli.born_ns,
         bernoulli.seen_ns,
         measurement,
         source,
         stamp_ns,
+        tracks.id,
+        tracks.label,
         tracks.center,
         tracks.size,
         tracks.yaw,
         tracks.velocity,
         tracks.yaw_rate,
         tracks.acceleration,
+        tracks.existence,
+        tracks.score,
+        tracks.covariance,
         tracks.age,
         tracks.time_since_detection,
         tracks.detection,
     )
+    if table.calibrated:
+        calibrate_rows(
+            rows,
+            bernoulli.label,
+            bernoulli.evidence,
+            bernoulli.mean,
+            table.knots,
+            table.knot_evidence,
+            table.knot_existence,
+            table.knot_along,
+            table.knot_across,
+            table.score_of_evidence,
+            tracks.existence,
+            tracks.score,
+            tracks.covariance,
+        )
     return tracks
 
 
@@ -170,26 +195,38 @@ def select_tracks(
 @kernel
 def read_tracks(
     rows: Index,
+    identity: Index,
+    label: Index,
     mean: Array,
+    covariance: Array,
+    existence: Array,
+    score: Array,
     auxiliary: Array,
     born_ns: Index,
     seen_ns: Index,
     measurement: Index,
     source: Index,
     stamp_ns: int,
+    identity_out: Index,
+    label_out: Index,
     center: Array,
     size: Array,
     yaw: Array,
     velocity: Array,
     yaw_rate: Array,
     acceleration: Array,
+    existence_out: Array,
+    score_out: Array,
+    covariance_out: Array,
     age: Array,
     time_since_detection: Array,
     detection: Index,
 ) -> None:
-    """Write the columns of `Tracks` that are not those of the objects in `rows`."""
+    """Write the columns of `Tracks` of the objects in `rows`, not calibrated yet."""
     for k in range(rows.shape[0]):
         n = rows[k]
+        identity_out[k], label_out[k] = identity[n], label[n]
+        existence_out[k], score_out[k], covariance_out[k] = existence[n], score[n], covariance[n]
         v, phi = mean[n, V], mean[n, PHI]
         center[k, 0], center[k, 1], center[k, 2] = mean[n, X], mean[n, Y], auxiliary[n, 3]
         for s in range(3):

@@ -127,7 +127,7 @@ def update_light_weight(
     evidence_out: Array,
     extracted_out: NDArray[np.bool_],
 ) -> None:
-    """Write the non-motion columns of the posterior; `extracted` stays as it was."""
+    """Write the non-motion columns of the posterior (eq. Confidence Score); `extracted` stays as it was."""
     for k in range(row.shape[0]):
         n, m = row[k], measurement[k]
         if n == NEW:

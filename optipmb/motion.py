@@ -52,7 +52,7 @@ def wrap(angle: float) -> float:
 
 @kernel
 def ctra_displacement(v: float, omega: float, a: float, dt: float) -> tuple[float, float]:
-    """Integrate the speed v + a t along a heading that turns with omega, from 0 to dt.
+    """Integrate the speed v + a t along a heading that turns with omega, from 0 to dt (eq. Motion Predict).
 
     Returns:
         The way along the starting heading and the way across it (to the left), m:

@@ -122,7 +122,7 @@ def predict_components(
     covariance_out: Array,
     weight_out: Array,
 ) -> tuple[int, int]:
-    """Predict the components that are within the limit of their class.
+    """Predict the components that are within the limit of their class (eq. PPP_prediction, MB_prediction).
 
     Args:
         mean: (N, 6) posterior means.

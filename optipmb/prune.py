@@ -200,7 +200,7 @@ def select_components(
     kept: Index,
     weight_out: Array,
 ) -> int:
-    """Write the rows that stay and their weights; return how many."""
+    """Write the rows that stay and their weights ``mu_+ (1 - p_d)`` (eq. PPP Update); return how many."""
     marked = np.zeros(weight.shape[0], np.bool_)
     for j in component:
         marked[j] = j < n_predicted

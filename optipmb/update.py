@@ -158,7 +158,7 @@ def ukf_update(
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
-    """Update one state with one measurement.
+    """Update one state with one measurement (eq. UKF Update).
 
     With C the cross covariance, S the innovation covariance and nu the innovation: ``K = C S^-1``, ``m = m_+ + K nu``,
     ``P = P_+ - K S K'``, computed through the Cholesky factor L of S as ``W = C L^-T``, ``P = P_+ - W W'``.
@@ -253,6 +253,8 @@ def moment_match(
     start: Index, weight: Array, mean: Array, covariance: Array, mean_out: Array, covariance_out: Array
 ) -> None:
     """Replace Gaussian mixtures by single Gaussians of the same mean and covariance.
+
+    Of first-time detections (eq. First-Time Detection Hypothesis Update 1).
 
     Headings are averaged as differences from the heading of the heaviest component, taken in (-pi, pi].
 

@@ -2,62 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from optipmb import (
-    association,
-    birth,
-    calibration,
-    density,
-    extract,
-    frame,
-    geometry,
-    hypotheses,
-    lightweight,
-    motion,
-    neighbours,
-    points,
-    predict,
-    preprocess,
-    prune,
-    update,
-)
 from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
 from optipmb.parameters import load_profile, parse_parameters
 from optipmb.tracker import Tracker
 
-MODULES = (
-    association,
-    birth,
-    calibration,
-    density,
-    extract,
-    frame,
-    geometry,
-    hypotheses,
-    lightweight,
-    motion,
-    neighbours,
-    points,
-    predict,
-    preprocess,
-    prune,
-    update,
-)
-"""All that have kernels."""
-
 
 def kernels() -> dict[str, Any]:
     """Return the kernels by name: numba's dispatchers, whose `stats` and `signatures` say what was compiled."""
+    modules = {name: module for name, module in sys.modules.items() if name.startswith("optipmb.")}
     return {
-        f"{module.__name__}.{name}": value
-        for module in MODULES
-        for name, value in vars(module).items()
-        if isinstance(value, Dispatcher) and value.py_func.__module__ == module.__name__
+        f"{module}.{name}": value
+        for module in sorted(modules)
+        for name, value in vars(modules[module]).items()
+        if isinstance(value, Dispatcher) and value.py_func.__module__ == module
     }
 
 

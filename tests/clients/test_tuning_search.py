@@ -28,7 +28,7 @@ def search(path: Path, *, seed: int = 0, settings: dict[str, int] | None = None)
     return Search(path, "valley", settings or {"a": 1}, SPACE, [START], seed)
 
 
-class Stopped(Exception):  # noqa: N818  nothing went wrong
+class Stopped(Exception):  # noqa: N818 - nothing went wrong
     """The session was ended in the middle of a trial."""
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from optipmb.association import UNASSIGNED
-from optipmb.birth import announced_states, fill_components, select_births
+from optipmb.birth import birth_states, fill_components, first_states, select_births
 from optipmb.calibration import SURE
 from optipmb.density import whole_periods
 from optipmb.extract import read_tracks, select_tracks
@@ -254,7 +254,14 @@ def test_tracks_are_read_off_the_states() -> None:
     shapes = [(3, 3), (3, 3), (3,), (3, 2), (3,), (3,), (3,), (3,)]
     out = [np.empty(shape) for shape in shapes]
     detection = np.empty(3, np.int64)
-    read_tracks(rows, mean, auxiliary, born, seen, measurement, source, NOW, *out, detection)
+    identity, label, r, score = np.arange(9) * 3, rng.integers(0, 4, 9), rng.uniform(0, 1, 9), rng.uniform(0, 1, 9)
+    covariance = rng.normal(0, 1, (9, 6, 6))
+    ids, labels, told = np.empty(3, np.int64), np.empty(3, np.int64), [np.empty(3), np.empty(3), np.empty((3, 6, 6))]
+    known = identity, label, mean, covariance, r, score, auxiliary, born, seen
+    read_tracks(rows, *known, measurement, source, NOW, ids, labels, *out[:6], *told, *out[6:], detection)
+    copies = zip((ids, labels, *told), (identity, label, r, score, covariance), strict=True)
+    for copy, column in copies:
+        np.testing.assert_array_equal(copy, column[rows])
     x = mean[rows]
     heading = np.column_stack([np.cos(x[:, 3]), np.sin(x[:, 3])])
     wanted = [np.column_stack([x[:, :2], auxiliary[rows, 3]]), auxiliary[rows, :3], x[:, 3], x[:, 2:3] * heading]
@@ -266,7 +273,7 @@ def test_tracks_are_read_off_the_states() -> None:
 
 @SEEDS
 def test_announced_objects_are_matched_mixtures(seed: int) -> None:
-    """Each is the mixture of its updated components with weights e^j / e; the states of newborns are not touched."""
+    """Each is the mixture of its updated components with weights e^j / e; newborns are births."""
     rng = np.random.default_rng(seed)
     count, pairs = 6, 20
     kind = np.array([FROM_POISSON, NEWBORN, FROM_POISSON, FROM_POISSON, CLUTTER])
@@ -279,8 +286,13 @@ def test_announced_objects_are_matched_mixtures(seed: int) -> None:
     noise = rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2), np.array([True, False])
     out, spread = np.full((3, 6), np.nan), np.full((3, 6, 6), np.nan)
     given = rows, kind, component, announced, log_e, mean, covariance
-    assert announced_states(*given, *measured, *noise, out, spread) == 0
-    assert np.isnan(out[1]).all()
+    births = rng.uniform(0, 2, 2), rng.uniform(0.1, 1, (2, 6)), rng.uniform(0.1, 1, (2, 6))
+    assert first_states(*given, *measured, *births, *noise, out, spread) == 0
+    born, born_spread = np.empty((1, 6)), np.empty((1, 6, 6))
+    position, velocity, yaw, label = measured
+    birth_states(rows[1:2], position, yaw, velocity, label, *births, born, born_spread)
+    np.testing.assert_array_equal(out[1], born[0])
+    np.testing.assert_array_equal(spread[1], born_spread[0])
     for k, m in ((0, 0), (2, 3)):
         members = np.flatnonzero(announced == m)
         parts, spreads = np.empty((members.size, 6)), np.empty((members.size, 6, 6))
@@ -307,16 +319,22 @@ def test_low_scores_are_born_with_what_association_leaves(seed: int) -> None:
 
 @SEEDS
 def test_components_that_stay_and_those_that_are_born_stand_in_order(seed: int) -> None:
-    """First the columns of the rows that stay, then box, class and stamp of the measurements."""
+    """First the columns of the rows that stay, then birth, box, class and stamp of the measurements."""
     rng = np.random.default_rng(seed)
     mean, covariance, label = rng.normal(0, 1, (8, 6)), rng.normal(0, 1, (8, 6, 6)), rng.integers(0, 3, 8)
     auxiliary, born, kept, rows = rng.normal(0, 1, (8, 4)), stamps(rng, 8), np.array([1, 5]), np.array([2, 0, 3])
     measured, boxes = rng.integers(0, 3, 4), rng.normal(0, 1, (4, 4))
     out = np.zeros((5, 6)), np.zeros((5, 6, 6)), np.empty(5, np.int64), np.empty((5, 4)), np.empty(5, np.int64)
-    fill_components(kept, mean, covariance, label, auxiliary, born, rows, measured, boxes, NOW, *out)
+    position, yaw, velocity = rng.normal(0, 9, (4, 2)), rng.normal(0, 1, 4), rng.normal(0, 2, (4, 2))
+    births = rng.uniform(0, 2, 3), rng.uniform(0.1, 1, (3, 6)), rng.uniform(0.1, 1, (3, 6))
+    old = kept, mean, covariance, label, auxiliary, born
+    fill_components(*old, rows, position, yaw, velocity, measured, boxes, NOW, *births, *out)
     np.testing.assert_array_equal(out[0][:2], mean[kept])
     np.testing.assert_array_equal(out[1][:2], covariance[kept])
-    assert not out[0][2:].any()
+    state, spread = np.empty((3, 6)), np.empty((3, 6, 6))
+    birth_states(rows, position, yaw, velocity, measured, *births, state, spread)
+    np.testing.assert_array_equal(out[0][2:], state)
+    np.testing.assert_array_equal(out[1][2:], spread)
     np.testing.assert_array_equal(out[2], [*label[kept], *measured[rows]])
     np.testing.assert_array_equal(out[3], [*auxiliary[kept], *boxes[rows]])
     np.testing.assert_array_equal(out[4], [*born[kept], NOW, NOW, NOW])

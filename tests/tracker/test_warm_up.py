@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import optipmb
-from optipmb.warm import MODULES, kernels
+from optipmb.warm import kernels
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 
@@ -72,7 +72,7 @@ def test_after_a_warm_up_nothing_is_compiled() -> None:
 
 
 def test_all_kernels_are_counted() -> None:
-    """Every module that defines a kernel is among those that are looked at."""
+    """Every kernel that a module defines is among those that are looked at."""
     folder = Path(optipmb.__file__).parent
     defined = set()
     for path in folder.glob("*.py"):
@@ -80,4 +80,3 @@ def test_all_kernels_are_counted() -> None:
             if isinstance(node, ast.FunctionDef) and any(ast.unparse(one) == "kernel" for one in node.decorator_list):
                 defined.add(f"optipmb.{path.stem}.{node.name}")
     assert set(kernels()) == defined
-    assert len(MODULES) == len({name.rpartition(".")[0] for name in defined})

@@ -1,0 +1,204 @@
+"""Every kernel has a plain twin that it must equal: a table of where, and twins of those that have none elsewhere."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from optipmb.calibration import SURE, calibrate_rows, log_odds
+from optipmb.errors import FrameError
+from optipmb.frame import MAX_COORDINATE, MAX_SPEED, _refuse, allowed
+from optipmb.hypotheses import detection_costs, first_detections, gate, local_hypotheses
+from optipmb.preprocess import gather
+from optipmb.warm import kernels
+
+COMPILING = settings(deadline=None)  # the first call compiles
+HERE = Path(__file__).parent
+
+TWINS = {
+    "association.assign": "test_hypotheses.test_the_total_is_that_of_the_hungarian_algorithm",
+    "birth.birth_states": "test_update.test_a_birth_is_the_textbook_birth",
+    "birth.fill_components": "test_kernels.test_components_that_stay_and_those_that_are_born_stand_in_order",
+    "birth.first_states": "test_kernels.test_announced_objects_are_matched_mixtures",
+    "birth.select_births": "test_kernels.test_low_scores_are_born_with_what_association_leaves",
+    "calibration.calibrate_rows": "test_twins.test_rows_are_calibrated_as_numpy_interpolates",
+    "calibration.log_odds": "test_twins.test_log_odds_are_bounded",
+    "density.whole_periods": "test_kernels.test_periods_are_counted_to_the_nearest",
+    "extract.read_tracks": "test_kernels.test_tracks_are_read_off_the_states",
+    "extract.select_tracks": "test_kernels.test_tracks_are_selected_by_two_thresholds",
+    "frame.allowed": "test_twins.test_values_are_allowed_as_numpy_says",
+    "geometry.bev_iou": "test_geometry.test_iou_is_that_of_clipped_polygons",
+    "geometry.box_iou": "test_geometry.test_iou_is_that_of_clipped_polygons",
+    "geometry.corners": "test_geometry.test_iou_is_that_of_clipped_polygons",
+    "geometry.intersection_area": "test_geometry.test_iou_is_that_of_clipped_polygons",
+    "geometry.iou_exceeds": "test_kernels.test_cheap_rejections_change_no_decision",
+    "hypotheses._grown": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "hypotheses.detection_costs": "test_hypotheses.test_costs_and_association_probabilities_are_the_formulas",
+    "hypotheses.first_detections": "test_hypotheses.test_each_kind_of_first_detection_has_its_formula",
+    "hypotheses.gate": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "hypotheses.local_hypotheses": "test_twins.test_hypotheses_are_those_of_their_parts",
+    "lightweight.update_light_weight": "test_kernels.test_the_light_weight_filter_is_its_formulas",
+    "motion.centred": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
+    "motion.ctra_displacement": "test_motion.test_the_displacement_is_the_integral_of_the_velocity",
+    "motion.predict_state": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
+    "motion.square_root": "test_motion.test_the_square_root_squared_is_the_covariance",
+    "motion.wrap": "test_motion.test_a_wrapped_angle_is_the_same_direction_in_the_half_open_interval",
+    "neighbours.block": "test_kernels.test_a_search_finds_every_neighbour_once",
+    "neighbours.cell": "test_kernels.test_a_search_finds_every_neighbour_once",
+    "neighbours.empty_torus": "test_kernels.test_a_search_finds_every_neighbour_once",
+    "neighbours.insert": "test_kernels.test_a_search_finds_every_neighbour_once",
+    "points.boxes_in_sensor": "test_geometry.test_points_in_boxes_counts_every_point",
+    "points.boxes_of_cells": "test_geometry.test_points_in_boxes_counts_every_point",
+    "points.column": "test_geometry.test_points_that_are_not_finite_are_in_no_box",
+    "points.count_points": "test_geometry.test_points_in_boxes_counts_every_point",
+    "predict.predict_components": "test_kernels.test_components_within_their_limit_are_predicted",
+    "preprocess.gather": "test_twins.test_measurements_are_the_chosen_rows",
+    "preprocess.non_maximum_suppression": "test_geometry.test_suppression_is_the_greedy_one_per_class",
+    "preprocess.precedes": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
+    "preprocess.select": "test_kernels.test_only_scores_from_the_filter_on_are_chosen",
+    "preprocess.sort_canonically": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
+    "prune.select_components": "test_kernels.test_components_survive_unless_marked_or_old",
+    "prune.select_objects": "test_kernels.test_objects_survive_by_existence_and_misses",
+    "update.moment_match": "test_update.test_a_mixture_keeps_its_mean_and_covariance",
+    "update.ukf_update": "test_update.test_the_update_is_the_textbook_ukf",
+    "update.ukf_updates": "test_update.test_the_update_is_the_textbook_ukf",
+    "update.workspace": "test_update.test_the_update_is_the_textbook_ukf",
+}
+"""Kernel -> the test that holds it, or the kernel that it is a part of, against plain numpy or a textbook formula."""
+
+
+def test_every_kernel_has_a_twin() -> None:
+    """The table names every kernel, and tests that there are."""
+    assert {name.removeprefix("optipmb.") for name in kernels()} == set(TWINS)
+    tests = set()
+    for path in HERE.glob("test_*.py"):
+        body = ast.parse(path.read_text(encoding="utf-8")).body
+        tests |= {f"{path.stem}.{node.name}" for node in body if isinstance(node, ast.FunctionDef)}
+    assert set(TWINS.values()) <= tests
+
+
+COORDINATES = st.sampled_from(
+    [0.0, -3.5, MAX_COORDINATE, -MAX_COORDINATE, np.nextafter(MAX_COORDINATE, np.inf), np.nan]
+)
+LENGTHS = st.sampled_from([1.0, 1e-300, MAX_COORDINATE, 0.0, -1.0, np.inf, np.nan])
+SCORES = st.sampled_from([0.5, 1.0, 1e-300, 0.0, -0.5, np.nextafter(1.0, 2.0), np.nan])
+SPEEDS = st.sampled_from([0.0, MAX_SPEED, -MAX_SPEED, np.nextafter(MAX_SPEED, np.inf), np.nan, -np.inf])
+
+
+@COMPILING
+@given(data=st.data(), count=st.integers(0, 3), worst=st.integers(0, 6))
+def test_values_are_allowed_as_numpy_says(data: st.DataObject, count: int, worst: int) -> None:
+    """Bounds, signs, NaN and half-known velocities; what is not allowed is refused, and nothing else."""
+
+    def drawn(place: int, shape: tuple[int, ...], values: st.SearchStrategy[float]) -> np.ndarray:
+        return data.draw(arrays(np.float64, shape, elements=values)) if place == worst else np.full(shape, 0.5)
+
+    label = data.draw(arrays(np.int64, count, elements=st.integers(-1, 3))) if worst == 0 else np.zeros(count, np.int64)
+    center, size = drawn(1, (count, 3), COORDINATES), drawn(2, (count, 3), LENGTHS)
+    yaw, score, velocity = drawn(3, (count,), COORDINATES), drawn(4, (count,), SCORES), drawn(5, (count, 2), SPEEDS)
+    unknown = np.isnan(velocity).all(axis=1, keepdims=True)
+    wanted = (
+        bool(((label >= 0) & (label < 3)).all())
+        and bool((np.abs(center) <= MAX_COORDINATE).all() and (np.abs(yaw) <= MAX_COORDINATE).all())
+        and bool(((size > 0) & (size <= MAX_COORDINATE)).all() and ((score > 0) & (score <= 1)).all())
+        and bool(((np.abs(velocity) <= MAX_SPEED) | unknown).all())
+    )
+    assert allowed(label, 3, center, size, yaw, score, velocity) == wanted
+    if wanted:
+        _refuse(label, 3, center, size, yaw, score, velocity)
+    else:
+        with pytest.raises(FrameError):
+            _refuse(label, 3, center, size, yaw, score, velocity)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rows_are_calibrated_as_numpy_interpolates(seed: int) -> None:
+    """`numpy.interp` over the knots of each class, a turned diagonal on x and y; other classes stay as they are."""
+    rng = np.random.default_rng(seed)
+    knots = np.array([4, 0, 1])
+    bends = np.sort(rng.normal(0, 2, (3, 4)), axis=1)
+    existence_at, along_at, across_at = (np.sort(rng.uniform(0, 1, (3, 4)), axis=1) for _ in range(3))
+    label, evidence, mean = rng.integers(0, 3, 30), rng.normal(0, 3, 30), rng.normal(0, 3, (30, 6))
+    evidence[:4], label[:4] = bends[0], 0  # at the knots themselves
+    rows = np.flatnonzero(rng.random(30) < 0.7)
+    existence, score, covariance = (rng.normal(0, 1, (rows.size, *shape)) for shape in ((), (), (6, 6)))
+    told, ranked, widened = existence.copy(), score.copy(), covariance.copy()
+    told_by_evidence = np.array([True, True, False])
+    curves = knots, bends, existence_at, along_at, across_at, told_by_evidence
+    calibrate_rows(rows, label, evidence, mean, *curves, told, ranked, widened)
+    for k, n in enumerate(rows):
+        c = label[n]
+        used = slice(0, knots[c])
+        if knots[c]:
+            existence[k], along, across = (
+                np.interp(evidence[n], bends[c, used], curve[c, used]) for curve in (existence_at, along_at, across_at)
+            )
+            cos, sin = np.cos(mean[n, 3]), np.sin(mean[n, 3])
+            turn = np.array([[cos, -sin], [sin, cos]])
+            covariance[k, :2, :2] += turn @ np.diag([along**2, across**2]) @ turn.T
+            if told_by_evidence[c]:
+                score[k] = 0.5 + 0.5 * evidence[n] / SURE
+    np.testing.assert_allclose(told, existence, rtol=1e-12)
+    np.testing.assert_allclose(ranked, score, rtol=1e-15)
+    np.testing.assert_allclose(widened, covariance, rtol=1e-12, atol=1e-15)
+
+
+@COMPILING
+@given(score=st.floats(1e-12, 1.0))
+def test_log_odds_are_bounded(score: float) -> None:
+    """`ln[z / (1 - z)]` between minus and plus `SURE`, also at one."""
+    with np.errstate(divide="ignore"):
+        wanted = np.clip(np.log(np.float64(score)) - np.log1p(-np.float64(score)), -SURE, SURE)
+    assert log_odds(score) == pytest.approx(wanted, rel=1e-14, abs=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_measurements_are_the_chosen_rows(seed: int) -> None:
+    """Every column is that of the detections, by an index array; the height of the centre is the last of x_A."""
+    rng = np.random.default_rng(seed)
+    center, size, velocity = rng.normal(0, 9, (20, 3)), rng.uniform(1, 5, (20, 3)), rng.normal(0, 2, (20, 2))
+    velocity[3] = np.nan
+    yaw, score, label, source = (
+        rng.normal(0, 1, 20),
+        rng.uniform(0, 1, 20),
+        rng.integers(0, 3, 20),
+        rng.permutation(40)[:20],
+    )
+    chosen = rng.permutation(20)[:12]
+    shapes = (12, 2), (12,), (12, 2), (12, 4), (12,)
+    out = [*(np.empty(shape) for shape in shapes), np.empty(12, np.int64), np.empty(12, np.int64)]
+    gather(chosen, center, size, yaw, velocity, score, label, source, *out)
+    wanted = center[:, :2], yaw, velocity, np.column_stack([size, center[:, 2]]), score, label, source
+    for found, column in zip(out, wanted, strict=True):
+        np.testing.assert_array_equal(found, column[chosen])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_hypotheses_are_those_of_their_parts(seed: int) -> None:
+    """Gates, costs, ln e = ln(mu p_d) + ln N and first-time detections, in the order of the columns."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(0, 0.5, (20, 6, 6))
+    mean, covariance = rng.normal(0, 4, (20, 6)), root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6)
+    label, weight, p_d = rng.integers(0, 2, 20), rng.uniform(0.1, 1, 20), rng.uniform(0.1, 0.9, 20)
+    position, measured, score = rng.normal(0, 4, (15, 2)), rng.integers(0, 2, 15), rng.uniform(0, 1, 15)
+    distance, noise = np.array([2.0, 4.0]), np.array([0.2, 0.7])
+    clutter, birth, threshold = np.array([1e-3, 1e-2]), np.array([1e-4, 1e-3]), np.array([0.3, 0.6])
+    old, new = slice(0, 12), slice(12, 20)
+    objects = mean[old], covariance[old], label[old]
+    components = mean[new], covariance[new], label[new]
+    given = *objects, weight[old], p_d[old], *components, weight[new], p_d[new]
+    found = local_hypotheses(*given, position, measured, score, distance, noise, clutter, birth, threshold)
+    row, measurement, likelihood = gate(*objects, position, measured, distance, noise)
+    cost, association = detection_costs(row, measurement, likelihood, weight[old], p_d[old], 15)
+    component, announced, log_e = gate(*components, position, measured, distance, noise)
+    log_e = np.log((weight * p_d)[new][component]) + log_e
+    first = first_detections(announced, log_e, score, association, measured, clutter, birth, threshold)
+    wanted = row, measurement, cost, component, announced, log_e, *first, association
+    for column, expected in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(column, expected, rtol=1e-12)
