@@ -15,7 +15,7 @@ help:
 	@echo "make bench   time the tracker, its kernels, the codec and the service, beside the saved baseline"
 	@echo "make figures measure the tracker's figures of docs/performance.md, beside other trackers, and write the page"
 	@echo "make load    measure what the service carries on this machine, as docs/performance.md has it"
-	@echo "make kills   kill the service a hundred times while recorded frames stream through it, and compare (needs DATA)"
+	@echo "make kills   kill the service a hundred times while recorded frames stream through it, and compare (needs KITTI)"
 	@echo "make soak    load the service for an hour, and see that nothing grows and every message is counted"
 	@echo "make stack   run the compose file's stack as processes and show that it works (needs Debian's prometheus)"
 	@echo "make tune    make the tuned profiles anew from DATA=... (out/tune-*/tuned.toml) and compare them with those that ship"
