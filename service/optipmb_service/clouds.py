@@ -53,6 +53,10 @@ class Clouds:
         others = (cloud for (whose, stamp), cloud in self._kept.items() if stamp == stamp_ns and not publishers(whose))
         return next(others, None)
 
+    def full_behind(self, stamp_ns: int) -> bool:
+        """Whether the shelf is full of clouds for frames later than a stamp: the next would push one of them off."""
+        return len(self._kept) >= self._most and all(stamp > stamp_ns for _, stamp in self._kept)
+
     def forget_before(self, stamp_ns: int, reach_ns: int) -> None:
         """Drop the clouds before a stamp; those further back than `reach_ns` belong to frames after a jump."""
         gone = [key for key in self._kept if 0 < stamp_ns - key[1] <= reach_ns]

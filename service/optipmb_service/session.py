@@ -351,7 +351,7 @@ class Session:
     def _advance(self, now_ns: int | None) -> list[Output]:
         """Process the frames that are ready, in order; None: all of them."""
         outputs: list[Output] = []
-        while (ready := self._waiting.take(now_ns, self._past.complete_until, self._cloud)) is not None:
+        while ready := self._waiting.take(now_ns, self._past.complete_until, self._cloud, self._crowded):
             outputs += self._process(ready)
         return outputs
 
@@ -359,6 +359,9 @@ class Session:
         if held.message.has_points is False:
             return None
         return self._clouds.get(held.mark.epoch, held.mark.stamp_ns, self._arrived.knows)
+
+    def _crowded(self, held: Held) -> bool:
+        return self._clouds.full_behind(held.mark.stamp_ns)
 
     def _process(self, ready: Ready) -> list[Output]:
         """Put a frame in its place."""

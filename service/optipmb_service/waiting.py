@@ -90,6 +90,7 @@ class Waiting:
         now_ns: int | None,
         complete: Callable[[Mark], bool],
         cloud: Callable[[Held], schemas.Points | None],
+        crowded: Callable[[Held], bool],
     ) -> Ready | None:
         """Return the next frame if it is ready, None otherwise.
 
@@ -97,6 +98,8 @@ class Waiting:
             now_ns: monotonic time; None: nothing waits any longer.
             complete: whether no frame is missing before one.
             cloud: finds the cloud of a frame.
+            crowded: whether longer waiting for the cloud of a frame would cost those behind it theirs. Else one lost
+                cloud would: each frame would find its own pushed off by the time that the one before was let go.
         """
         if now_ns is not None and self.recovery_ns is not None and now_ns >= self.recovery_ns:
             self.recovery_ns = None
@@ -108,7 +111,7 @@ class Waiting:
         points = cloud(head)
         missed = points is None and head.deadline_ns is not None
         many = len(self._held) > MAX_HELD and self.recovery_ns is None
-        if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not many:
+        if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not (many or crowded(head)):
             return None
         del self._held[0]
         return Ready(head, points, missed)

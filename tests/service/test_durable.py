@@ -111,13 +111,14 @@ def test_a_store_that_cannot_be_opened_degrades(start: Callable[..., Any], tmp_p
 
 
 def test_the_wall_clock_may_jump(start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Fault 8: the wall clock jumps by hours, ahead and back, before every frame: the tracks are the same bytes."""
+    """Fault 8: the wall clock jumps by hours, ahead and back, while every frame waits for its cloud: the same bytes."""
 
     def tracks(endpoint: str, jump: Callable[[int], None]) -> list[bytes]:
         with Node(endpoint) as node:
             for seq in range(20):
+                node.send(SENSOR.detections(seq, has_points=True))
                 jump(seq)
-                node.send(SENSOR.detections(seq))
+                node.send(SENSOR.points(seq))
                 received = node.tracks(SENSOR.stream, seq + 1)
             return [plain(message) for message in received]
 

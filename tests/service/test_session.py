@@ -18,6 +18,7 @@ import optipmb
 NUSCENES = optipmb.load_profile("nuscenes")
 WAIT_NS = Policy().cloud_wait_ns
 SENSOR = Sensor()
+LOST = 10
 
 
 def session(**changes: Any) -> Session:
@@ -226,6 +227,23 @@ def test_clouds_are_bounded() -> None:
         one.on_points(SENSOR.points(seq), 0)
     got = tracks(feed(one, [5, 6], has_points=True) + one.on_tick(WAIT_NS))
     assert [message.cloud_used for message in got] == [False, True]
+
+
+def test_one_lost_cloud_costs_one_frame_its_cloud() -> None:
+    """Where the wait is longer than the clouds kept, one lost cloud does not push those off that come behind it.
+
+    Twenty frames a second, a wait of a second, eight clouds kept: every frame but one is tracked with its cloud.
+    """
+    one = session(policy=Policy(clouds=8, cloud_wait_ns=SECOND))
+    got = []
+    for seq in range(100):
+        now_ns = seq * SECOND // 20
+        got += one.on_tick(now_ns)
+        if seq != LOST:
+            got += one.on_points(SENSOR.points(seq), now_ns)
+        got += one.on_detections(SENSOR.detections(seq, has_points=True), now_ns)
+    used = {message.seq: message.cloud_used for message in tracks([*got, *one.flush()])}
+    assert used == {seq: seq != LOST for seq in range(100)}
 
 
 def test_unknown_classes_are_left_out_and_told_once() -> None:
