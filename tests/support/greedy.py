@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from optipmb_client.results import ResultTable
+from boxes import Row, table_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from optipmb_client.results import ResultTable
     from optipmb_client.tuning.material import Clip
 
 REACH = {
@@ -26,6 +27,9 @@ REACH = {
     "pedestrian": 1.0,
     "motorcycle": 13.0,
     "bicycle": 3.0,
+    "Car": 4.0,
+    "Pedestrian": 1.0,
+    "Cyclist": 3.0,
 }
 """Farthest that a track of a class is sought, metres."""
 PATIENCE = 3
@@ -42,7 +46,7 @@ class _Track:
 def greedy_tracks(clip: Clip, name: str) -> ResultTable:
     """Track the detections of one class, in the world frame."""
     tracks: list[_Track] = []
-    rows: list[tuple[int, int, int]] = []  # frame, id, detection
+    rows: list[Row] = []
     before, count = None, 0
     for index, frame in enumerate(clip.frames):
         dt = 0.0 if before is None else (frame.stamp_ns - before) * 1e-9
@@ -58,22 +62,7 @@ def greedy_tracks(clip: Clip, name: str) -> ResultTable:
                 count += 1
                 identity = count
             found.append(_Track(identity, place, velocity[m]))
-            rows.append((index, identity, m))
+            rows.append((index, identity, frame.center[m], frame.size[m], float(frame.yaw[m]), float(frame.score[m])))
         lost = [replace(track, place=track.place + track.velocity * dt, missed=track.missed + 1) for track in free]
         tracks = [*found, *(track for track in lost if track.missed < PATIENCE)]
-    boxes = [clip.frames[index] for index, _, _ in rows]
-    column = {
-        key: np.array([getattr(frame, key)[m] for frame, (_, _, m) in zip(boxes, rows, strict=True)])
-        for key in ("center", "size", "yaw", "score")
-    }
-    return ResultTable(
-        labels=(name,),
-        frame=np.array([index for index, _, _ in rows], dtype=np.int64),
-        id=np.array([identity for _, identity, _ in rows], dtype=np.int64),
-        label=np.zeros(len(rows), dtype=np.int64),
-        center=column["center"].reshape(-1, 3),
-        size=column["size"].reshape(-1, 3),
-        yaw=column["yaw"],
-        score=column["score"],
-        box2d=np.full((len(rows), 4), np.nan),
-    )
+    return table_of(clip, name, rows)

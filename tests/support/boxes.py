@@ -1,0 +1,40 @@
+"""Rows of a simple tracker as a table of results."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from optipmb_client.geometry import to_sensor
+from optipmb_client.results import ResultTable
+from optipmb_client.results.kitti import LEAST_SHOWN
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from optipmb_client.tuning.material import Clip
+
+Row = tuple[int, int, "NDArray[np.float64]", "NDArray[np.float64]", float, float]
+"""Frame, id, centre, size, yaw and score, in the world frame."""
+
+
+def table_of(clip: Clip, name: str, rows: list[Row]) -> ResultTable:
+    """Return the table, with image boxes where there is a camera."""
+    frame, identity, center, size, yaw, score = zip(*rows, strict=True) if rows else ([],) * 6
+    when = np.array(frame, dtype=np.int64)
+    centers, sizes = np.array(center, dtype=np.float64).reshape(-1, 3), np.array(size, dtype=np.float64).reshape(-1, 3)
+    yaws = np.array(yaw, dtype=np.float64)
+    image = np.full((len(when), 4), np.nan)
+    if clip.camera is not None:
+        local, turned = to_sensor(clip.rotation[when], clip.translation[when], centers, yaws)
+        image = clip.camera.boxes(local, sizes, turned, LEAST_SHOWN)[0]
+    return ResultTable(
+        labels=(name,),
+        frame=when,
+        id=np.array(identity, dtype=np.int64),
+        label=np.zeros(len(when), dtype=np.int64),
+        center=centers,
+        size=sizes,
+        yaw=yaws,
+        score=np.array(score, dtype=np.float64),
+        box2d=image,
+    )
