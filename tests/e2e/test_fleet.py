@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from fleet import Fleet, freeze, thaw
+from optipmb_client import Publisher
 from optipmb_schemas import Keys, ServiceStatus, SessionState, Tracks
 from optipmb_service.checkpoint import digest_of
 from optipmb_service.records import Tracked
@@ -119,6 +120,23 @@ def test_terminated_in_the_middle(tmp_path: Path) -> None:
         node.send(*(SENSOR.detections(seq) for seq in range(50, 60)))
         fleet.service("a")
         check(node, 60, owner="a")
+
+
+@pytest.mark.timeout(120)
+def test_clouds_of_before_the_start_are_used(tmp_path: Path) -> None:
+    """Fault 1: a service that starts late gets frames and clouds from the caches of a publisher that keeps clouds."""
+    box = {"label": ["car"], "center": [[0, 0, 1]], "size": [[4, 2, 1.5]], "yaw": [0], "score": [0.9]}
+    cloud = [[x / 10, 0.0, 1.0] for x in range(20)]
+    with (
+        Fleet(tmp_path) as fleet,
+        Node(fleet.endpoint) as node,
+        Publisher(SENSOR.stream, fleet.endpoint, frame="world", cache_clouds=10) as publisher,
+    ):
+        for seq in range(5):
+            publisher.publish(stamp_ns=SENSOR.stamp_ns(seq), points=cloud, **box)
+        fleet.service("a", cloud_wait_s=5.0)
+        used = [tracks.cloud_used for tracks in node.tracks(SENSOR.stream, 5)]
+    assert used == [True] * 5
 
 
 @pytest.mark.timeout(120)

@@ -12,14 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from optipmb_schemas import Keys, ServiceStatus, SessionState
-from optipmb_service.keeper import STORE_FILE
-from optipmb_service.store import SqliteStore
+from optipmb_service.keeper import STORE_FILE, Keeper
+from optipmb_service.session import Session
+from optipmb_service.store import MemoryStore, SqliteStore
+from optipmb_service.transport import Transport
 from router import Node, Sensor, plain, until
 
 import optipmb
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable, Mapping
 
     import pytest
 
@@ -129,6 +131,58 @@ def test_the_wall_clock_may_jump(start: Callable[..., Any], monkeypatch: pytest.
         monkeypatch.setattr(time, "time_ns", lambda: true_ns() + (-1) ** seq * seq * 3600 * 10**9)
 
     assert tracks(start(store=str(tmp_path / "b"))[1], jump) == expected
+
+
+def test_nothing_is_published_while_the_tenure_has_lapsed(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Fault 17: who was away long enough for another to take over publishes only after a look at who has the stream."""
+    look, may_look = Transport.claimants, threading.Event()
+    may_look.set()
+
+    def claimants(transport: Transport, streams: Iterable[str] | None) -> Mapping[str, set[str]] | None:
+        return look(transport, streams) if may_look.is_set() else None
+
+    monkeypatch.setattr(Transport, "claimants", claimants)
+    service, endpoint = start(store=str(tmp_path))
+    with Node(endpoint) as node:
+        node.send(SENSOR.detections(0))
+        node.tracks(SENSOR.stream, 1)
+        may_look.clear()
+        service._steward._tenure.lapse()
+        node.send(*(SENSOR.detections(seq) for seq in range(1, 4)))
+        until(lambda: service.status().sessions[0].queue == 3, "the frames wait")
+        assert len(node.tracks_seen.items) == 1
+        may_look.set()
+        assert [tracks.seq for tracks in node.tracks(SENSOR.stream, 4)] == [0, 1, 2, 3]
+
+
+def test_what_a_checkpoint_contains_has_had_time_to_leave() -> None:
+    """Fault 1: a kill between the writing of a checkpoint and the sending of its tracks would swallow them.
+
+    So a checkpoint is written a quarter of a second after it was taken.
+    """
+    session = Session(SENSOR.stream, optipmb.load_profile("nuscenes"))
+    taken: list[float] = []
+    written: list[float] = []
+
+    class Watched(MemoryStore):
+        """Notes when it is written to."""
+
+        def save(self, checkpoints: Mapping[str, bytes]) -> frozenset[str]:
+            written.append(time.monotonic())
+            return super().save(checkpoints)
+
+    def gather() -> None:
+        taken.append(time.monotonic())
+        keeper.put(session.snapshot())
+
+    keeper = Keeper(Watched("one"), 0.05, lambda _: True)
+    keeper.start(gather)
+    until(lambda: len(written) >= 2, "two checkpoints are written")
+    delays = [at - before for before, at in zip(taken, written, strict=False)]
+    keeper.close(1.0)
+    assert min(delays) >= 0.25
 
 
 def test_overload_costs_the_stream_that_is_overloaded(start: Callable[..., Any]) -> None:
