@@ -20,13 +20,13 @@ from router import Sensor
 
 import optipmb
 
-SECONDS = float(os.environ.get("OPTIPMB_TEST_SOAK_S", "20"))
+SECONDS = float(os.environ.get("OPTIPMB_TEST_SOAK_S", "14"))
 STREAMS = int(os.environ.get("OPTIPMB_TEST_SOAK_STREAMS", "5"))
 CLOUD_STREAMS = max(1, STREAMS // 10)
 RATE_HZ = 20.0
 OBJECTS, POINTS = 40, 30_000
 MOST_GROWTH = 0.05
-WARM_S = 8.0
+WARM_S = 7.0
 """Until then the caches of the newest tracks fill up."""
 SAMPLES = 60
 TELL_EVERY_S = 60.0
