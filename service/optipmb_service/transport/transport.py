@@ -29,8 +29,8 @@ CHANNEL: Final = 4096
 HISTORY_S: Final = 60.0
 """Age of what is fetched from the publishers' small caches when the service starts or a publisher appears."""
 
-TRACKS_CACHE: Final = 128
-"""Tracks kept per stream for subscribers that lost some or come late: 5 s and more at the usual rates."""
+TRACKS_CACHE: Final = 50
+"""Tracks kept per stream for subscribers that lost some or come late: 5 s at 10 Hz. Most of what a stream holds."""
 
 HEARTBEAT_S: Final = 0.2
 """How long the loss of the newest tracks may stay unnoticed."""
