@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import optipmb
 from optipmb_service import convert
 from optipmb_service.checkpoint import Checkpoint, Recorded
-from optipmb_service.clouds import Clouds
 from optipmb_service.moments import Entry, Moment, Whereabouts
 from optipmb_service.past import Past
 from optipmb_service.quarantine import dump_of
@@ -35,8 +34,8 @@ from optipmb_service.records import (
 )
 from optipmb_service.stepping import Outcome, Stepper
 from optipmb_service.telling import Telling
-from optipmb_service.timing import Mark, Timeline, hold_until
-from optipmb_service.waiting import Held, Waiting
+from optipmb_service.timing import Mark, Timeline
+from optipmb_service.waiting import Waiting
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -82,9 +81,7 @@ class Session:
         self._clock = clock
         self._make = tracker
         self._past = Past(self._stepper(parameters), self._policy, life or Life())
-        self._arrived = self._past.timeline
-        self._waiting = Waiting()
-        self._clouds = Clouds(self._policy.clouds)
+        self._waiting = Waiting(self._policy, self._past.timeline)
         self._quarantine = ""
         self._run = 0
 
@@ -108,7 +105,7 @@ class Session:
                 self._telling.deliveries.refused += 1
                 return [self._telling.complain.quarantined(mark, self._quarantine)]
             outputs += self.reset("quarantine")
-        decision, arrived = self._arrived.judge(mark)
+        decision, arrived = self._waiting.timeline.judge(mark)
         if not decision.verdict.admitted:
             return [*outputs, *self._telling.refused(mark, decision)]
         try:
@@ -116,18 +113,11 @@ class Session:
         except optipmb.FrameError as error:
             self._telling.deliveries.refused += 1
             self._past.note(mark)
-            self._arrived = self._arrived.note(mark)
+            self._waiting.timeline = self._waiting.timeline.note(mark)
             return [*outputs, self._telling.complain.invalid(mark, error)]
-        self._arrived = arrived
-        deadline_ns = hold_until(
-            has_points=message.has_points,
-            stamp_ns=mark.stamp_ns,
-            arrived_ns=now_ns if arrived_ns is None else arrived_ns,
-            newest_cloud_ns=self._clouds.newest_ns,
-            cloud_wait_ns=self._policy.cloud_wait_ns,
-            cloud_memory_ns=self._policy.cloud_memory_ns,
-        )
-        self._waiting.add(Held(message, mark, decision.place.order(mark), frame, ignored, deadline_ns, ticket))
+        self._waiting.timeline = arrived
+        since_ns = now_ns if arrived_ns is None else arrived_ns
+        self._waiting.add(message, decision.place.order(mark), frame, ignored, since_ns, ticket)
         return [*outputs, *self._advance(now_ns)]
 
     def on_points(self, message: schemas.Points, now_ns: int, *, ticket: Any = None) -> list[Output]:
@@ -142,7 +132,7 @@ class Session:
             convert.cloud_of(message)
         except optipmb.FrameError as error:
             return [self._telling.complain.invalid(Mark(message.epoch, message.seq, message.stamp_ns), error)]
-        self._clouds.add(message)
+        self._waiting.clouds.add(message)
         outputs = self._amend(message, ticket) if self._policy.late_clouds and not self._quarantine else []
         return [*outputs, *self._advance(now_ns)]
 
@@ -235,7 +225,7 @@ class Session:
             window=tuple(Recorded(one.message, one.points, one.missed, one.revision, one.packed) for one in entries),
             head=self._past.head,
             deliveries=replace(self._telling.deliveries),
-            newest_cloud_ns=self._clouds.newest_ns,
+            newest_cloud_ns=self._waiting.clouds.newest_ns,
             run=self._run,
         )
 
@@ -332,14 +322,13 @@ class Session:
         return self._telling.state(
             self.parameters.name,
             self._past.head,
-            condition=self._condition(closed=closed),
+            condition="closed" if closed else self._condition,
             shed=shed,
             queue=queue + len(self._waiting),
         )
 
-    def _condition(self, *, closed: bool) -> Condition:
-        if closed:
-            return "closed"
+    @property
+    def _condition(self) -> Condition:
         if self._quarantine:
             return "quarantined"
         if self.recovering:
@@ -351,17 +340,9 @@ class Session:
     def _advance(self, now_ns: int | None) -> list[Output]:
         """Process the frames that are ready, in order; None: all of them."""
         outputs: list[Output] = []
-        while ready := self._waiting.take(now_ns, self._past.complete_until, self._cloud, self._crowded):
+        while ready := self._waiting.take(now_ns, self._past.complete_until):
             outputs += self._process(ready)
         return outputs
-
-    def _cloud(self, held: Held) -> schemas.Points | None:
-        if held.message.has_points is False:
-            return None
-        return self._clouds.get(held.mark.epoch, held.mark.stamp_ns, self._arrived.knows)
-
-    def _crowded(self, held: Held) -> bool:
-        return self._clouds.full_behind(held.mark.stamp_ns)
 
     def _process(self, ready: Ready) -> list[Output]:
         """Put a frame in its place."""
@@ -387,7 +368,8 @@ class Session:
             outcomes = self._past.go(placed, behind=behind)
         except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
             return self._fail(error, placed, mark)
-        self._settle(timeline)
+        gone = self._past.settle(timeline)
+        self._waiting.follow(self._past.timeline, self._past.base, gone)
         self._telling.deliveries.inserted += not behind
         return self._report(outcomes, before, ticket, began_ns)
 
@@ -407,39 +389,29 @@ class Session:
         self._quarantine = f"{type(error).__name__}: {error}"[:MAX_ERROR]
         self._telling.deliveries.refused += 1 + self._waiting.clear()
         self._past.note(mark)
-        self._arrived = self._past.timeline
+        self._waiting.timeline = self._past.timeline
         dump = dump_of(self._past.stepper, self._past.base, placed, error)
         return [self._telling.complain.failed(mark, self._quarantine), Quarantined(self._quarantine, dump)]
-
-    def _settle(self, timeline: Timeline) -> None:
-        """Take over the timeline with a frame, and let go what the window does not hold any more."""
-        gone, base = self._past.settle(timeline), self._past.base
-        if gone:
-            self._arrived = self._arrived.settle(base.course, base.last, gone)
-            if base.last is not None:
-                self._clouds.forget_before(base.last.stamp_ns, self._policy.gap_limit_ns)
-        if not self._waiting:
-            self._arrived = self._past.timeline
 
     def _begin(self, moment: Moment, stepper: Stepper | None = None) -> None:
         """Go on from a moment without a way back behind it."""
         self._past.begin(moment, stepper)
-        self._arrived = self._past.timeline
+        self._waiting.timeline = self._past.timeline
 
     def _resume(self, checkpoint: Checkpoint, now_ns: int) -> None:
         if checkpoint.cloud_wait_ns is not None:
             self._wait(checkpoint.cloud_wait_ns)
         self._quarantine = checkpoint.quarantine
         self._telling.deliveries = replace(checkpoint.deliveries)
-        self._clouds.newest_ns = checkpoint.newest_cloud_ns
+        self._waiting.clouds.newest_ns = checkpoint.newest_cloud_ns
         self._waiting.recovery_ns = now_ns + self._policy.recovery_wait_ns
         self._run = checkpoint.run + 1
         self._past.resume(checkpoint)
-        self._arrived = self._past.timeline
+        self._waiting.timeline = self._past.timeline
 
     def _wait(self, cloud_wait_ns: int) -> None:
         self._cloud_wait_ns = cloud_wait_ns
-        self._policy = replace(self._policy, cloud_wait_ns=cloud_wait_ns)
+        self._policy = self._waiting.policy = replace(self._policy, cloud_wait_ns=cloud_wait_ns)
 
     def _stepper(self, parameters: optipmb.Parameters) -> Stepper:
         return Stepper(self.stream, parameters, self._make(parameters), self._policy)

@@ -1,4 +1,8 @@
-"""Frames that are held: for their point clouds and, after a restore, for frames before them that may still come."""
+"""What arrived and was not gone through yet: clouds, and frames that are held until they are ready.
+
+A frame is held for its point cloud and, after a restore, for frames before it that may still come. The timeline here is
+that of the past with the frames held: a frame is judged by it when it arrives, and by the past's when its turn comes.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +10,20 @@ from bisect import insort
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from optipmb_service.clouds import Clouds
+from optipmb_service.timing import Mark, hold_until
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     import optipmb_schemas as schemas
 
     import optipmb
-    from optipmb_service.timing import Mark
+    from optipmb_service.moments import Moment
+    from optipmb_service.records import Policy
+    from optipmb_service.timing import Timeline
+
+    Order = tuple[int, int, int]
 
 MAX_HELD: Final = 64
 """Frames held for their clouds at once; beyond it the oldest goes on without."""
@@ -37,7 +48,7 @@ class Held:
 
     message: schemas.Detections
     mark: Mark
-    order: tuple[int, int, int]
+    order: Order
     frame: optipmb.Frame
     ignored: int
     deadline_ns: int | None
@@ -54,9 +65,17 @@ class Ready:
 
 
 class Waiting:
-    """The frames held, in the order in which they will be processed."""
+    """The frames held, in the order in which they will be processed, and the clouds.
 
-    def __init__(self) -> None:
+    Args:
+        policy: how long frames wait; may be replaced.
+        timeline: of the past.
+    """
+
+    def __init__(self, policy: Policy, timeline: Timeline) -> None:
+        self.policy = policy
+        self.timeline = timeline
+        self.clouds = Clouds(policy.clouds)
         self._held: list[Held] = []
         self.recovery_ns: int | None = None
         """Until when frames behind a gap are held for those missing (monotonic); None: they are not."""
@@ -64,9 +83,41 @@ class Waiting:
     def __len__(self) -> int:
         return len(self._held)
 
-    def add(self, held: Held) -> None:
-        """Put a frame where it belongs."""
-        insort(self._held, held, key=lambda one: one.order)
+    def add(
+        self,
+        message: schemas.Detections,
+        order: Order,
+        frame: optipmb.Frame,
+        ignored: int,
+        arrived_ns: int,
+        ticket: Any,
+    ) -> None:
+        """Put a frame where it belongs; the arguments are those of `Held`, and when it arrived (monotonic)."""
+        mark = Mark(message.epoch, message.seq, message.stamp_ns)
+        deadline_ns = hold_until(
+            has_points=message.has_points,
+            stamp_ns=mark.stamp_ns,
+            arrived_ns=arrived_ns,
+            newest_cloud_ns=self.clouds.newest_ns,
+            cloud_wait_ns=self.policy.cloud_wait_ns,
+            cloud_memory_ns=self.policy.cloud_memory_ns,
+        )
+        insort(self._held, Held(message, mark, order, frame, ignored, deadline_ns, ticket), key=lambda one: one.order)
+
+    def follow(self, past: Timeline, base: Moment, gone: frozenset[Mark]) -> None:
+        """Take over where the past is now.
+
+        Args:
+            past: its timeline.
+            base: the moment before its window.
+            gone: the frames that have left the window.
+        """
+        if gone:
+            self.timeline = self.timeline.settle(base.course, base.last, gone)
+            if base.last is not None:
+                self.clouds.forget_before(base.last.stamp_ns, self.policy.gap_limit_ns)
+        if not self._held:
+            self.timeline = past
 
     def clear(self) -> int:
         """Drop all; returns how many there were."""
@@ -89,17 +140,12 @@ class Waiting:
         self,
         now_ns: int | None,
         complete: Callable[[Mark], bool],
-        cloud: Callable[[Held], schemas.Points | None],
-        crowded: Callable[[Held], bool],
     ) -> Ready | None:
         """Return the next frame if it is ready, None otherwise.
 
         Args:
             now_ns: monotonic time; None: nothing waits any longer.
             complete: whether no frame is missing before one.
-            cloud: finds the cloud of a frame.
-            crowded: whether longer waiting for the cloud of a frame would cost those behind it theirs. Else one lost
-                cloud would: each frame would find its own pushed off by the time that the one before was let go.
         """
         if now_ns is not None and self.recovery_ns is not None and now_ns >= self.recovery_ns:
             self.recovery_ns = None
@@ -108,13 +154,25 @@ class Waiting:
         head = self._held[0]
         if now_ns is not None and len(self._held) <= MAX_RECOVERING and self._behind_gap(head, complete):
             return None
-        points = cloud(head)
+        points = self._cloud(head)
         missed = points is None and head.deadline_ns is not None
         many = len(self._held) > MAX_HELD and self.recovery_ns is None
-        if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not (many or crowded(head)):
+        if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not (many or self._crowded(head)):
             return None
         del self._held[0]
         return Ready(head, points, missed)
+
+    def _cloud(self, held: Held) -> schemas.Points | None:
+        if held.message.has_points is False:
+            return None
+        return self.clouds.get(held.mark.epoch, held.mark.stamp_ns, self.timeline.knows)
+
+    def _crowded(self, held: Held) -> bool:
+        """Whether longer waiting for a cloud would cost the frames behind it theirs.
+
+        Else one lost cloud would: each frame would find its own pushed off by the time that the one before was let go.
+        """
+        return self.clouds.full_behind(held.mark.stamp_ns)
 
     def _behind_gap(self, head: Held, complete: Callable[[Mark], bool]) -> bool:
         return self.recovery_ns is not None and not complete(head.mark)
