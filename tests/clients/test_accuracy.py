@@ -9,7 +9,7 @@ from kalman import kalman_tracks
 from optipmb_client.cli import run
 from optipmb_client.datasets import open_dataset
 from optipmb_client.evaluation.calibration import CalibrationResult
-from optipmb_client.tuning.calibrate import judge_calibration
+from optipmb_client.tuning.calibrate import cross_calibration
 from optipmb_client.tuning.figures import Figures
 from optipmb_client.tuning.material import Clip, load, of_class, track_clip
 from optipmb_client.tuning.scoring import Scorer, rules_of, scorer_of
@@ -46,9 +46,9 @@ def figures(profile: str, detections: str, name: str) -> Figures:
 
 
 def calibration(profile: str, detections: str, name: str) -> CalibrationResult:
-    """How well the tracks of one class know themselves."""
+    """How well the tracks of one class know themselves, each sequence with the calibration that the others give."""
     scorers, clips = material(profile, detections)
-    return judge_calibration(clips[name], scorers[name], only(optipmb.load_profile(profile), name))
+    return cross_calibration(clips[name], scorers[name], only(optipmb.load_profile(profile), name))
 
 
 @pytest.mark.parametrize(("name", "amota", "hota"), [("car", 0.87, 0.66), ("pedestrian", 0.92, 0.74)])
@@ -87,14 +87,14 @@ def test_kitti_is_tracked_better_than_by_simple_trackers(name: str, lead: float)
 
 @pytest.mark.parametrize("name", ["Car", "Pedestrian", "Cyclist"])
 def test_kitti_is_tracked_at_least_as_well_as_with_the_papers_values(name: str) -> None:
-    """Neither sAMOTA nor MOTA is less than with the values of the paper's table."""
+    """Neither sAMOTA nor MOTA is less than with the values of the paper's table, by more than a thousandth."""
     tuned, paper = figures("kitti", "pointrcnn", name), figures("kitti-paper", "pointrcnn", name)
     assert tuned.samota >= paper.samota - 0.001
-    assert tuned.mota >= paper.mota
+    assert tuned.mota >= paper.mota - 0.001
 
 
 def test_car_tracks_know_themselves() -> None:
-    """NEES is 2 within what the objects leave open, and existence probabilities come true within ten points."""
+    """In sequences left out NEES is 2 within what objects leave open, and existence comes true within ten points."""
     found = calibration("kitti", "pointrcnn", "Car")
     low, high = found.interval
     assert low < 2.0 < high
