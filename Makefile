@@ -104,7 +104,7 @@ kills: install
 
 # An hour of load, which CI does for seconds.
 soak: install
-	OPTIPMB_TEST_SOAK_S=3600 OPTIPMB_TEST_SOAK_STREAMS=20 $(BIN)/pytest -q tests/e2e/test_soak.py --timeout 0
+	OPTIPMB_TEST_SOAK_S=3600 OPTIPMB_TEST_SOAK_STREAMS=10 $(BIN)/pytest -q tests/e2e/test_soak.py --timeout 0
 
 clean:
 	rm -rf $(VENV) out build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
