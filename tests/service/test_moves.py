@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from optipmb_schemas import Keys
 from optipmb_service.share import Share
+from optipmb_service.standby import Standby
 from optipmb_service.transport import Transport
 from router import Node, Sensor, until
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import pytest
+    from optipmb_service.ports import Packet
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -27,17 +29,23 @@ def test_a_stream_that_is_moved_while_its_owner_is_sought(
 ) -> None:
     """Its first frames wait here and nowhere else: they are tracked, and only then is the stream left."""
     look, may_look = Transport.claimants, threading.Event()
+    add, waiting = Standby.add, []
+
+    def keep(standby: Standby, packet: Packet, *, frame: bool) -> None:
+        add(standby, packet, frame=frame)
+        waiting.append(packet)
 
     def claimants(transport: Transport, streams: Iterable[str] | None) -> Mapping[str, set[str]] | None:
         return look(transport, streams) if may_look.is_set() else None
 
     monkeypatch.setattr(Transport, "claimants", claimants)
+    monkeypatch.setattr(Standby, "add", keep)
     share = Share(HERE, 2, {SENSOR.stream: HERE})
     service, endpoint = start(share=share, store=str(tmp_path))
     left = threading.Event()
     with Node(endpoint) as node:
         node.send(*(SENSOR.detections(seq) for seq in range(FRAMES)))
-        until(lambda: service.status().standby == 1, "frames wait for the owner to be known")
+        until(lambda: len(waiting) == FRAMES, "all frames wait for the owner to be known")
         share.move(SENSOR.stream, THERE)
         assert service.give_up(SENSOR.stream, left.set)
         assert not left.is_set()
