@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,12 +42,11 @@ SHOWN = ("sAMOTA", "AMOTA", "MOTA", "HOTA", "HOTA, all", "IDS", "FP", "FN")
 
 def ways(dataset: str, name: str) -> Iterator[Way]:
     """Yield the trackers by name."""
-    yield "greedy", lambda clip: greedy_tracks(clip, name)
+    yield "greedy", partial(greedy_tracks, name=name)
     if name in HABITS:
-        yield "Kalman filters (AB3DMOT)", lambda clip: kalman_tracks(clip, name)
+        yield "Kalman filters (AB3DMOT)", partial(kalman_tracks, name=name)
     for profile in (f"{dataset}-paper", dataset):
-        parameters = only(optipmb.load_profile(profile), name)
-        yield f"`{profile}`", lambda clip, p=parameters: track_clip(clip, p)  # type: ignore[misc]
+        yield f"`{profile}`", partial(track_clip, parameters=only(optipmb.load_profile(profile), name))
 
 
 def main() -> None:

@@ -86,7 +86,9 @@ def kalman_tracks(clip: Clip, name: str) -> ResultTable:
             track.covariance = STEP @ track.covariance @ STEP.T + GAINED
             track.missed += 1
         free = set(range(len(boxes)))
-        for m, n in _assigned(boxes, np.array([track.state[:MEASURED] for track in tracks]).reshape(-1, 7), habits):
+        for m, n in _assigned(
+            boxes, np.array([track.state[:MEASURED] for track in tracks]).reshape(-1, MEASURED), habits
+        ):
             _update(tracks[n], boxes[m], float(odds[m]))
             free.discard(m)
         for m in sorted(free):
