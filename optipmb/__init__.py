@@ -21,6 +21,7 @@ from optipmb.frame import Frame, PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
 from optipmb.parameters import Calibration, ClassParameters, Parameters, load_profile, parse_parameters, profiles
 from optipmb.points import points_in_boxes
+from optipmb.soundness import sound
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
 from optipmb.warm import warm_up
 
@@ -51,5 +52,6 @@ __all__ = [
     "parse_parameters",
     "points_in_boxes",
     "profiles",
+    "sound",
     "warm_up",
 ]

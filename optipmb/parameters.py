@@ -15,7 +15,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from optipmb.errors import ParameterError
 
@@ -23,6 +23,16 @@ Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 OpenProbability = Annotated[float, Field(gt=0.0, lt=1.0)]
 Positive = Annotated[float, Field(gt=0.0, le=1e9)]
 NonNegative = Annotated[float, Field(ge=0.0, le=1e9)]
+
+
+def _printable(name: str) -> str:
+    if not name.isprintable():
+        raise ValueError("a name of printable characters")
+    return name
+
+
+ClassName = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable)]
+"""As messages take it."""
 
 
 class _Table(BaseModel):
@@ -166,7 +176,7 @@ class Parameters(_Table):
         description="seconds between frames for which p_s and the counted limits hold; with another dt they are scaled"
     )
     provenance: str = Field(default="", max_length=10_000, description="where the values come from")
-    classes: Annotated[dict[str, ClassParameters], Field(min_length=1, max_length=256)] = Field(
+    classes: Annotated[dict[ClassName, ClassParameters], Field(min_length=1, max_length=256)] = Field(
         description="one table per class; a detection of any other class is left out and counted"
     )
 

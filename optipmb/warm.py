@@ -11,6 +11,7 @@ from numba.core.dispatcher import Dispatcher
 from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
 from optipmb.parameters import load_profile, parse_parameters
+from optipmb.soundness import sound
 from optipmb.tracker import Tracker
 
 
@@ -73,4 +74,6 @@ def _run() -> None:
             velocity=[[1.0, 0.0], [0.0, 0.0], [np.nan, np.nan]],
             cloud=cloud,
         )
-        posterior = tracker.step(posterior, given).density
+        result = tracker.step(posterior, given)
+        posterior = result.density
+        sound(result.tracks)

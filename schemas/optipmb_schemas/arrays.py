@@ -24,6 +24,9 @@ from optipmb_schemas.errors import MessageError, cut, invalid, shape_text
 MAX_COLUMNS: Final = 64
 """Most columns of an array whose further columns are dropped."""
 
+_FEW: Final = 4096
+"""Values up to which looking for the place of an extreme is faster than a reduction, which takes long to begin."""
+
 _DTYPES: Final = {name: np.dtype(name) for name in ("f4", "f8", "i8")}
 
 
@@ -72,8 +75,9 @@ class Array:
         columns = self.shape[-1]
         if self.wider and isinstance(columns, int) and len(shape) > 1 and columns < shape[-1] <= MAX_COLUMNS:
             shape = (*shape[:-1], columns)
-        if len(shape) != len(self.shape) or shape[1:] != self.shape[1:] or not (self.rows or shape == self.shape):
-            raise MessageError("invalid_value", "", f"shape {self.shape_described}", f"shape {cut(shape_text(shape))}")
+        if shape[1:] == self.shape[1:] and len(shape) == len(self.shape) and (self.rows or shape == self.shape):
+            return
+        raise MessageError("invalid_value", "", f"shape {self.shape_described}", f"shape {cut(shape_text(shape))}")
 
     def validate(self, value: object) -> NDArray[Any]:
         """Return `value` as the array that the description asks for.
@@ -151,8 +155,7 @@ class Array:
             return np.array(array, self.dtype, order="C")
 
     def _check_values(self, array: NDArray[Any]) -> None:
-        lowest, highest = np.minimum.reduce(array, axis=None), np.maximum.reduce(array, axis=None)
-        # Both extremes of an array with a NaN are NaN, and comparisons with NaN are false.
+        lowest, highest = _extremes(array)
         if (lowest > self.low if self.above else lowest >= self.low) and highest <= self.high:
             return
         good = ((array > self.low) if self.above else (array >= self.low)) & (array <= self.high)
@@ -189,6 +192,14 @@ class Array:
         if self.wider:
             item["items"]["maxItems"] = MAX_COLUMNS
         return {**item, "x-dtype": self.dtype, "x-shape": list(self.shape)}
+
+
+def _extremes(array: NDArray[Any]) -> tuple[Any, Any]:
+    """Return the lowest and the highest value, both NaN where one is: comparisons with NaN are false."""
+    if array.size > _FEW:
+        return np.minimum.reduce(array, axis=None), np.maximum.reduce(array, axis=None)
+    flat = array.reshape(-1)
+    return flat.item(flat.argmin()), flat.item(flat.argmax())
 
 
 def unit_quaternion(array: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ optional field `pad`), so that the receiver's view is aligned.
 """
 
 import sys
+from functools import lru_cache
 from math import prod
 from typing import Any, Final
 
@@ -26,6 +27,8 @@ LARGE: Final = 4096
 ALIGNMENT: Final = 8
 """Large blocks start at a multiple of this many bytes from the start of the message."""
 
+_LITTLE: Final = sys.byteorder == "little"
+
 _NAMES: Final = DTYPES | {dtype.str: dtype for dtype in DTYPES.values()}
 
 _msgpack: Any = msgpack  # its type information is partial
@@ -44,7 +47,6 @@ def read_array(value: object, description: Array, limits: Limits) -> NDArray[Any
         array = description.from_lists(value)
     else:
         raise invalid("", f"an array of shape {description.shape_described}", value)
-    description.check_shape(array.shape)
     most = limits.rows(description.rows) if description.rows else len(array)
     if len(array) > most:
         raise MessageError("too_large", "", f"at most {most} rows", f"{len(array)} rows")
@@ -74,21 +76,43 @@ def _read_block(block: dict[str, Any], description: Array) -> NDArray[Any]:
 
 
 def block_of(array: NDArray[Any]) -> dict[str, Any]:
-    """Return the block of a native array. The data of a large one are a view, not a copy."""
-    little = array if _plain(array) else np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-    data = little.data if little.nbytes >= LARGE else little.tobytes()
-    return {"dtype": f"{array.dtype.kind}{array.dtype.itemsize}", "shape": list(array.shape), "data": data}
+    """Return the block of a native array."""
+    return {"dtype": array.dtype.str[1:], "shape": array.shape, "data": _data(array)}
 
 
-def _plain(array: NDArray[Any]) -> bool:
-    """Whether the bytes of an array are those of its block as they lie."""
-    return sys.byteorder == "little" and array.dtype.isnative and array.flags.c_contiguous
+def pack_field(name: str, array: NDArray[Any], offset: int) -> tuple[bytes, bytes | memoryview]:
+    """Return a field of a message that is to lie at `offset`, in two parts: all before the data, and the data.
+
+    The data of a large array are a view, not a copy, and aligned.
+    """
+    if array.nbytes < LARGE:
+        return _head(name, array.dtype, array.shape), _data(array)
+    before, after = _large_head(name, array.dtype, array.shape)
+    padding = -(offset + len(before) + 2 + len(after)) % ALIGNMENT
+    return before + b"\xc4" + bytes((padding, *bytes(padding))) + after, _data(array)
 
 
-def pack_large(block: dict[str, Any], offset: int) -> tuple[bytes, memoryview]:
-    """Return head and data of a large block that is to lie at `offset`, with the padding that aligns its data."""
-    pack, data = _msgpack.packb, block["data"]
-    head: bytes = b"\x84" + b"".join(map(pack, ("dtype", block["dtype"], "shape", block["shape"], "pad")))
-    tail: bytes = pack("data") + b"\xc6" + data.nbytes.to_bytes(4, "big")
-    padding = -(offset + len(head) + 2 + len(tail)) % ALIGNMENT
-    return head + b"\xc4" + bytes((padding, *bytes(padding))) + tail, data
+# Messages have the same few shapes over and over.
+
+
+@lru_cache(1024)
+def _head(name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    """Return all before the data of a small array."""
+    data = bytes(prod(shape) * dtype.itemsize)
+    field: bytes = _msgpack.packb({name: {"dtype": dtype.str[1:], "shape": shape, "data": data}})
+    return field[1 : len(field) - len(data)]
+
+
+@lru_cache(1024)
+def _large_head(name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[bytes, bytes]:
+    """Return what stands before the padding of a large array, and what between it and the data."""
+    pack, size = _msgpack.packb, prod(shape) * dtype.itemsize
+    before = pack(name) + b"\x84" + b"".join(map(pack, ("dtype", dtype.str[1:], "shape", shape, "pad")))
+    return before, pack("data") + b"\xc6" + size.to_bytes(4, "big")
+
+
+def _data(array: NDArray[Any]) -> bytes | memoryview:
+    """Return the bytes of an array, little-endian, row by row: of a large one a view."""
+    if not (_LITTLE and array.dtype.isnative and array.flags.c_contiguous):
+        array = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+    return array.data if array.nbytes >= LARGE else array.tobytes()

@@ -11,7 +11,7 @@ from typing import Any, Final, TypeVar
 import msgpack
 import numpy as np
 
-from optipmb_schemas.blocks import block_of, pack_large, read_array
+from optipmb_schemas.blocks import block_of, pack_field, read_array
 from optipmb_schemas.control import MoveRequest, Problem, ResetRequest, ServiceStatus, SessionParameters, SessionState
 from optipmb_schemas.errors import MessageError, show
 from optipmb_schemas.limits import DEFAULT, Limits
@@ -43,6 +43,8 @@ _UNDECLARED: Final = frozenset({"", "zenoh/bytes", "zenoh/string"})  # what Zeno
 _JSON_STARTS: Final = frozenset(b"{ \t\r\n")  # in msgpack these are small integers, never the start of a map
 _DIGITS: Final = 20  # of a 64-bit integer with its sign; the time to read longer ones grows with their square
 
+_SCALARS: Final = frozenset({str, bytes, int, float, bool})  # what msgpack takes as it is
+
 _msgpack: Any = msgpack  # its type information is partial
 
 
@@ -54,23 +56,21 @@ def encoding_of(message: Message | type[Message], *, form: str = "msgpack") -> s
 
 def encode(message: Message) -> bytes:
     """Return the message as msgpack, arrays as blocks. Fields that are None are left out."""
-    fields = _plain(message, blocks=True)
-    packer = _msgpack.Packer(autoreset=False)
-    packer.pack_map_header(len(fields))
-    parts: list[bytes | memoryview] = []
-    size = 0  # of the parts; what the packer holds comes after them
-    for name, value in fields.items():
-        packer.pack(name)
-        if isinstance(value, dict) and isinstance(value.get("data"), memoryview):
-            parts.append(packer.bytes())
-            packer.reset()
-            size += len(parts[-1])
-            head, data = pack_large(value, size)
+    fields = message.present()
+    packer = _msgpack.Packer()
+    pack = packer.pack
+    parts: list[bytes | memoryview] = [packer.pack_map_header(len(fields))]
+    size = len(parts[0])
+    for name, value in fields:
+        if isinstance(value, np.ndarray):
+            head, data = pack_field(name, value, size)
             parts += (head, data)
-            size += len(head) + data.nbytes
+            size += len(head) + value.nbytes
         else:
-            packer.pack(value)
-    parts.append(packer.bytes())
+            plain = value if type(value) in _SCALARS else _plain(value, blocks=True)
+            packed: bytes = pack(name) + pack(plain)
+            parts.append(packed)
+            size += len(packed)
     return b"".join(parts)
 
 

@@ -22,8 +22,12 @@ class Message(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore", arbitrary_types_allowed=True)
 
+    names: ClassVar[tuple[str, ...]] = ()
+    """Names of the fields, in the order of their description."""
     arrays: ClassVar[dict[str, Array]] = {}
     """Descriptions of the array fields, by name."""
+    columns: ClassVar[tuple[tuple[str, str], ...]] = ()
+    """Name and letter of the array fields whose number of rows is symbolic."""
     nested: ClassVar[dict[str, type["Message"]]] = {}
     """Message types of the fields that hold one message, by name."""
 
@@ -44,17 +48,34 @@ class Message(BaseModel):
                     cls.arrays[name] = part
                 elif isinstance(part, type) and issubclass(part, Message):
                     cls.nested[name] = part
+        cls.names = tuple(cls.model_fields)
+        cls.columns = tuple((name, one.rows) for name, one in cls.arrays.items() if one.rows is not None)
+
+    @classmethod
+    def trusted(cls, /, **fields: Any) -> Self:
+        """Return the message of values that are known to be valid, without checking them again.
+
+        For what a program has made itself out of values that were checked. Every value has the type that the field
+        holds, arrays their dtype and order; all fields are given that have no default.
+        """
+        for name in cls.arrays:
+            array = fields.get(name)
+            if array is not None:
+                fields[name] = array = array.view()
+                array.flags.writeable = False
+        return cls.model_construct(**fields)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         rows: dict[str, tuple[str, int]] = {}
-        for name, description in self.arrays.items():
-            array = getattr(self, name)
-            if array is None or description.rows is None:
+        values = self.__dict__
+        for name, letter in self.columns:
+            array = values[name]
+            if array is None:
                 continue
-            first, number = rows.setdefault(description.rows, (name, len(array)))
+            first, number = rows.setdefault(letter, (name, len(array)))
             if len(array) != number:
-                expected = f"{number} rows as in {first}, for shape {description.shape_described}"
+                expected = f"{number} rows as in {first}, for shape {self.arrays[name].shape_described}"
                 raise MessageError("invalid_value", name, expected, f"shape {shape_text(array.shape)}")
         self.check()
         return self
@@ -64,13 +85,14 @@ class Message(BaseModel):
 
     def present(self) -> list[tuple[str, Any]]:
         """Return the names and values of the fields that are not None, in the order of their description."""
-        return [(name, value) for name in type(self).model_fields if (value := getattr(self, name)) is not None]
+        values = self.__dict__
+        return [(name, value) for name in self.names if (value := values[name]) is not None]
 
     def __eq__(self, other: object) -> bool:
         """Equal messages have equal bytes on the wire; NaN equals NaN here, and 0.0 differs from -0.0 in arrays."""
         if type(other) is not type(self):
             return NotImplemented
-        return all(_same(getattr(self, name), getattr(other, name)) for name in type(self).model_fields)
+        return all(_same(getattr(self, name), getattr(other, name)) for name in self.names)
 
     __hash__ = BaseModel.__hash__  # pydantic's, of all fields: messages with arrays are not hashable
 

@@ -106,8 +106,16 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
     gap: int,
     ignored: int,
 ) -> schemas.Tracks:
-    """Return the message for the tracks of a frame, without its delivery part."""
-    return schemas.Tracks(
+    """Return the message for the tracks of a frame, without its delivery part.
+
+    What the tracker made of checked detections needs one look, not the checks of a message from elsewhere; where that
+    look finds something odd, those checks say what it is.
+
+    Raises:
+        schemas.MessageError: the tracks hold numbers that no message may.
+    """
+    make = schemas.Tracks.trusted if optipmb.sound(tracks) else schemas.Tracks
+    return make(
         stream=stream,
         epoch=mark.epoch,
         seq=mark.seq,

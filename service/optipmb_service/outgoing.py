@@ -87,7 +87,7 @@ class Outgoing:
         ticket: Ticket = tracked.ticket
         passed_ns = time.monotonic_ns() - ticket.now_ns
         waited_ns = max(0, passed_ns - ticket.decode_ns - tracked.step_ns)
-        delivery = schemas.Delivery(
+        delivery = schemas.Delivery.trusted(
             instance=self._instance,
             received_ns=ticket.wall_ns,
             published_ns=time.time_ns(),

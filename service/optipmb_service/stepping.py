@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 MAX_LABELS: Final = 256
 """Unknown class names remembered as reported."""
 
+_OPENING: Final = frozenset({Verdict.NEW_EPOCH, Verdict.RESTART})
+
 
 @dataclass(frozen=True, slots=True)
 class Begins:
@@ -96,22 +98,18 @@ class Stepper:
         begins = _begins(before, entry)
         known = Whereabouts() if begins else before.whereabouts
         whereabouts, where = judge(known, mark.stamp_ns, position_of(entry.message), self._policy)
-        counts = replace(
-            before.counts,
-            new_epochs=before.counts.new_epochs + (place.opens in (Verdict.NEW_EPOCH, Verdict.RESTART)),
-            clouds_missed=before.counts.clouds_missed + entry.missed,
-            astray=before.counts.astray + (where == "astray"),
-        )
-        passed = replace(
-            before, course=before.course.after(mark, place), last=mark, counts=counts, whereabouts=whereabouts
-        )
         if where == "astray":
+            counts = _counted(before.counts, entry, astray=1)
+            course = before.course.after(mark, place)
+            passed = replace(before, course=course, last=mark, counts=counts, whereabouts=whereabouts)
             return passed, Outcome(entry, None, None, {})
         if where == "moved":
             begins = Begins("pose", place.jump_ns)
-        return self._track(passed, entry, begins)
+        return self._track(before, entry, begins, whereabouts)
 
-    def _track(self, before: Moment, entry: Entry, begins: Begins | None) -> tuple[Moment, Outcome]:
+    def _track(
+        self, before: Moment, entry: Entry, begins: Begins | None, whereabouts: Whereabouts
+    ) -> tuple[Moment, Outcome]:
         mark, density, session, starts = entry.mark, before.density, before.session, before.starts
         reported = before.reported
         if begins:
@@ -120,8 +118,10 @@ class Stepper:
             reported = frozenset()
             if begins.reason != "first":
                 density = optipmb.Density.empty(density.next_id)
-        cloud = None if entry.points is None else convert.cloud_of(entry.points)
-        result = self._tracker.step(density, replace(entry.frame, cloud=cloud))
+        frame = entry.frame
+        if entry.points is not None:
+            frame = replace(frame, cloud=convert.cloud_of(entry.points))
+        result = self._tracker.step(density, frame)
         used = bool(result.diagnostics.cloud_used)
         same = before.tracked is not None and before.tracked[0] == mark.epoch
         highest = before.tracked[1] if before.tracked is not None and same else mark.seq - 1
@@ -138,23 +138,19 @@ class Stepper:
             ignored=entry.ignored,
         )
         unknown = self._unknown(entry, reported) if entry.ignored else {}
-        counts = before.counts
-        after = replace(
-            before,
+        repaired = int(result.diagnostics.repaired)
+        after = Moment(
             density=result.density,
             session=session,
             starts=starts,
             generation=entry.place.generation,
+            course=before.course.after(mark, entry.place),
+            last=mark,
             tracked=(mark.epoch, max(highest, mark.seq)),
             tracks=len(tracks.id),
-            counts=replace(
-                counts,
-                frames=counts.frames + 1,
-                gaps=counts.gaps + gap,
-                clouds_used=counts.clouds_used + used,
-                repaired=counts.repaired + int(result.diagnostics.repaired),
-            ),
+            counts=_counted(before.counts, entry, tracked=1, gap=gap, used=used, repaired=repaired),
             reported=reported | unknown.keys() if unknown else reported,
+            whereabouts=whereabouts,
         )
         return after, Outcome(entry, tracks, begins, unknown)
 
@@ -162,6 +158,28 @@ class Stepper:
         found = convert.unknown_labels(self.parameters, entry.message)
         new = sorted(found.keys() - reported)[: max(0, MAX_LABELS - len(reported))]
         return {label: found[label] for label in found if label in new}
+
+
+def _counted(
+    before: Counts,
+    entry: Entry,
+    *,
+    astray: int = 0,
+    tracked: int = 0,
+    gap: int = 0,
+    used: bool = False,
+    repaired: int = 0,
+) -> Counts:
+    """Return the counts with one more frame."""
+    return Counts(
+        frames=before.frames + tracked,
+        gaps=before.gaps + gap,
+        new_epochs=before.new_epochs + (entry.place.opens in _OPENING),
+        clouds_used=before.clouds_used + used,
+        clouds_missed=before.clouds_missed + entry.missed,
+        astray=before.astray + astray,
+        repaired=before.repaired + repaired,
+    )
 
 
 def empty(stepper: Stepper, last: Mark | None, next_id: int, starts: int, counts: Counts | None = None) -> Moment:

@@ -156,7 +156,7 @@ class Seen:
         """Return it with one more sequence number."""
         ahead = seq - self.highest
         if ahead <= 0:
-            return replace(self, mask=self.mask | 1 << -ahead)
+            return Seen(self.epoch, self.highest, self.mask | 1 << -ahead)
         # A sequence number may leap by 2^60: never shift further than the window is wide.
         shifted = self.mask << ahead if ahead < WINDOW else 0
         return Seen(self.epoch, seq, (shifted | 1) & ((1 << WINDOW) - 1))
@@ -233,8 +233,10 @@ class Timeline:
 
     def settle(self, base: Course, floor: Mark | None, gone: frozenset[Mark]) -> Timeline:
         """Return it with a later beginning of the window: `gone` are the frames that fell out of it."""
-        marks = tuple(mark for mark in self.marks if mark not in gone)
-        return replace(self, base=base, floor=floor, marks=marks)
+        marks = self.marks[len(gone) :]  # mostly it was the oldest that went
+        if gone != frozenset(self.marks[: len(gone)]):
+            marks = tuple(mark for mark in self.marks if mark not in gone)
+        return Timeline(self.gap_limit_ns, self.epochs, base, floor, marks, self.tip)
 
     def complete_until(self, mark: Mark, processed: tuple[bytes, int] | None) -> bool:
         """Whether no frame is missing between the last one processed of its epoch and this one."""
@@ -252,12 +254,8 @@ class Timeline:
         if not self._free(mark, place):
             return self._refuse(mark, Verdict.LATE)
         behind = place.era == self.tip.era and mark.stamp_ns < self.tip.newest_ns
-        timeline = replace(
-            self,
-            epochs=self._remember(mark, number),
-            marks=(*self.marks, mark),
-            tip=self.tip.after(mark, place),
-        )
+        epochs, marks, tip = self._remember(mark, number), (*self.marks, mark), self.tip.after(mark, place)
+        timeline = Timeline(self.gap_limit_ns, epochs, self.base, self.floor, marks, tip)
         return Decision(Verdict.INSERTED if behind else place.opens, place, last=not behind), timeline
 
     def _insert(self, mark: Mark, number: int) -> tuple[Decision, Timeline]:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
+import optipmb_schemas as schemas
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from optipmb_service import convert
 from optipmb_service.checkpoint import Checkpoint, decode_checkpoint, encode_checkpoint
 from optipmb_service.session import Session
+from optipmb_service.timing import Mark
 from router import Sensor
 from sessions import feed, tracks
 
@@ -63,6 +68,46 @@ def test_a_covariance_that_no_message_can_carry_is_not_told() -> None:
     assert tracks(feed(two, range(4, 9), SENSOR)) == []
     assert "covariance" in two.quarantine
     assert "expected a number in" in two.quarantine
+
+
+def told(found: optipmb.Tracks) -> schemas.Tracks:
+    """The message for tracks."""
+    return convert.tracks_of(
+        found,
+        stream=SENSOR.stream,
+        mark=Mark(SENSOR.epoch, 1, 2),
+        session="0" * 32,
+        revision=0,
+        parameters=NUSCENES,
+        cloud_used=False,
+        gap=0,
+        ignored=0,
+    )
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.data(), count=st.integers(0, 3))
+def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.DataObject, count: int) -> None:
+    """Whatever numbers the tracks hold, near every bound of the message: sound ones make a valid one."""
+    columns = {}
+    for name, array in schemas.Tracks.arrays.items():
+        shape = (count, *array.shape[1:])
+        if array.dtype == "i8":
+            top = len(NUSCENES.classes) - 1 if name == "label" else 9
+            columns[name] = data.draw(arrays(np.int64, shape, elements=st.integers(0, top), unique=name == "id"))
+        else:
+            ends = [array.low, array.high, np.nextafter(array.high, np.inf), np.nextafter(array.low, -np.inf), np.nan]
+            columns[name] = data.draw(
+                arrays(np.float64, shape, elements=st.just(0.5) | st.sampled_from(ends), fill=st.just(0.5))
+            )
+    found = optipmb.Tracks(**columns)
+    if not optipmb.sound(found):
+        with suppress(schemas.MessageError):
+            told(found)
+        return
+    message = told(found)
+    assert schemas.decode(schemas.encode(message), schemas.Tracks) == message
+    assert all(not getattr(message, name).flags.writeable for name in columns)
 
 
 def test_repairs_are_counted_and_shown() -> None:

@@ -192,6 +192,16 @@ def test_values_at_which_the_filter_would_divide_by_zero_are_refused(path: str, 
     assert refused(document_with(path, value)).path == path
 
 
+@pytest.mark.parametrize("name", ["", "x" * 65, "Car\n"])
+def test_a_class_is_named_so_that_messages_can_say_it(name: str) -> None:
+    """One to 64 printable characters, as labels have; the error says which name it was."""
+    document = random_parameters(0)
+    document["classes"][name] = document["classes"].pop("Car")
+    error = refused(document)
+    assert error.path.startswith("classes")
+    assert repr(name)[:60] in error.received
+
+
 @pytest.mark.parametrize("path", ["gates", "classes.Car.gates", "classes.Car.birth.gates"])
 def test_an_unknown_field_is_refused(path: str) -> None:
     """A misspelt parameter is not silently ignored."""

@@ -65,6 +65,7 @@ TWINS = {
     "preprocess.sort_canonically": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
     "prune.select_components": "test_kernels.test_components_survive_unless_marked_or_old",
     "prune.select_objects": "test_kernels.test_objects_survive_by_existence_and_misses",
+    "soundness.all_within": "test_soundness.test_bounds_are_kept_in_every_column",
     "update.moment_match": "test_update.test_a_mixture_keeps_its_mean_and_covariance",
     "update.ukf_update": "test_update.test_the_update_is_the_textbook_ukf",
     "update.ukf_updates": "test_update.test_the_update_is_the_textbook_ukf",

@@ -1,0 +1,94 @@
+"""Whether tracks hold numbers that a receiver can work with, found out in one pass.
+
+What comes out of the filter is sound as long as its covariances are. A covariance that came in with deviations of
+kilometres can grow past every bound, and whoever gives tracks away should know before anybody plans with them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from optipmb.compiled import kernel
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from optipmb.extract import Tracks
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+MAX_PLACE: Final = 1e9
+"""Largest coordinate of a track, m: ten times what a detection may have."""
+
+MAX_VALUE: Final = 1e5
+"""Largest size, heading, speed, turn rate and acceleration, in the units of `Tracks`."""
+
+MAX_COVARIANCE: Final = 1e30
+"""Largest entry of a covariance, in the units of `Tracks`."""
+
+MAX_AGE: Final = 1e12
+"""Longest age, s."""
+
+
+def sound(tracks: Tracks) -> bool:
+    """Tell whether all numbers of the tracks are finite and within bounds, and the ids ascend.
+
+    Existence and score lie in [0, 1], sizes are positive, ages are not negative, coordinates are at most `MAX_PLACE`,
+    covariances `MAX_COVARIANCE`, ages `MAX_AGE`, all others `MAX_VALUE`.
+    """
+    return bool(
+        all_within(
+            tracks.id,
+            tracks.center,
+            tracks.size,
+            tracks.yaw,
+            tracks.velocity,
+            tracks.yaw_rate,
+            tracks.acceleration,
+            tracks.existence,
+            tracks.score,
+            tracks.covariance,
+            tracks.age,
+            tracks.time_since_detection,
+        )
+    )
+
+
+@kernel
+def all_within(
+    identity: Index,
+    center: Array,
+    size: Array,
+    yaw: Array,
+    velocity: Array,
+    yaw_rate: Array,
+    acceleration: Array,
+    existence: Array,
+    score: Array,
+    covariance: Array,
+    age: Array,
+    time_since_detection: Array,
+) -> bool:
+    """Tell whether the columns of `Tracks` are within the bounds of `sound`; NaN is in none."""
+    good = True
+    before = -1
+    for n in range(identity.shape[0]):
+        good &= identity[n] > before
+        before = identity[n]
+        for s in range(3):
+            good &= abs(center[n, s]) <= MAX_PLACE
+            good &= 0.0 < size[n, s] <= MAX_VALUE
+        good &= abs(yaw[n]) <= MAX_VALUE
+        good &= abs(velocity[n, 0]) <= MAX_VALUE and abs(velocity[n, 1]) <= MAX_VALUE
+        good &= abs(yaw_rate[n]) <= MAX_VALUE
+        good &= abs(acceleration[n]) <= MAX_VALUE
+        good &= 0.0 <= existence[n] <= 1.0
+        good &= 0.0 <= score[n] <= 1.0
+        good &= 0.0 <= age[n] <= MAX_AGE
+        good &= 0.0 <= time_since_detection[n] <= MAX_AGE
+        for s in range(covariance.shape[1]):
+            for t in range(covariance.shape[2]):
+                good &= abs(covariance[n, s, t]) <= MAX_COVARIANCE
+    return good
