@@ -24,9 +24,6 @@ from optipmb_schemas.errors import MessageError, cut, invalid, shape_text
 MAX_COLUMNS: Final = 64
 """Most columns of an array whose further columns are dropped."""
 
-_FEW: Final = 4096
-"""Values up to which looking for the place of an extreme is faster than a reduction, which takes long to begin."""
-
 _DTYPES: Final = {name: np.dtype(name) for name in ("f4", "f8", "i8")}
 
 
@@ -155,7 +152,8 @@ class Array:
             return np.array(array, self.dtype, order="C")
 
     def _check_values(self, array: NDArray[Any]) -> None:
-        lowest, highest = _extremes(array)
+        lowest, highest = np.minimum.reduce(array, axis=None), np.maximum.reduce(array, axis=None)
+        # Both extremes of an array with a NaN are NaN, and comparisons with NaN are false.
         if (lowest > self.low if self.above else lowest >= self.low) and highest <= self.high:
             return
         good = ((array > self.low) if self.above else (array >= self.low)) & (array <= self.high)
@@ -192,14 +190,6 @@ class Array:
         if self.wider:
             item["items"]["maxItems"] = MAX_COLUMNS
         return {**item, "x-dtype": self.dtype, "x-shape": list(self.shape)}
-
-
-def _extremes(array: NDArray[Any]) -> tuple[Any, Any]:
-    """Return the lowest and the highest value, both NaN where one is: comparisons with NaN are false."""
-    if array.size > _FEW:
-        return np.minimum.reduce(array, axis=None), np.maximum.reduce(array, axis=None)
-    flat = array.reshape(-1)
-    return flat.item(flat.argmin()), flat.item(flat.argmax())
 
 
 def unit_quaternion(array: NDArray[np.float64]) -> NDArray[np.float64]:
