@@ -1,4 +1,4 @@
-"""How new objects enter: the hybrid adaptive birth model (HABM, Section IV.F) and first-time detections (IV.D.2).
+"""How new objects enter: births at measurements (Section IV.F) and first-time detections (IV.D.2).
 
 A birth starts at the measurement: m^0 = [z_x, z_y, speed, heading, 0, 0] under the covariance P^0 of its class. The
 paper takes speed and heading from the measured velocity. Two cases that it leaves open: without a velocity the
@@ -15,14 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import STATE, Poissons
-from optipmb.hypotheses import CLUTTER, FROM_POISSON
+from optipmb.density import STATE
+from optipmb.hypotheses import FROM_POISSON
 from optipmb.motion import wrap
 from optipmb.update import moment_match, ukf_updates
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from optipmb.density import Poissons
     from optipmb.hypotheses import Hypotheses
     from optipmb.preprocess import Measurements
     from optipmb.table import ClassTable
@@ -79,150 +80,6 @@ def birth_states(
         covariance_out[k] = 0.0
         for s in range(STATE):
             covariance_out[k, s, s] = spread[s] * spread[s]
-
-
-def adaptive_births(measurements: Measurements, hypotheses: Hypotheses, table: ClassTable) -> tuple[Index, Array]:
-    """Select lambda_b: the low-scored measurements M_low and their weights ``mu_b = mu_ab (1 - p_a)`` (eq. HABM).
-
-    Returns:
-        (K,) measurements, and (K,) weights; a zero weight makes no component.
-    """
-    rows, weight = np.empty(len(measurements), np.int64), np.empty(len(measurements))
-    count = select_births(
-        hypotheses.first_kind,
-        hypotheses.association,
-        measurements.label,
-        table.adaptive_birth_rate,
-        rows,
-        weight,
-    )
-    return rows[:count], weight[:count]
-
-
-@kernel
-def select_births(
-    first_kind: Index, association: Array, label: Index, birth_rate: Array, rows: Index, weight: Array
-) -> int:
-    """Write the measurements of lambda_b and their weights ``mu_ab (1 - p_a)`` (eq. HABM); return how many they are."""
-    count = 0
-    for m in range(first_kind.shape[0]):
-        born = birth_rate[label[m]] * (1.0 - association[m])
-        if first_kind[m] == CLUTTER and born > 0.0:
-            rows[count], weight[count] = m, born
-            count += 1
-    return count
-
-
-def measurement_births(measurements: Measurements, table: ClassTable) -> tuple[Index, Array]:
-    """Select every measurement, with weight mu_ab: GNN-PMB's birth model, the baseline of the ablation."""
-    return np.arange(len(measurements)), table.adaptive_birth_rate[measurements.label]
-
-
-def with_births(
-    poisson: Poissons,
-    kept: Index,
-    weight: Array,
-    births: tuple[Index, Array],
-    measurements: Measurements,
-    stamp_ns: int,
-    table: ClassTable,
-) -> Poissons:
-    """Put the components that stay and those that are born together.
-
-    Args:
-        poisson: the components.
-        kept: (K,) which of them stay.
-        weight: (K,) their weights.
-        births: (B,) measurements that make a component each, and (B,) the weights.
-        measurements: Z_k.
-        stamp_ns: stamp of the frame.
-        table: parameters as columns.
-    """
-    rows, born_weight = births
-    old, count = kept.shape[0], kept.shape[0] + rows.shape[0]
-    if not count:
-        return Poissons.empty()
-    joined = Poissons(
-        mean=np.empty((count, STATE)),
-        covariance=np.empty((count, STATE, STATE)),
-        weight=np.empty(count),
-        label=np.empty(count, np.int64),
-        auxiliary=np.empty((count, 4)),
-        born_ns=np.empty(count, np.int64),
-    )
-    joined.weight[:old], joined.weight[old:] = weight, born_weight
-    fill_components(
-        kept,
-        poisson.mean,
-        poisson.covariance,
-        poisson.label,
-        poisson.auxiliary,
-        poisson.born_ns,
-        rows,
-        measurements.position,
-        measurements.yaw,
-        measurements.velocity,
-        measurements.label,
-        measurements.auxiliary,
-        stamp_ns,
-        table.birth_heading_speed,
-        table.birth_known,
-        table.birth_unknown,
-        joined.mean,
-        joined.covariance,
-        joined.label,
-        joined.auxiliary,
-        joined.born_ns,
-    )
-    return joined
-
-
-@kernel
-def fill_components(
-    kept: Index,
-    mean: Array,
-    covariance: Array,
-    label: Index,
-    auxiliary: Array,
-    born_ns: Index,
-    rows: Index,
-    position: Array,
-    yaw: Array,
-    velocity: Array,
-    measured_label: Index,
-    measured_auxiliary: Array,
-    stamp_ns: int,
-    heading_speed: Array,
-    known: Array,
-    unknown: Array,
-    mean_out: Array,
-    covariance_out: Array,
-    label_out: Index,
-    auxiliary_out: Array,
-    born_ns_out: Index,
-) -> None:
-    """Copy the components in `kept`, and put behind them those that the measurements in `rows` make."""
-    old = kept.shape[0]
-    for k in range(old):
-        j = kept[k]
-        mean_out[k], covariance_out[k], auxiliary_out[k] = mean[j], covariance[j], auxiliary[j]
-        label_out[k], born_ns_out[k] = label[j], born_ns[j]
-    birth_states(
-        rows,
-        position,
-        yaw,
-        velocity,
-        measured_label,
-        heading_speed,
-        known,
-        unknown,
-        mean_out[old:],
-        covariance_out[old:],
-    )
-    for b in range(rows.shape[0]):
-        k, m = old + b, rows[b]
-        auxiliary_out[k] = measured_auxiliary[m]
-        label_out[k], born_ns_out[k] = measured_label[m], stamp_ns
 
 
 def first_detected_states(

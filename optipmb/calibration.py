@@ -61,7 +61,7 @@ def calibrate_rows(
     """Overwrite existence, score and covariance of the rows whose class has a calibration.
 
     Args:
-        rows: (K,) objects.
+        rows: (>= K,) objects, in front.
         label: (N,) classes.
         evidence: (N,) e_k.
         mean: (N, 6) motion states.
@@ -75,7 +75,7 @@ def calibrate_rows(
         score: (K,) in: x_s, out: the score that is told.
         covariance: (K, 6, 6) in: P, out: with the lasting error.
     """
-    for row in range(rows.shape[0]):
+    for row in range(existence.shape[0]):
         n = rows[row]
         c = label[n]
         count = knots[c]

@@ -11,12 +11,13 @@ Auxiliary state x_A = [length, width, height, z]: box size and height of the box
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 
 from optipmb.compiled import kernel
+from optipmb.records import record
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -51,7 +52,7 @@ class _Rows:
         return type(self)(**{name: column[rows] for name, column in self.columns()})
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Bernoullis(_Rows):
     """The detected potential objects.
 
@@ -102,7 +103,7 @@ class Bernoullis(_Rows):
         )
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Poissons(_Rows):
     """The Gaussian components of the Poisson intensity of undetected objects (eq. PPP Posterior).
 
@@ -128,17 +129,23 @@ class Poissons(_Rows):
     @classmethod
     def empty(cls) -> Poissons:
         """No components."""
+        return cls.unfilled(np.zeros(0))
+
+    @classmethod
+    def unfilled(cls, weight: NDArray[np.float64]) -> Poissons:
+        """Components of these weights; what the other columns hold does not matter yet."""
+        count = weight.shape[0]
         return cls(
-            mean=np.zeros((0, STATE)),
-            covariance=np.zeros((0, STATE, STATE)),
-            weight=np.zeros(0),
-            label=np.zeros(0, np.int64),
-            auxiliary=np.zeros((0, 4)),
-            born_ns=np.zeros(0, np.int64),
+            np.empty((count, STATE)),  # mean
+            np.empty((count, STATE, STATE)),  # covariance
+            weight,
+            np.empty(count, np.int64),  # label
+            np.empty((count, 4)),  # auxiliary
+            np.empty(count, np.int64),  # born_ns
         )
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Density:
     """The whole state of a session between two frames.
 

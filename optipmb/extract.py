@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from optipmb.calibration import calibrate_rows
 from optipmb.compiled import kernel
 from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, whole_periods
+from optipmb.records import record
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Index = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Tracks:
     """The extracted tracks of one frame in the world frame, one row per track, ascending ids.
 
@@ -98,22 +98,21 @@ def extract(
         bernoulli.extracted,
         rows,
     )
-    rows = rows[:count]
     tracks = Tracks(
-        id=np.empty(count, np.int64),
-        label=np.empty(count, np.int64),
-        center=np.empty((count, 3)),
-        size=np.empty((count, 3)),
-        yaw=np.empty(count),
-        velocity=np.empty((count, 2)),
-        yaw_rate=np.empty(count),
-        acceleration=np.empty(count),
-        existence=np.empty(count),
-        score=np.empty(count),
-        covariance=np.empty((count, STATE, STATE)),
-        age=np.empty(count),
-        time_since_detection=np.empty(count),
-        detection=np.empty(count, np.int64),
+        np.empty(count, np.int64),  # id
+        np.empty(count, np.int64),  # label
+        np.empty((count, 3)),  # center
+        np.empty((count, 3)),  # size
+        np.empty(count),  # yaw
+        np.empty((count, 2)),  # velocity
+        np.empty(count),  # yaw_rate
+        np.empty(count),  # acceleration
+        np.empty(count),  # existence
+        np.empty(count),  # score
+        np.empty((count, STATE, STATE)),  # covariance
+        np.empty(count),  # age
+        np.empty(count),  # time_since_detection
+        np.empty(count, np.int64),  # detection
     )
     read_tracks(
         rows,
@@ -222,8 +221,8 @@ def read_tracks(
     time_since_detection: Array,
     detection: Index,
 ) -> None:
-    """Write the columns of `Tracks` of the objects in `rows`, not calibrated yet."""
-    for k in range(rows.shape[0]):
+    """Write the columns of `Tracks` of the objects at the front of `rows`, not calibrated yet."""
+    for k in range(identity_out.shape[0]):
         n = rows[k]
         identity_out[k], label_out[k] = identity[n], label[n]
         existence_out[k], score_out[k], covariance_out[k] = existence[n], score[n], covariance[n]

@@ -8,13 +8,13 @@ hypotheses that win (`optipmb.update`). Likelihoods are kept as logarithms: weig
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
+from optipmb.records import record
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,8 +33,11 @@ CLUTTER: Final = 1
 NEWBORN: Final = 2
 """No component, high score: a newborn object (M_high)."""
 
+FEW: Final = 128
+"""Up to so many measurements it is faster to look at all of them than to find the neighbours among them."""
 
-@dataclass(frozen=True, slots=True)
+
+@record
 class Hypotheses:
     """All local hypotheses of one frame. Pairs are ordered by object or component, then by measurement.
 
@@ -84,28 +87,34 @@ def enumerate_hypotheses(
         measurements: Z_k.
         table: parameters as columns.
     """
-    return Hypotheses(
-        *local_hypotheses(
-            bernoulli.mean,
-            bernoulli.covariance,
-            bernoulli.label,
-            bernoulli.existence,
-            p_d,
-            poisson.mean,
-            poisson.covariance,
-            poisson.label,
-            poisson.weight,
-            p_d_poisson,
-            measurements.position,
-            measurements.label,
-            measurements.score,
-            table.gate,
-            table.noise_position,
-            table.clutter_intensity,
-            table.birth_intensity,
-            table.birth_score,
-        )
+    count = len(measurements)
+    first_kind, first_cost = np.empty(count, np.int64), np.empty(count)
+    first_existence, association = np.empty(count), np.empty(count)
+    pairs = local_hypotheses(
+        bernoulli.mean,
+        bernoulli.covariance,
+        bernoulli.label,
+        bernoulli.existence,
+        p_d,
+        poisson.mean,
+        poisson.covariance,
+        poisson.label,
+        poisson.weight,
+        p_d_poisson,
+        measurements.position,
+        measurements.label,
+        measurements.score,
+        table.gate,
+        table.noise_position,
+        table.clutter_intensity,
+        table.birth_intensity,
+        table.birth_score,
+        first_kind,
+        first_cost,
+        first_existence,
+        association,
     )
+    return Hypotheses(*pairs, first_kind, first_cost, first_existence, association)
 
 
 @kernel
@@ -128,22 +137,36 @@ def local_hypotheses(
     clutter_intensity: Array,
     birth_intensity: Array,
     birth_score: Array,
-) -> tuple[Index, Index, Array, Index, Index, Array, Index, Array, Array, Array]:
-    """Enumerate the local hypotheses; the columns of `Hypotheses`, in their order."""
+    first_kind: Index,
+    first_cost: Array,
+    first_existence: Array,
+    association: Array,
+) -> tuple[Index, Index, Array, Index, Index, Array]:
+    """Enumerate the local hypotheses: return the columns of `Hypotheses` over pairs, write those over measurements."""
     row, measurement, log_likelihood = gate(
         mean, covariance, label, position, measured_label, gate_distance, noise_position
     )
-    detection_cost, association = detection_costs(row, measurement, log_likelihood, existence, p_d, position.shape[0])
+    detection_cost = detection_costs(row, measurement, log_likelihood, existence, p_d, association)
     component, announced, log_e = gate(
         mean_poisson, covariance_poisson, label_poisson, position, measured_label, gate_distance, noise_position
     )
     for k in range(component.shape[0]):
         j = component[k]
         log_e[k] = math.log(weight[j] * p_d_poisson[j]) + log_e[k]
-    kind, cost, first_existence = first_detections(
-        announced, log_e, score, association, measured_label, clutter_intensity, birth_intensity, birth_score
+    first_detections(
+        announced,
+        log_e,
+        score,
+        association,
+        measured_label,
+        clutter_intensity,
+        birth_intensity,
+        birth_score,
+        first_kind,
+        first_cost,
+        first_existence,
     )
-    return row, measurement, detection_cost, component, announced, log_e, kind, cost, first_existence, association
+    return row, measurement, detection_cost, component, announced, log_e
 
 
 @kernel
@@ -158,8 +181,6 @@ def gate(
 ) -> tuple[Index, Index, Array]:
     """Find the measurements of an object's class within its gate and their position likelihoods.
 
-    The measurements stand in a torus of cells as wide as the gate of their class; an object looks at its neighbours.
-
     Args:
         mean: (N, 6) predicted means.
         covariance: (N, 6, 6) predicted covariances.
@@ -173,31 +194,81 @@ def gate(
         Objects, measurements and log-likelihoods ln N(z_xy; z_hat, S) of the pairs (eq. Predicted Measurement),
         ordered by object, then measurement.
     """
-    capacity = 4 * (mean.shape[0] + position.shape[0]) + 16 if mean.shape[0] else 0
-    row = np.empty(capacity, np.int64)
-    measurement = np.empty(capacity, np.int64)
-    log_likelihood = np.empty(capacity)
-    if mean.shape[0] == 0:
-        return row, measurement, log_likelihood
+    if position.shape[0] <= FEW:
+        row, measurement = pairs_of_few(mean, label, position, measured_label, gate_distance)
+    else:
+        row, measurement = pairs_of_many(mean, label, position, measured_label, gate_distance)
+    log_likelihood = np.empty(row.shape[0])
+    before = -1
+    s_xx = s_xy = s_yy = determinant = constant = 0.0
+    for k in range(row.shape[0]):
+        n, m = row[k], measurement[k]
+        if n != before:  # what the pairs of an object share
+            before = n
+            r_xy = noise_position[label[n]] ** 2
+            s_xx, s_xy, s_yy = covariance[n, 0, 0] + r_xy, covariance[n, 0, 1], covariance[n, 1, 1] + r_xy
+            determinant = s_xx * s_yy - s_xy * s_xy
+            constant = -math.log(2.0 * math.pi) - 0.5 * math.log(determinant)
+        dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
+        squared = (s_yy * dx * dx - 2.0 * s_xy * dx * dy + s_xx * dy * dy) / determinant
+        log_likelihood[k] = constant - 0.5 * squared
+    return row, measurement, log_likelihood
+
+
+@kernel
+def pairs_of_few(
+    mean: Array, label: Index, position: Array, measured_label: Index, gate_distance: Array
+) -> tuple[Index, Index]:
+    """Find the pairs within the gates by looking at every measurement; arguments and order as in `gate`."""
+    n_measurements = position.shape[0]
+    capacity = 2 * (mean.shape[0] + n_measurements) + 16 if mean.shape[0] else 0
+    row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+    squared = np.empty(n_measurements)
+    x, y = position[:, 0].copy(), position[:, 1].copy()
+    count = 0
+    for n in range(mean.shape[0]):
+        if count + n_measurements > capacity:
+            capacity = 2 * (count + n_measurements)
+            row, measurement = _grown(row, capacity), _grown(measurement, capacity)
+        eta = gate_distance[label[n]]
+        for m in range(n_measurements):  # apart from what follows, so that it is done several at a time
+            dx, dy = x[m] - mean[n, 0], y[m] - mean[n, 1]
+            squared[m] = dx * dx + dy * dy
+        for m in range(n_measurements):
+            if squared[m] <= eta * eta and measured_label[m] == label[n]:
+                row[count], measurement[count] = n, m
+                count += 1
+    return row[:count], measurement[:count]
+
+
+@kernel
+def pairs_of_many(
+    mean: Array, label: Index, position: Array, measured_label: Index, gate_distance: Array
+) -> tuple[Index, Index]:
+    """Find the pairs within the gates by looking at neighbours; arguments and order as in `gate`.
+
+    The measurements stand in a torus of cells twice as wide as the gate of their class, so that a gate touches two or
+    three cells along each axis.
+    """
+    capacity = 2 * (mean.shape[0] + position.shape[0]) + 16 if mean.shape[0] else 0
+    row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
     head, following, side = empty_torus(position.shape[0])
     for m in range(position.shape[0]):
-        insert(head, following, side, m, position[m, 0], position[m, 1], gate_distance[measured_label[m]])
+        insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * gate_distance[measured_label[m]])
     count = 0
     for n in range(mean.shape[0]):
         eta = gate_distance[label[n]]
         begin = count
-        first_x, last_x, first_y, last_y = block(mean[n, 0], mean[n, 1], eta, eta)
+        first_x, last_x, first_y, last_y = block(mean[n, 0], mean[n, 1], eta, 2.0 * eta)
         for i in range(first_x, last_x + 1):
             for j in range(first_y, last_y + 1):
                 m = head[(i & (side - 1)) * side + (j & (side - 1))]
                 while m != NOBODY:
                     dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
-                    if measured_label[m] == label[n] and dx * dx + dy * dy <= eta * eta:
+                    if dx * dx + dy * dy <= eta * eta and measured_label[m] == label[n]:
                         if count == capacity:
                             capacity *= 2
-                            row = _grown(row, capacity)
-                            measurement = _grown(measurement, capacity)
-                            log_likelihood = _grown(log_likelihood, capacity)
+                            row, measurement = _grown(row, capacity), _grown(measurement, capacity)
                         slot = count  # keep the measurements of this object in ascending order
                         while slot > begin and measurement[slot - 1] > m:
                             measurement[slot] = measurement[slot - 1]
@@ -206,19 +277,11 @@ def gate(
                         row[count] = n
                         count += 1
                     m = following[m]
-        r_xy = noise_position[label[n]] ** 2
-        s_xx, s_xy, s_yy = covariance[n, 0, 0] + r_xy, covariance[n, 0, 1], covariance[n, 1, 1] + r_xy
-        determinant = s_xx * s_yy - s_xy * s_xy
-        constant = -math.log(2.0 * math.pi) - 0.5 * math.log(determinant)
-        for k in range(begin, count):
-            dx, dy = position[measurement[k], 0] - mean[n, 0], position[measurement[k], 1] - mean[n, 1]
-            squared = (s_yy * dx * dx - 2.0 * s_xy * dx * dy + s_xx * dy * dy) / determinant
-            log_likelihood[k] = constant - 0.5 * squared
-    return row[:count].copy(), measurement[:count].copy(), log_likelihood[:count].copy()
+    return row[:count], measurement[:count]
 
 
 @kernel
-def _grown(array: Array, capacity: int) -> Array:
+def _grown(array: Index, capacity: int) -> Index:
     larger = np.empty(capacity, array.dtype)
     larger[: array.shape[0]] = array
     return larger
@@ -226,23 +289,37 @@ def _grown(array: Array, capacity: int) -> Array:
 
 @kernel
 def detection_costs(
-    row: Index, measurement: Index, log_likelihood: Array, existence: Array, p_d: Array, n_measurements: int
-) -> tuple[Array, Array]:
+    row: Index, measurement: Index, log_likelihood: Array, existence: Array, p_d: Array, association: Array
+) -> Array:
     """Compute the cost of each detection hypothesis and the association probability of each measurement.
 
     ``w = -ln [r p_d N(z; z_hat, S) / (1 - r + r (1 - p_d))]`` (eq. Detection Hypothesis Update) and
     ``p_a = min[1, sum_n N(z; z_hat^n, S^n)]`` (eq. Association Probability).
 
+    Args:
+        row: (K,) object of each pair, ascending.
+        measurement: (K,) measurement of each pair.
+        log_likelihood: (K,) ln N of each pair.
+        existence: (N,) r.
+        p_d: (N,) detection probabilities.
+        association: (M,) receives p_a.
+
     Returns:
-        (K,) costs and (M,) association probabilities.
+        (K,) costs.
     """
     cost = np.empty(row.shape[0])
-    association = np.zeros(n_measurements)
+    association[:] = 0.0
+    before, missed, detected = -1, 0.0, 0.0
     for k in range(row.shape[0]):
-        r, p = existence[row[k]], p_d[row[k]]
-        cost[k] = math.log(1.0 - r + r * (1.0 - p)) - math.log(r * p) - log_likelihood[k]
+        if row[k] != before:  # what the pairs of an object share
+            before = row[k]
+            r, p = existence[before], p_d[before]
+            missed, detected = math.log(1.0 - r + r * (1.0 - p)), math.log(r * p)
+        cost[k] = missed - detected - log_likelihood[k]
         association[measurement[k]] += math.exp(log_likelihood[k])
-    return cost, np.minimum(association, 1.0)
+    for m in range(association.shape[0]):
+        association[m] = min(association[m], 1.0)
+    return cost
 
 
 @kernel
@@ -255,7 +332,10 @@ def first_detections(
     clutter_intensity: Array,
     birth_intensity: Array,
     birth_score: Array,
-) -> tuple[Index, Array, Array]:
+    kind: Index,
+    cost: Array,
+    existence: Array,
+) -> None:
     """Compute kind, cost and existence of the first-time detection hypothesis of each measurement.
 
     With components in the gate (eq. First-Time Detection Hypothesis Update 1): ``w = -ln(e + lambda_c)``, ``r = e /
@@ -272,17 +352,18 @@ def first_detections(
         clutter_intensity: (C,) lambda_c.
         birth_intensity: (C,) mu_b0 / A.
         birth_score: (C,) eta_score.
+        kind: (M,) receives `FROM_POISSON`, `CLUTTER` or `NEWBORN`.
+        cost: (M,) receives w.
+        existence: (M,) receives r.
     """
     n_measurements = score.shape[0]
     log_sum = np.full(n_measurements, -math.inf)  # ln e, e = sum_j e^j
-    kind = np.full(n_measurements, CLUTTER)
+    kind[:] = CLUTTER
     for k in range(measurement.shape[0]):
         m = measurement[k]
         kind[m] = FROM_POISSON
         larger, smaller = max(log_sum[m], log_e[k]), min(log_sum[m], log_e[k])
         log_sum[m] = larger if smaller == -math.inf else larger + math.log1p(math.exp(smaller - larger))
-    cost = np.empty(n_measurements)
-    existence = np.empty(n_measurements)
     for m in range(n_measurements):
         clutter = clutter_intensity[label[m]]
         if kind[m] == FROM_POISSON:
@@ -296,4 +377,3 @@ def first_detections(
             kind[m] = NEWBORN
             cost[m] = -math.log(birth_intensity[label[m]] * (1.0 - association[m]) + clutter)
             existence[m] = 1.0
-    return kind, cost, existence

@@ -55,17 +55,17 @@ def light_weight_filter(
     """
     count = len(survivors)
     posterior = Bernoullis(
-        mean=mean,
-        covariance=covariance,
-        existence=survivors.existence,
-        label=np.empty(count, np.int64),
-        auxiliary=np.empty((count, 4)),
-        id=np.empty(count, np.int64),
-        born_ns=np.empty(count, np.int64),
-        seen_ns=np.empty(count, np.int64),
-        score=np.empty(count),
-        evidence=np.empty(count),
-        extracted=np.empty(count, np.bool_),
+        mean,
+        covariance,
+        survivors.existence,
+        np.empty(count, np.int64),  # label
+        np.empty((count, 4)),  # auxiliary
+        np.empty(count, np.int64),  # id
+        np.empty(count, np.int64),  # born_ns
+        np.empty(count, np.int64),  # seen_ns
+        np.empty(count),  # score
+        np.empty(count),  # evidence
+        np.empty(count, np.bool_),  # extracted
     )
     update_light_weight(
         survivors.row,
@@ -128,6 +128,8 @@ def update_light_weight(
     extracted_out: NDArray[np.bool_],
 ) -> None:
     """Write the non-motion columns of the posterior (eq. Confidence Score); `extracted` stays as it was."""
+    # What the evidence keeps: over the time since the frame before, and in a first detection over one nominal period.
+    memory_of_frame = memory ** ((stamp_ns - before_ns) * 1e-9 / period)
     for k in range(row.shape[0]):
         n, m = row[k], measurement[k]
         if n == NEW:
@@ -151,6 +153,5 @@ def update_light_weight(
             score_out[k] = (1.0 - math.exp(-x_len)) * z_s
             seen_ns_out[k] = stamp_ns
             latest = log_odds(z_s)
-        periods = 1.0 if born_ns_out[k] == stamp_ns else (stamp_ns - before_ns) * 1e-9 / period
-        kept = memory[c] ** periods
+        kept = memory[c] if born_ns_out[k] == stamp_ns else memory_of_frame[c]
         evidence_out[k] = kept * evidence_out[k] + (1.0 - kept) * latest

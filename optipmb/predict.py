@@ -47,17 +47,17 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     if kept.shape[0] < len(bernoulli):
         bernoulli = bernoulli.take(kept)
     bernoulli = Bernoullis(
-        mean=mean,
-        covariance=covariance,
-        existence=existence,
-        label=bernoulli.label,
-        auxiliary=bernoulli.auxiliary,
-        id=bernoulli.id,
-        born_ns=bernoulli.born_ns,
-        seen_ns=bernoulli.seen_ns,
-        score=bernoulli.score,
-        evidence=bernoulli.evidence,
-        extracted=bernoulli.extracted,
+        mean,
+        covariance,
+        existence,
+        bernoulli.label,
+        bernoulli.auxiliary,
+        bernoulli.id,
+        bernoulli.born_ns,
+        bernoulli.seen_ns,
+        bernoulli.score,
+        bernoulli.evidence,
+        bernoulli.extracted,
     )
     if not len(poisson):
         return Density(stamp_ns, density.next_id, bernoulli, poisson), repaired_mb
@@ -101,7 +101,9 @@ def _carry(
         covariance,
         carried,
     )
-    return kept[:left], mean[:left], covariance[:left], carried[:left], repaired
+    if left < count:
+        return kept[:left], mean[:left], covariance[:left], carried[:left], repaired
+    return kept, mean, covariance, carried, repaired
 
 
 @kernel

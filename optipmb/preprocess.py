@@ -7,7 +7,6 @@ depends on the order in which a detector lists its boxes.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.geometry import iou_exceeds
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
+from optipmb.records import record
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Index = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Measurements:
     """The measurement set Z_k, best score first.
 
@@ -72,13 +72,13 @@ def preprocess(frame: Frame, table: ClassTable) -> tuple[Measurements, int, int]
         chosen,
     )
     measurements = Measurements(
-        position=np.empty((kept, 2)),
-        yaw=np.empty(kept),
-        velocity=np.empty((kept, 2)),
-        auxiliary=np.empty((kept, 4)),
-        score=np.empty(kept),
-        label=np.empty(kept, np.int64),
-        source=np.empty(kept, np.int64),
+        np.empty((kept, 2)),  # position
+        np.empty(kept),  # yaw
+        np.empty((kept, 2)),  # velocity
+        np.empty((kept, 4)),  # auxiliary
+        np.empty(kept),  # score
+        np.empty(kept, np.int64),  # label
+        np.empty(kept, np.int64),  # source
     )
     gather(
         chosen,

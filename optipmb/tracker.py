@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from optipmb.association import UNASSIGNED, associate
-from optipmb.birth import adaptive_births, first_detected_states, measurement_births, with_births
+from optipmb.association import associate
+from optipmb.birth import first_detected_states
 from optipmb.density import NO_FRAME, STATE, Density, Poissons
 from optipmb.detection_probability import detection_probability
 from optipmb.errors import FrameError
@@ -18,8 +18,10 @@ from optipmb.hypotheses import enumerate_hypotheses
 from optipmb.lightweight import light_weight_filter
 from optipmb.predict import predict
 from optipmb.preprocess import preprocess
-from optipmb.prune import surviving_components, surviving_objects
+from optipmb.prune import surviving_objects
+from optipmb.records import record
 from optipmb.table import ClassTable
+from optipmb.undetected import update_undetected, with_measurement_births
 from optipmb.update import update_states
 
 if TYPE_CHECKING:
@@ -51,10 +53,6 @@ STAGES: Final = (
 """The stages of a step, in their order, as `Diagnostics.stage_ns` has them."""
 
 
-NOTHING: Final = (np.empty(0, np.int64), np.empty(0))
-"""No births."""
-
-
 def _no_clock() -> int:
     return 0
 
@@ -77,7 +75,7 @@ class Modules:
     ote: bool = True
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Diagnostics:
     """What happened in a step, beside the tracks.
 
@@ -102,7 +100,7 @@ class Diagnostics:
     stage_ns: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class StepResult:
     """Posterior density, extracted tracks and diagnostics of one step."""
 
@@ -172,8 +170,7 @@ class Tracker:
         measurements, below_score, suppressed = preprocess(frame, table)
         n_predicted = len(poisson)
         if not modules.habm:
-            births = measurement_births(measurements, table)
-            poisson = with_births(poisson, np.arange(n_predicted), poisson.weight, births, measurements, now, table)
+            poisson = with_measurement_births(poisson, measurements, now, table)
         times.append(clock())
         cloud = frame.cloud if modules.adp else None
         p_d, p_d_poisson = self._detection_probabilities(bernoulli, poisson, cloud)
@@ -194,7 +191,13 @@ class Tracker:
         times.append(clock())
 
         # PPP update and redundant PPP pruning
-        undetected = self._update_poisson(poisson, p_d_poisson, n_predicted, hypotheses, measurements, now)
+        undetected = (
+            update_undetected(
+                poisson, p_d_poisson, n_predicted, hypotheses, measurements, now, table, adaptive=modules.habm
+            )
+            if modules.rpp
+            else Poissons.empty()
+        )
         times.append(clock())
 
         # Track extraction
@@ -202,16 +205,16 @@ class Tracker:
         times.append(clock())
 
         born = len(survivors) - survivors.known
-        posterior = Density(stamp_ns=now, next_id=predicted.next_id + born, bernoulli=objects, poisson=undetected)
+        posterior = Density(now, predicted.next_id + born, objects, undetected)
         diagnostics = Diagnostics(
-            cloud_used=cloud is not None,
-            detections=frame.score.shape[0],
-            below_score=below_score,
-            suppressed=suppressed,
-            associated=int(np.count_nonzero(assigned != UNASSIGNED)),
-            born=born,
-            repaired=repaired + repaired_now,
-            stage_ns=tuple(map(sub, times[1:], times)),
+            cloud is not None,
+            frame.score.shape[0],
+            below_score,
+            suppressed,
+            survivors.detected,
+            born,
+            repaired + repaired_now,
+            tuple(map(sub, times[1:], times)),  # stage_ns
         )
         return StepResult(posterior, tracks, diagnostics)
 
@@ -242,26 +245,10 @@ class Tracker:
         """Compute the motion states of the posterior: by the UKF for known objects, as births for new ones."""
         count, known = len(survivors), survivors.known
         mean, covariance = np.empty((count, STATE)), np.empty((count, STATE, STATE))
-        repaired = update_states(survivors, bernoulli, measurements, self._table, mean[:known], covariance[:known])
+        repaired = update_states(survivors, bernoulli, measurements, self._table, mean, covariance)
         if known < count:
             rows = survivors.measurement[known:]
             repaired += first_detected_states(
                 rows, measurements, hypotheses, poisson, self._table, mean[known:], covariance[known:]
             )
         return mean, covariance, repaired
-
-    def _update_poisson(
-        self,
-        poisson: Poissons,
-        p_d: Array,
-        n_predicted: int,
-        hypotheses: Hypotheses,
-        measurements: Measurements,
-        now: int,
-    ) -> Poissons:
-        """Update the PPP, prune it and add the births that later frames may find (HABM)."""
-        if not self.modules.rpp:
-            return Poissons.empty()
-        kept, weight = surviving_components(poisson, p_d, n_predicted, hypotheses, now, self._table)
-        births = adaptive_births(measurements, hypotheses, self._table) if self.modules.habm else NOTHING
-        return with_births(poisson, kept, weight, births, measurements, now, self._table)

@@ -17,6 +17,7 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.density import PHI, STATE, V, X, Y
 from optipmb.motion import ORDER, SPREAD, WEIGHT, square_root, wrap
+from optipmb.prune import NEW
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -48,16 +49,15 @@ def update_states(
         bernoulli: predicted objects.
         measurements: Z_k.
         table: parameters as columns.
-        mean_out: (K, 6) receives the means of the known objects.
-        covariance_out: (K, 6, 6) receives their covariances.
+        mean_out: (K, 6) receives the means of the known objects; rows of new ones are left as they are.
+        covariance_out: (K, 6, 6) receives their covariances, likewise.
 
     Returns:
         How many covariances had to be repaired.
     """
-    known = survivors.known
     repaired: int = ukf_updates(
-        survivors.row[:known],
-        survivors.measurement[:known],
+        survivors.row,
+        survivors.measurement,
         bernoulli.mean,
         bernoulli.covariance,
         measurements.position,
@@ -107,7 +107,7 @@ def ukf_updates(
     """Update states with the measurement of each; a negative measurement leaves the state as predicted.
 
     Args:
-        row: (K,) state that each result is made of.
+        row: (K,) state that each result is made of; where it is `NEW`, there is none, and nothing is written.
         measurement: (K,) index of the associated measurement, or negative.
         mean: (N, 6) predicted means.
         covariance: (N, 6, 6) predicted covariances.
@@ -119,8 +119,8 @@ def ukf_updates(
         noise_velocity: (C,) of z_vx and z_vy.
         noise_heading: (C,) of z_phi.
         heading_sign_reliable: (C,) whether the sign of a measured heading can be trusted.
-        mean_out: (>= K, 6) receives the posterior means.
-        covariance_out: (>= K, 6, 6) receives the posterior covariances.
+        mean_out: (K, 6) receives the posterior means.
+        covariance_out: (K, 6, 6) receives the posterior covariances.
 
     Returns:
         How many covariances had to be repaired.
@@ -131,6 +131,8 @@ def ukf_updates(
     buffers = workspace()
     for k in range(row.shape[0]):
         n, m = row[k], measurement[k]
+        if n == NEW:
+            continue
         if m < 0:
             mean_out[k] = mean[n]
             covariance_out[k] = covariance[n]

@@ -17,12 +17,15 @@ from scipy.optimize import linear_sum_assignment
 from optipmb.association import UNASSIGNED, associate
 from optipmb.hypotheses import (
     CLUTTER,
+    FEW,
     FROM_POISSON,
     NEWBORN,
     Hypotheses,
     detection_costs,
     first_detections,
     gate,
+    pairs_of_few,
+    pairs_of_many,
 )
 
 Array = NDArray[np.float64]
@@ -37,25 +40,29 @@ def random_objects(rng: np.random.Generator, count: int) -> tuple[Array, Array, 
     return mean, root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6), rng.integers(0, 2, count)
 
 
+@pytest.mark.parametrize("measurements", [0, 40, FEW, FEW + 1, 300])
 @pytest.mark.parametrize("count", [0, 1, 5, 60])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_gate_holds_every_pair_of_a_class_within_the_distance(seed: int, count: int) -> None:
-    """The sweep finds the pairs of the double loop, in its order, with their textbook likelihoods."""
+def test_the_gate_holds_every_pair_of_a_class_within_the_distance(seed: int, count: int, measurements: int) -> None:
+    """The search finds the pairs of the double loop, in its order, with their textbook likelihoods."""
     rng = np.random.default_rng(seed)
     mean, covariance, label = random_objects(rng, count)
-    position, measured = rng.normal(0, 4, (40, 2)), rng.integers(0, 2, 40)
-    position[:3] = position[0]  # several at one place
+    position, measured = rng.normal(0, 4, (measurements, 2)), rng.integers(0, 2, measurements)
+    position[:3] = position[:1]  # several at one place
     distance, noise = np.array([1.5, 5.0]), np.array([0.2, 0.7])
     found = gate(mean, covariance, label, position, measured, distance, noise)
     wanted = [
         (n, m)
         for n in range(count)
-        for m in range(40)
+        for m in range(measurements)
         if label[n] == measured[m] and math.dist(mean[n, :2], position[m]) <= distance[label[n]]
     ]
     assert list(zip(found[0].tolist(), found[1].tolist(), strict=True)) == wanted
     likelihood = [textbook.log_likelihood(position[m], mean[n], covariance[n], noise[label[n]]) for n, m in wanted]
     np.testing.assert_allclose(found[2], likelihood, rtol=1e-10, atol=1e-10)
+    for search in (pairs_of_few, pairs_of_many):
+        row, measurement = search(mean, label, position, measured, distance)
+        assert list(zip(row.tolist(), measurement.tolist(), strict=True)) == wanted
 
 
 def test_the_edge_of_the_gate_is_inside() -> None:
@@ -74,7 +81,8 @@ def test_costs_and_association_probabilities_are_the_formulas(seed: int) -> None
     likelihood = rng.normal(-2, 1.5, 24)
     r, p_d = rng.uniform(1e-6, 1, 8), rng.uniform(0.01, 0.99, 8)
     r[0] = 1.0
-    cost, association = detection_costs(row, measurement, likelihood, r, p_d, 6)
+    association = np.full(6, np.nan)
+    cost = detection_costs(row, measurement, likelihood, r, p_d, association)
     for k, n in enumerate(row):
         ratio = r[n] * p_d[n] * math.exp(likelihood[k]) / (1 - r[n] + r[n] * (1 - p_d[n]))
         assert cost[k] == pytest.approx(-math.log(ratio), rel=1e-12)
@@ -86,7 +94,8 @@ def test_costs_and_association_probabilities_are_the_formulas(seed: int) -> None
 def test_costs_stay_finite_where_likelihoods_vanish() -> None:
     """Far in the tail, where exp would be zero, the cost still orders the hypotheses."""
     arguments = np.array([0, 0]), np.array([0, 1]), np.array([-2000.0, -3000.0]), np.array([0.5]), np.array([0.9])
-    cost, association = detection_costs(*arguments, 2)
+    association = np.full(2, np.nan)
+    cost = detection_costs(*arguments, association)
     assert cost[0] < cost[1] < math.inf
     np.testing.assert_array_equal(association, 0)
 
@@ -95,7 +104,8 @@ def test_each_kind_of_first_detection_has_its_formula() -> None:
     """Poisson components in the gate, a low score without, a high score without."""
     log_e = np.log([0.2, 0.3, 0.05])
     clutter, birth = np.array([np.nan, 0.01]), np.array([np.nan, 0.002])
-    kind, cost, existence = first_detections(
+    kind, cost, existence = np.full(4, -1), np.empty(4), np.empty(4)
+    first_detections(
         np.array([0, 0, 3]),
         log_e,
         np.array([0.9, 0.1, 0.5, 0.1]),
@@ -104,6 +114,9 @@ def test_each_kind_of_first_detection_has_its_formula() -> None:
         clutter,
         birth,
         np.array([np.nan, 0.5]),
+        kind,
+        cost,
+        existence,
     )
     np.testing.assert_array_equal(kind, [FROM_POISSON, CLUTTER, NEWBORN, FROM_POISSON])
     wanted = [-math.log(0.5 + 0.01), -math.log(0.01), -math.log(0.002 * 0.75 + 0.01), -math.log(0.05 + 0.01)]
@@ -117,7 +130,8 @@ def test_first_detections_hold_over_all_magnitudes(log_e: list[float]) -> None:
     """E is summed as logarithms: no overflow, no underflow, r in [0, 1]."""
     arguments = np.zeros(len(log_e), np.int64), np.array(log_e), np.array([0.5]), np.zeros(1)
     table = np.array([1e-3]), np.array([1e-4]), np.array([0.5])
-    _, cost, existence = first_detections(*arguments, np.zeros(1, np.int64), *table)
+    kind, cost, existence = np.empty(1, np.int64), np.empty(1), np.empty(1)
+    first_detections(*arguments, np.zeros(1, np.int64), *table, kind, cost, existence)
     total = np.logaddexp.reduce([*log_e, math.log(1e-3)])
     assert cost[0] == pytest.approx(-total, rel=1e-10, abs=1e-10)
     assert existence[0] == pytest.approx(math.exp(np.logaddexp.reduce(log_e) - total), rel=1e-9, abs=1e-300)

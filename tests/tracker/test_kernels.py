@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from optipmb.association import UNASSIGNED
-from optipmb.birth import birth_states, fill_components, first_states, select_births
+from optipmb.birth import birth_states, first_states
 from optipmb.calibration import SURE
 from optipmb.density import whole_periods
 from optipmb.extract import read_tracks, select_tracks
@@ -20,7 +20,8 @@ from optipmb.motion import predict_state
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
 from optipmb.predict import predict_components
 from optipmb.preprocess import select, sort_canonically
-from optipmb.prune import NEW, select_components, select_objects
+from optipmb.prune import NEW, select_objects
+from optipmb.undetected import fill_components, select_births, select_components, select_undetected
 from optipmb.update import moment_match, ukf_updates
 
 Array = NDArray[np.float64]
@@ -157,7 +158,7 @@ def test_objects_survive_by_existence_and_misses(seed: int) -> None:
     kind, first = rng.choice([FROM_POISSON, CLUTTER, NEWBORN], m), rng.uniform(0, 0.2, m)
     max_misses, floor = np.array([4, 12]), np.array([0.05, 0.1])
     row, measurement, existence = np.empty(n + m, np.int64), np.empty(n + m, np.int64), np.empty(n + m)
-    known, count = select_objects(
+    count, known, hits = select_objects(
         r,
         seen,
         label,
@@ -181,7 +182,7 @@ def test_objects_survive_by_existence_and_misses(seed: int) -> None:
     np.testing.assert_array_equal(row[:count], [*np.flatnonzero(alive), *[NEW] * free.sum()])
     np.testing.assert_array_equal(measurement[:count], [*assigned[alive], *np.flatnonzero(free)])
     np.testing.assert_array_equal(existence[:count], [*posterior[alive], *first[free]])
-    assert known == alive.sum()
+    assert (known, hits) == (alive.sum(), detected.sum())
 
 
 @SEEDS
@@ -317,6 +318,24 @@ def test_low_scores_are_born_with_what_association_leaves(seed: int) -> None:
     np.testing.assert_array_equal(weight[:count], rate[label[wanted]] * (1 - association[wanted]))
 
 
+@pytest.mark.parametrize("adaptive", [True, False])
+@SEEDS
+def test_what_is_undetected_stays_or_is_born(seed: int, adaptive: bool) -> None:  # noqa: FBT001 - parametrized
+    """The components that stay and behind them, under HABM, the births, each as the kernel of its own selects them."""
+    rng = np.random.default_rng(seed)
+    weight, p_d, label, born = rng.uniform(0, 2, 9), rng.uniform(0, 1, 9), rng.integers(0, 2, 9), stamps(rng, 9)
+    old = weight, p_d, label, born, 6, rng.integers(0, 9, 4), NOW, PERIOD, np.array([2, 9])
+    kind, association = rng.choice([FROM_POISSON, CLUTTER, NEWBORN], 7), rng.choice([0.0, 0.3, 1.0], 7)
+    new = kind, association, rng.integers(0, 2, 7), np.array([0.5, 2.0])
+    chosen, carried = np.empty(16, np.int64), np.empty(16)
+    stay, count = select_undetected(*old, adaptive, *new, chosen, carried)
+    kept, left, rows, fresh = np.empty(9, np.int64), np.empty(9), np.empty(7, np.int64), np.empty(7)
+    assert stay == select_components(*old, kept, left)
+    assert count - stay == (select_births(*new, rows, fresh) if adaptive else 0)
+    np.testing.assert_array_equal(chosen[:count], [*kept[:stay], *rows[: count - stay]])
+    np.testing.assert_array_equal(carried[:count], [*left[:stay], *fresh[: count - stay]])
+
+
 @SEEDS
 def test_components_that_stay_and_those_that_are_born_stand_in_order(seed: int) -> None:
     """First the columns of the rows that stay, then birth, box, class and stamp of the measurements."""
@@ -327,8 +346,8 @@ def test_components_that_stay_and_those_that_are_born_stand_in_order(seed: int) 
     out = np.zeros((5, 6)), np.zeros((5, 6, 6)), np.empty(5, np.int64), np.empty((5, 4)), np.empty(5, np.int64)
     position, yaw, velocity = rng.normal(0, 9, (4, 2)), rng.normal(0, 1, 4), rng.normal(0, 2, (4, 2))
     births = rng.uniform(0, 2, 3), rng.uniform(0.1, 1, (3, 6)), rng.uniform(0.1, 1, (3, 6))
-    old = kept, mean, covariance, label, auxiliary, born
-    fill_components(*old, rows, position, yaw, velocity, measured, boxes, NOW, *births, *out)
+    old = np.concatenate([kept, rows]), kept.size, mean, covariance, label, auxiliary, born
+    fill_components(*old, position, yaw, velocity, measured, boxes, NOW, *births, *out)
     np.testing.assert_array_equal(out[0][:2], mean[kept])
     np.testing.assert_array_equal(out[1][:2], covariance[kept])
     state, spread = np.empty((3, 6)), np.empty((3, 6, 6))

@@ -24,9 +24,7 @@ HERE = Path(__file__).parent
 TWINS = {
     "association.assign": "test_hypotheses.test_the_total_is_that_of_the_hungarian_algorithm",
     "birth.birth_states": "test_update.test_a_birth_is_the_textbook_birth",
-    "birth.fill_components": "test_kernels.test_components_that_stay_and_those_that_are_born_stand_in_order",
     "birth.first_states": "test_kernels.test_announced_objects_are_matched_mixtures",
-    "birth.select_births": "test_kernels.test_low_scores_are_born_with_what_association_leaves",
     "calibration.calibrate_rows": "test_twins.test_rows_are_calibrated_as_numpy_interpolates",
     "calibration.log_odds": "test_twins.test_log_odds_are_bounded",
     "density.whole_periods": "test_kernels.test_periods_are_counted_to_the_nearest",
@@ -42,6 +40,8 @@ TWINS = {
     "hypotheses.detection_costs": "test_hypotheses.test_costs_and_association_probabilities_are_the_formulas",
     "hypotheses.first_detections": "test_hypotheses.test_each_kind_of_first_detection_has_its_formula",
     "hypotheses.gate": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "hypotheses.pairs_of_few": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "hypotheses.pairs_of_many": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.local_hypotheses": "test_twins.test_hypotheses_are_those_of_their_parts",
     "lightweight.update_light_weight": "test_kernels.test_the_light_weight_filter_is_its_formulas",
     "motion.centred": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
@@ -63,9 +63,12 @@ TWINS = {
     "preprocess.precedes": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
     "preprocess.select": "test_kernels.test_only_scores_from_the_filter_on_are_chosen",
     "preprocess.sort_canonically": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
-    "prune.select_components": "test_kernels.test_components_survive_unless_marked_or_old",
     "prune.select_objects": "test_kernels.test_objects_survive_by_existence_and_misses",
     "soundness.all_within": "test_soundness.test_bounds_are_kept_in_every_column",
+    "undetected.fill_components": "test_kernels.test_components_that_stay_and_those_that_are_born_stand_in_order",
+    "undetected.select_births": "test_kernels.test_low_scores_are_born_with_what_association_leaves",
+    "undetected.select_components": "test_kernels.test_components_survive_unless_marked_or_old",
+    "undetected.select_undetected": "test_kernels.test_what_is_undetected_stays_or_is_born",
     "update.moment_match": "test_update.test_a_mixture_keeps_its_mean_and_covariance",
     "update.ukf_update": "test_update.test_the_update_is_the_textbook_ukf",
     "update.ukf_updates": "test_update.test_the_update_is_the_textbook_ukf",
@@ -194,12 +197,17 @@ def test_hypotheses_are_those_of_their_parts(seed: int) -> None:
     objects = mean[old], covariance[old], label[old]
     components = mean[new], covariance[new], label[new]
     given = *objects, weight[old], p_d[old], *components, weight[new], p_d[new]
-    found = local_hypotheses(*given, position, measured, score, distance, noise, clutter, birth, threshold)
+    firsts = np.empty(15, np.int64), np.empty(15), np.empty(15)
+    told = np.empty(15)
+    table = distance, noise, clutter, birth, threshold
+    found = local_hypotheses(*given, position, measured, score, *table, *firsts, told)
     row, measurement, likelihood = gate(*objects, position, measured, distance, noise)
-    cost, association = detection_costs(row, measurement, likelihood, weight[old], p_d[old], 15)
+    association, kind, first_cost, existence = np.empty(15), np.empty(15, np.int64), np.empty(15), np.empty(15)
+    cost = detection_costs(row, measurement, likelihood, weight[old], p_d[old], association)
     component, announced, log_e = gate(*components, position, measured, distance, noise)
     log_e = np.log((weight * p_d)[new][component]) + log_e
-    first = first_detections(announced, log_e, score, association, measured, clutter, birth, threshold)
+    first = kind, first_cost, existence
+    first_detections(announced, log_e, score, association, measured, clutter, birth, threshold, *first)
     wanted = row, measurement, cost, component, announced, log_e, *first, association
-    for column, expected in zip(found, wanted, strict=True):
+    for column, expected in zip((*found, *firsts, told), wanted, strict=True):
         np.testing.assert_allclose(column, expected, rtol=1e-12)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from optipmb.birth import birth_states
+from optipmb.prune import NEW
 from optipmb.update import moment_match, ukf_update, ukf_updates, workspace
 
 Array = NDArray[np.float64]
@@ -122,8 +123,8 @@ def test_states_without_a_measurement_stay_as_predicted() -> None:
     mean, covariance = np.stack([m for m, _ in states]), np.stack([p for _, p in states])
     zs = [measurement(rng, mean[2], velocity=True), measurement(rng, mean[0], velocity=False)]
     classes = [noise(rng, heading_sign=True), noise(rng, heading_sign=False)]
-    rows, chosen, label = np.array([0, 1, 2, 3, 0]), np.array([1, -1, 0, -1, -1]), np.array([1, 0])
-    out, spread = np.full((5, 6), np.nan), np.full((5, 6, 6), np.nan)
+    rows, chosen, label = np.array([0, 1, 2, 3, 0, NEW]), np.array([1, -1, 0, -1, -1, 0]), np.array([1, 0])
+    out, spread = np.full((6, 6), np.nan), np.full((6, 6, 6), np.nan)
     ukf_updates(
         rows,
         chosen,
@@ -141,7 +142,10 @@ def test_states_without_a_measurement_stay_as_predicted() -> None:
         spread,
     )
     for k, (n, m) in enumerate(zip(rows, chosen, strict=True)):
-        if m < 0:
+        if n == NEW:
+            assert np.isnan(out[k]).all()
+            assert np.isnan(spread[k]).all()
+        elif m < 0:
             np.testing.assert_array_equal(out[k], mean[n])
             np.testing.assert_array_equal(spread[k], covariance[n])
         else:
