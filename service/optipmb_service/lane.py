@@ -22,6 +22,7 @@ from optipmb_service.outgoing import Outgoing, Ticket
 from optipmb_service.ownership import Standing
 from optipmb_service.ports import Packet
 from optipmb_service.problems import problem_of
+from optipmb_service.reading import message_of
 from optipmb_service.records import Begun, Output, Quarantined, Tracked
 from optipmb_service.session import Session
 from optipmb_service.standby import Standby
@@ -178,27 +179,11 @@ class Lane:
         """Return the message of a packet; None after a refusal."""
         kind = schemas.Detections if frame else schemas.Points
         try:
-            return self._decode(packet, kind)
+            return message_of(packet, kind, self.stream, self._circle.limits)
         except schemas.MessageError as error:
             self._accounts.refuse(self.session, frame=frame)
             self._report(error.code, error.path, error.expected, error.received, what=kind.__name__)
             return None
-
-    def _decode(
-        self, packet: Packet, kind: type[schemas.Detections | schemas.Points]
-    ) -> schemas.Detections | schemas.Points:
-        """Return the message of a packet.
-
-        Raises:
-            MessageError: it is none, or not one of this stream.
-        """
-        limits = self._circle.limits
-        if packet.payload is None:
-            raise schemas.MessageError("too_large", "", f"at most {limits.max_bytes} bytes", f"{packet.size} bytes")
-        message = schemas.decode(packet.payload, kind, encoding=packet.encoding, limits=limits)
-        if message.stream != self.stream:
-            raise schemas.MessageError("invalid_value", "stream", repr(self.stream), repr(message.stream))
-        return message
 
     def _deliver(self, outputs: Sequence[Output]) -> None:
         for output in outputs:
@@ -400,20 +385,4 @@ class Lane:
         session = self.session
         if session is None:
             return None
-        p50, p99 = self.meter.latency_ms()
-        state = self._accounts.state(session)
-        return schemas.SessionSummary(
-            stream=self.stream,
-            profile=state.profile,
-            state="stale" if self.stale else state.state,
-            rate_hz=self.meter.rate_hz(now_ns),
-            latency_p50_ms=p50,
-            latency_p99_ms=p99,
-            frames=state.frames,
-            refused=state.refused,
-            shed=state.shed,
-            gaps=state.gaps,
-            tracks=state.tracks,
-            queue=state.queue,
-            age_s=self.meter.age_s(now_ns),
-        )
+        return self.meter.summary(self._accounts.state(session), now_ns, stale=self.stale)

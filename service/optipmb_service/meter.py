@@ -6,6 +6,8 @@ import threading
 from collections import deque
 from typing import Final
 
+import optipmb_schemas as schemas
+
 LATENCIES: Final = 512
 ARRIVALS: Final = 64
 
@@ -56,3 +58,22 @@ class Meter:
     def age_s(self, now_ns: int) -> float | None:
         """Return the seconds since the last frame; None before the first."""
         return None if self.frame_ns is None else max(0.0, (now_ns - self.frame_ns) / 1e9)
+
+    def summary(self, state: schemas.SessionState, now_ns: int, *, stale: bool) -> schemas.SessionSummary:
+        """Return the line of the service's status for a stream in a state; may be called by any thread."""
+        p50, p99 = self.latency_ms()
+        return schemas.SessionSummary(
+            stream=state.stream,
+            profile=state.profile,
+            state="stale" if stale else state.state,
+            rate_hz=self.rate_hz(now_ns),
+            latency_p50_ms=p50,
+            latency_p99_ms=p99,
+            frames=state.frames,
+            refused=state.refused,
+            shed=state.shed,
+            gaps=state.gaps,
+            tracks=state.tracks,
+            queue=state.queue,
+            age_s=self.age_s(now_ns),
+        )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from optipmb_service.checkpoint import Recorded
 from optipmb_service.history import History
 from optipmb_service.moments import Entry, weigh
 from optipmb_service.stepping import Stepper, empty
@@ -108,9 +109,10 @@ class Past:
         self._history = History(moment, self.stepper.step)
         self.timeline = self.timeline.settle(moment.course, moment.last, frozenset(self.timeline.marks))
 
-    def portable(self) -> tuple[Moment, Sequence[Entry]]:
+    def portable(self) -> tuple[Moment, tuple[Recorded, ...]]:
         """Return the beginning and the frames of as much of the window as a checkpoint takes along."""
-        return self._history.portable(self._policy.checkpoint_bytes)
+        base, entries = self._history.portable(self._policy.checkpoint_bytes)
+        return base, tuple(Recorded(one.message, one.points, one.missed, one.revision, one.packed) for one in entries)
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Take up what was written down.

@@ -5,8 +5,7 @@ clouds and, after a restore, for frames that were missed; everything else follow
 messages give the same tracks, byte for byte, and those of the window give the same state in whatever order they come.
 
 The parts: `waiting` holds frames until they are ready, `past` has those that were gone through, `telling` says and
-counts what became of them. What is here is what happens around these: commands, the state to be written down, and what
-is done when a step fails.
+counts what became of them. Here are commands, the state to be written down, and what is done when a step fails.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import optipmb
 from optipmb_service import convert
-from optipmb_service.checkpoint import Checkpoint, Recorded
+from optipmb_service.checkpoint import Checkpoint
 from optipmb_service.moments import Entry, Moment, Whereabouts
 from optipmb_service.past import Past
 from optipmb_service.quarantine import dump_of
@@ -30,9 +29,8 @@ from optipmb_service.records import (
     Policy,
     Quarantined,
     RefusedError,
-    Tracked,
 )
-from optipmb_service.stepping import Outcome, Stepper
+from optipmb_service.stepping import Stepper
 from optipmb_service.telling import Telling
 from optipmb_service.timing import Mark, Timeline
 from optipmb_service.waiting import Waiting
@@ -145,11 +143,6 @@ class Session:
         """When `on_tick` is due (monotonic, ns); None while nothing is held."""
         return self._waiting.deadline_ns(self._past.complete_until)
 
-    @property
-    def held(self) -> int:
-        """Frames waiting, for their clouds or for frames that were missed."""
-        return len(self._waiting)
-
     def refuse(self) -> None:
         """Count a message of the stream that was none."""
         self._telling.deliveries.refused += 1
@@ -214,7 +207,7 @@ class Session:
 
         Frames that are held are not in it: they come again from the publisher's cache.
         """
-        base, entries = self._past.portable()
+        base, window = self._past.portable()
         return Checkpoint(
             stream=self.stream,
             parameters=self.parameters,
@@ -222,7 +215,7 @@ class Session:
             quarantine=self._quarantine,
             epochs=self._past.timeline.epochs,
             base=base,
-            window=tuple(Recorded(one.message, one.points, one.missed, one.revision, one.packed) for one in entries),
+            window=window,
             head=self._past.head,
             deliveries=replace(self._telling.deliveries),
             newest_cloud_ns=self._waiting.clouds.newest_ns,
@@ -248,10 +241,10 @@ class Session:
         Args:
             checkpoint: its state; its profile goes on too.
             now_ns: monotonic time; the waiting for missed frames begins now.
-            policy: waiting, restarting, going back.
-            instance: name of the service, for problems.
-            tracker: makes the tracker.
-            clock: measures how long a step takes, ns.
+            policy: this, and what follows, as in the constructor.
+            instance: the same.
+            tracker: the same.
+            clock: the same.
 
         Raises:
             CheckpointError: its frames do not fit together.
@@ -371,18 +364,9 @@ class Session:
         gone = self._past.settle(timeline)
         self._waiting.follow(self._past.timeline, self._past.base, gone)
         self._telling.deliveries.inserted += not behind
-        return self._report(outcomes, before, ticket, began_ns)
-
-    def _report(self, outcomes: list[Outcome], before: str, ticket: Any, began_ns: int) -> list[Output]:
-        """Return what is to be told of frames that were gone through."""
-        outputs = self._telling.begun(outcomes, before, self.session)
         step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
-        for one in outcomes:
-            outputs += self._telling.left_out(one, self.parameters)
-            if one.tracks is not None:
-                self._telling.deliveries.corrected += one.entry.revision > 0
-                outputs.append(Tracked(one.tracks, ticket, step_ns, self._run))
-        return outputs
+        begun = self._telling.begun(outcomes, before, self.session)
+        return [*begun, *self._telling.tracked(outcomes, self.parameters, ticket, step_ns, self._run)]
 
     def _fail(self, error: Exception, placed: list[Entry], mark: Mark) -> list[Output]:
         """Take no more frames; the one that failed and what is held go, unprocessed."""

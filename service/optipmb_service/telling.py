@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import optipmb_schemas as schemas
 
 from optipmb_service.complaints import Complaints
-from optipmb_service.records import Begun, Counters, Deliveries
+from optipmb_service.records import Begun, Counters, Deliveries, Tracked
 from optipmb_service.timing import Verdict
 
 if TYPE_CHECKING:
@@ -54,7 +54,27 @@ class Telling:
         begins = next((one.begins for one in reversed(outcomes) if one.begins), None)
         return [] if begins is None or session == before else [Begun(session, begins.reason, begins.jump_ns)]
 
-    def left_out(self, outcome: Outcome, parameters: optipmb.Parameters) -> list[Output]:
+    def tracked(
+        self, outcomes: Sequence[Outcome], parameters: optipmb.Parameters, ticket: Any, step_ns: int, run: int
+    ) -> list[Output]:
+        """Tell the tracks of frames that were gone through, and what of these was left out.
+
+        Args:
+            outcomes: what became of each frame.
+            parameters: the profile.
+            ticket: what came with the frame that is new.
+            step_ns: how long each took.
+            run: see `Session.run`.
+        """
+        outputs: list[Output] = []
+        for one in outcomes:
+            outputs += self._left_out(one, parameters)
+            if one.tracks is not None:
+                self.deliveries.corrected += one.entry.revision > 0
+                outputs.append(Tracked(one.tracks, ticket, step_ns, run))
+        return outputs
+
+    def _left_out(self, outcome: Outcome, parameters: optipmb.Parameters) -> list[Output]:
         """Tell what of a frame was not tracked: objects of unknown classes, or all of it; once, not at corrections."""
         if outcome.entry.revision > 0:
             return []

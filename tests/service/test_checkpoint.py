@@ -122,7 +122,7 @@ def test_a_restored_session_waits_for_what_it_missed() -> None:
     two = Session.restore(one.snapshot(), now_ns=100)
     assert two.state().state == "recovering"
     assert feed(two, [8, 9], SENSOR) == []
-    assert (two.held, two.deadline_ns) == (2, 100 + Policy().recovery_wait_ns)
+    assert (two.state().queue, two.deadline_ns) == (2, 100 + Policy().recovery_wait_ns)
     got = tracks(feed(two, [3, 4, 5, 6, 7], SENSOR))
     assert [(m.seq, m.revision, m.gap) for m in got] == [(seq, 0, 0) for seq in range(5, 10)]
     assert two.counters.duplicates == 2

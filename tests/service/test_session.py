@@ -197,7 +197,7 @@ def test_frames_keep_their_order_while_one_waits() -> None:
     one = session()
     assert feed(one, [0], has_points=True) == []
     assert feed(one, [1], has_points=False) == []
-    assert one.held == 2
+    assert one.state().queue == 2
     assert [message.seq for message in tracks(one.on_points(SENSOR.points(0), 1))] == [0, 1]
 
 
