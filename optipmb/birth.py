@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import STATE
+from optipmb.density import STATE, copy_state
 from optipmb.hypotheses import FROM_POISSON
 from optipmb.motion import wrap
 from optipmb.update import moment_match, ukf_updates
@@ -240,5 +240,5 @@ def first_states(
     matched, matched_spread = np.empty((wanted.shape[0], STATE)), np.empty((wanted.shape[0], STATE, STATE))
     moment_match(start, weight, parts, spreads, matched, matched_spread)
     for i in range(wanted.shape[0]):
-        mean_out[wanted[i]], covariance_out[wanted[i]] = matched[i], matched_spread[i]
+        copy_state(matched, matched_spread, i, mean_out, covariance_out, wanted[i])
     return repaired

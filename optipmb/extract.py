@@ -125,9 +125,16 @@ def extract(
         bernoulli.auxiliary,
         bernoulli.born_ns,
         bernoulli.seen_ns,
+        bernoulli.evidence,
         measurement,
         source,
         stamp_ns,
+        table.knots,
+        table.knot_evidence,
+        table.knot_existence,
+        table.knot_along,
+        table.knot_across,
+        table.score_of_evidence,
         tracks.id,
         tracks.label,
         tracks.center,
@@ -143,22 +150,6 @@ def extract(
         tracks.time_since_detection,
         tracks.detection,
     )
-    if table.calibrated:
-        calibrate_rows(
-            rows,
-            bernoulli.label,
-            bernoulli.evidence,
-            bernoulli.mean,
-            table.knots,
-            table.knot_evidence,
-            table.knot_existence,
-            table.knot_along,
-            table.knot_across,
-            table.score_of_evidence,
-            tracks.existence,
-            tracks.score,
-            tracks.covariance,
-        )
     return tracks
 
 
@@ -203,9 +194,16 @@ def read_tracks(
     auxiliary: Array,
     born_ns: Index,
     seen_ns: Index,
+    evidence: Array,
     measurement: Index,
     source: Index,
     stamp_ns: int,
+    knots: Index,
+    knot_evidence: Array,
+    knot_existence: Array,
+    knot_along: Array,
+    knot_across: Array,
+    score_of_evidence: NDArray[np.bool_],
     identity_out: Index,
     label_out: Index,
     center: Array,
@@ -221,16 +219,34 @@ def read_tracks(
     time_since_detection: Array,
     detection: Index,
 ) -> None:
-    """Write the columns of `Tracks` of the objects at the front of `rows`, not calibrated yet."""
+    """Write the columns of `Tracks` of the objects at the front of `rows`, calibrated where there are `knots`."""
     for k in range(identity_out.shape[0]):
         n = rows[k]
         identity_out[k], label_out[k] = identity[n], label[n]
-        existence_out[k], score_out[k], covariance_out[k] = existence[n], score[n], covariance[n]
+        existence_out[k], score_out[k] = existence[n], score[n]
         v, phi = mean[n, V], mean[n, PHI]
         center[k, 0], center[k, 1], center[k, 2] = mean[n, X], mean[n, Y], auxiliary[n, 3]
         for s in range(3):
             size[k, s] = auxiliary[n, s]
+        for s in range(STATE):
+            for t in range(STATE):
+                covariance_out[k, s, t] = covariance[n, s, t]
         yaw[k], yaw_rate[k], acceleration[k] = phi, mean[n, OMEGA], mean[n, A]
         velocity[k, 0], velocity[k, 1] = v * math.cos(phi), v * math.sin(phi)
         age[k], time_since_detection[k] = (stamp_ns - born_ns[n]) * 1e-9, (stamp_ns - seen_ns[n]) * 1e-9
         detection[k] = source[measurement[n]] if measurement[n] >= 0 else -1
+    calibrate_rows(
+        rows,
+        label,
+        evidence,
+        mean,
+        knots,
+        knot_evidence,
+        knot_existence,
+        knot_along,
+        knot_across,
+        score_of_evidence,
+        existence_out,
+        score_out,
+        covariance_out,
+    )

@@ -135,13 +135,15 @@ def update_light_weight(
         if n == NEW:
             label_out[k], identity_out[k] = measured_label[m], next_id
             born_ns_out[k], extracted_out[k], evidence_out[k] = stamp_ns, False, 0.0
-            auxiliary_out[k] = measured_auxiliary[m]
+            for s in range(4):
+                auxiliary_out[k, s] = measured_auxiliary[m, s]
             next_id += 1
         else:
             label_out[k], identity_out[k] = label[n], identity[n]
             born_ns_out[k], extracted_out[k], evidence_out[k] = born_ns[n], extracted[n], evidence[n]
             seen_ns_out[k] = seen_ns[n]
-            auxiliary_out[k] = auxiliary[n]
+            for s in range(4):
+                auxiliary_out[k, s] = auxiliary[n, s]
         c = label_out[k]
         score_out[k] = 0.0
         latest = -missed_evidence[c]

@@ -30,7 +30,6 @@ class ClassTable:
         noise_heading: (C,) of z_phi.
         birth_known: (C, 6) standard deviations of P^0 when the detection brings a velocity.
         birth_unknown: (C, 6) when it does not.
-        calibrated: whether any class has a calibration.
         memory: (C,) lambda; one without a calibration, and so the evidence stays zero.
         missed_evidence: (C,) l_miss.
         score_of_evidence: (C,) whether the score is the evidence.
@@ -64,7 +63,6 @@ class ClassTable:
     noise_heading: Array
     birth_known: Array
     birth_unknown: Array
-    calibrated: bool
     memory: Array
     missed_evidence: Array
     score_of_evidence: NDArray[np.bool_]
@@ -140,7 +138,6 @@ class ClassTable:
             noise_heading=column(lambda p: p.measurement_noise.heading),
             birth_known=spread(lambda p: p.birth.speed),
             birth_unknown=spread(lambda p: p.birth.unknown_speed),
-            calibrated=any(one is not None for one in calibrations),
             memory=np.array([one.memory if one else 1.0 for one in calibrations]),
             missed_evidence=np.array([one.missed if one else 0.0 for one in calibrations]),
             score_of_evidence=np.array([one is not None and one.score_of_evidence for one in calibrations], np.bool_),

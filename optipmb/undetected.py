@@ -12,7 +12,7 @@ import numpy as np
 
 from optipmb.birth import birth_states
 from optipmb.compiled import kernel
-from optipmb.density import Poissons, whole_periods
+from optipmb.density import Poissons, copy_state, whole_periods
 from optipmb.hypotheses import CLUTTER
 
 if TYPE_CHECKING:
@@ -243,7 +243,9 @@ def fill_components(
     """Copy the `old` components that `chosen` has in front, and put behind them those of the measurements behind."""
     for k in range(old):
         j = chosen[k]
-        mean_out[k], covariance_out[k], auxiliary_out[k] = mean[j], covariance[j], auxiliary[j]
+        copy_state(mean, covariance, j, mean_out, covariance_out, k)
+        for s in range(4):
+            auxiliary_out[k, s] = auxiliary[j, s]
         label_out[k], born_ns_out[k] = label[j], born_ns[j]
     count = label_out.shape[0]
     birth_states(
@@ -260,5 +262,6 @@ def fill_components(
     )
     for k in range(old, count):
         m = chosen[k]
-        auxiliary_out[k] = measured_auxiliary[m]
+        for s in range(4):
+            auxiliary_out[k, s] = measured_auxiliary[m, s]
         label_out[k], born_ns_out[k] = measured_label[m], stamp_ns

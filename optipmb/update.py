@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import PHI, STATE, V, X, Y
+from optipmb.density import PHI, STATE, V, X, Y, copy_state
 from optipmb.motion import ORDER, SPREAD, WEIGHT, square_root, wrap
 from optipmb.prune import NEW
 
@@ -134,8 +134,7 @@ def ukf_updates(
         if n == NEW:
             continue
         if m < 0:
-            mean_out[k] = mean[n]
-            covariance_out[k] = covariance[n]
+            copy_state(mean, covariance, n, mean_out, covariance_out, k)
             continue
         c = label[m]
         z[0], z[1], z[4] = position[m, 0], position[m, 1], yaw[m]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from optipmb.association import UNASSIGNED
 from optipmb.birth import birth_states, first_states
-from optipmb.calibration import SURE
+from optipmb.calibration import SURE, calibrate_rows
 from optipmb.density import whole_periods
 from optipmb.extract import read_tracks, select_tracks
 from optipmb.geometry import box_iou, iou_exceeds
@@ -247,8 +247,9 @@ def test_tracks_are_selected_by_two_thresholds(seed: int, both: bool) -> None:  
     np.testing.assert_array_equal(flags, known | wanted)
 
 
-def test_tracks_are_read_off_the_states() -> None:
-    """Every column of the tracks, in the units that they promise."""
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_tracks_are_read_off_the_states(calibrated: bool) -> None:  # noqa: FBT001 - parametrized
+    """Every column of the tracks, in the units that they promise, and calibrated where there is a calibration."""
     rng = np.random.default_rng(0)
     mean, auxiliary, born, seen = rng.normal(0, 3, (9, 6)), rng.uniform(1, 5, (9, 4)), stamps(rng, 9), stamps(rng, 9)
     rows, measurement, source = np.array([1, 4, 8]), np.arange(9) % 3 - 1, np.array([50, 60])
@@ -258,11 +259,18 @@ def test_tracks_are_read_off_the_states() -> None:
     identity, label, r, score = np.arange(9) * 3, rng.integers(0, 4, 9), rng.uniform(0, 1, 9), rng.uniform(0, 1, 9)
     covariance = rng.normal(0, 1, (9, 6, 6))
     ids, labels, told = np.empty(3, np.int64), np.empty(3, np.int64), [np.empty(3), np.empty(3), np.empty((3, 6, 6))]
-    known = identity, label, mean, covariance, r, score, auxiliary, born, seen
-    read_tracks(rows, *known, measurement, source, NOW, ids, labels, *out[:6], *told, *out[6:], detection)
-    copies = zip((ids, labels, *told), (identity, label, r, score, covariance), strict=True)
+    known = identity, label, mean, covariance, r, score, auxiliary, born, seen, rng.normal(0, 3, 9)
+    bends = np.sort(rng.normal(0, 2, (4, 3)), axis=1)
+    curves = bends, rng.uniform(0, 1, (4, 3)), rng.uniform(0, 1, (4, 3)), rng.uniform(0, 1, (4, 3)), np.full(4, True)
+    knots = np.full(4, 3 if calibrated else 0)
+    given = *known, measurement, source, NOW, knots, *curves
+    read_tracks(rows, *given, ids, labels, *out[:6], *told, *out[6:], detection)
+    wanted_told = [column[rows] for column in (r, score, covariance)]
+    calibrate_rows(rows, label, known[-1], mean, knots, *curves, *wanted_told)
+    assert np.array_equal(wanted_told[0], r[rows]) != calibrated
+    copies = zip((ids, labels, *told), (identity[rows], label[rows], *wanted_told), strict=True)
     for copy, column in copies:
-        np.testing.assert_array_equal(copy, column[rows])
+        np.testing.assert_array_equal(copy, column)
     x = mean[rows]
     heading = np.column_stack([np.cos(x[:, 3]), np.sin(x[:, 3])])
     wanted = [np.column_stack([x[:, :2], auxiliary[rows, 3]]), auxiliary[rows, :3], x[:, 3], x[:, 2:3] * heading]

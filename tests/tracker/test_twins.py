@@ -27,6 +27,7 @@ TWINS = {
     "birth.first_states": "test_kernels.test_announced_objects_are_matched_mixtures",
     "calibration.calibrate_rows": "test_twins.test_rows_are_calibrated_as_numpy_interpolates",
     "calibration.log_odds": "test_twins.test_log_odds_are_bounded",
+    "density.copy_state": "test_update.test_states_without_a_measurement_stay_as_predicted",
     "density.whole_periods": "test_kernels.test_periods_are_counted_to_the_nearest",
     "extract.read_tracks": "test_kernels.test_tracks_are_read_off_the_states",
     "extract.select_tracks": "test_kernels.test_tracks_are_selected_by_two_thresholds",
