@@ -33,7 +33,7 @@ CLUTTER: Final = 1
 NEWBORN: Final = 2
 """No component, high score: a newborn object (M_high)."""
 
-FEW: Final = 128
+FEW: Final = 256
 """Up to so many measurements it is faster to look at all of them than to find the neighbours among them."""
 
 
@@ -219,24 +219,32 @@ def gate(
 def pairs_of_few(
     mean: Array, label: Index, position: Array, measured_label: Index, gate_distance: Array
 ) -> tuple[Index, Index]:
-    """Find the pairs within the gates by looking at every measurement; arguments and order as in `gate`."""
+    """Find the pairs within the gates by looking at every measurement of a class; arguments and order as in `gate`."""
     n_measurements = position.shape[0]
     capacity = 2 * (mean.shape[0] + n_measurements) + 16 if mean.shape[0] else 0
     row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
-    squared = np.empty(n_measurements)
-    x, y = position[:, 0].copy(), position[:, 1].copy()
+    # The measurements, class after class.
+    start = np.zeros(gate_distance.shape[0] + 2, np.int64)
+    for c in measured_label:
+        start[c + 2] += 1
+    for c in range(gate_distance.shape[0]):
+        start[c + 2] += start[c + 1]
+    x, y, which = np.empty(n_measurements), np.empty(n_measurements), np.empty(n_measurements, np.int64)
+    for m in range(n_measurements):
+        k = start[measured_label[m] + 1]
+        x[k], y[k], which[k] = position[m, 0], position[m, 1], m
+        start[measured_label[m] + 1] += 1  # in the end where the next class starts
+
     count = 0
     for n in range(mean.shape[0]):
         if count + n_measurements > capacity:
             capacity = 2 * (count + n_measurements)
             row, measurement = _grown(row, capacity), _grown(measurement, capacity)
-        eta = gate_distance[label[n]]
-        for m in range(n_measurements):  # apart from what follows, so that it is done several at a time
-            dx, dy = x[m] - mean[n, 0], y[m] - mean[n, 1]
-            squared[m] = dx * dx + dy * dy
-        for m in range(n_measurements):
-            if squared[m] <= eta * eta and measured_label[m] == label[n]:
-                row[count], measurement[count] = n, m
+        eta, x_n, y_n = gate_distance[label[n]], mean[n, 0], mean[n, 1]
+        for k in range(start[label[n]], start[label[n] + 1]):
+            dx, dy = x[k] - x_n, y[k] - y_n
+            if abs(dx) <= eta and dx * dx + dy * dy <= eta * eta:  # most are too far along x already
+                row[count], measurement[count] = n, which[k]
                 count += 1
     return row[:count], measurement[:count]
 

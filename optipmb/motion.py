@@ -139,7 +139,9 @@ def predict_state(
                 point[ORDER[row]] = step * root[row, column]
             if column < STATE - 2:  # the columns of x and y leave the motion itself as it is at the centre
                 along, across = ctra_displacement(v + point[V], omega + point[OMEGA], a + point[A], dt)
-                cos_point, sin_point = math.cos(phi + point[PHI]), math.sin(phi + point[PHI])
+                cos_point, sin_point = cos_phi, sin_phi
+                if point[PHI] != 0.0:  # only the columns of v and phi turn the heading
+                    cos_point, sin_point = math.cos(phi + point[PHI]), math.sin(phi + point[PHI])
                 point[X] += cos_point * along - sin_point * across - dx0
                 point[Y] += sin_point * along + cos_point * across - dy0
                 point[V] += point[A] * dt

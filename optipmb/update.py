@@ -185,15 +185,21 @@ def ukf_update(
 
     # Deviations of the sigma points (chi) and of their measurements (psi) from the centre.
     innovation[:] = 0.0
-    vx0, vy0 = v * math.cos(phi), v * math.sin(phi)
+    cos_phi = sin_phi = 0.0
+    if with_velocity:
+        cos_phi, sin_phi = math.cos(phi), math.sin(phi)
+    vx0, vy0 = v * cos_phi, v * sin_phi
     for i in range(2 * STATE):
         step = SPREAD if i % 2 == 0 else -SPREAD
         for row in range(STATE):
             chi[i, ORDER[row]] = step * root[row, i // 2]
         psi[i, 0], psi[i, 1] = chi[i, X], chi[i, Y]
         if with_velocity:
-            psi[i, 2] = (v + chi[i, V]) * math.cos(phi + chi[i, PHI]) - vx0
-            psi[i, 3] = (v + chi[i, V]) * math.sin(phi + chi[i, PHI]) - vy0
+            cos_point, sin_point = cos_phi, sin_phi
+            if chi[i, PHI] != 0.0:  # only the columns of v and phi turn the heading
+                cos_point, sin_point = math.cos(phi + chi[i, PHI]), math.sin(phi + chi[i, PHI])
+            psi[i, 2] = (v + chi[i, V]) * cos_point - vx0
+            psi[i, 3] = (v + chi[i, V]) * sin_point - vy0
         psi[i, size - 1] = chi[i, PHI]
         for r in range(size):
             innovation[r] -= WEIGHT * psi[i, r]
