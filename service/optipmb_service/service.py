@@ -85,7 +85,7 @@ class Service:
         self._metrics = metrics or Metrics()
         self._transport = Transport(settings)
         self._desk = Desk(self._transport.publish_problem, _log_problem)
-        self._pool = Pool(settings.thread_count)
+        self._pool = Pool(settings.threads)
         self._steward = Steward(settings.instance, self._transport, settings.lease_s)
         self._keeper = open_keeper(settings, self._steward.may_write)
         self._registry = Registry(

@@ -175,7 +175,7 @@ class Settings(BaseSettings):
         default=1, ge=1, le=64, description="processes that track, each a share of the streams; 1: this process itself"
     )
     threads: int = Field(
-        default=0, ge=0, le=256, description="threads that track, per worker; 0: one per processor, at most 8"
+        default=1, ge=1, le=256, description="threads that track, per worker; more than one make the tail longer"
     )
     max_sessions: int = Field(
         default=1000, ge=1, le=100_000, description="streams tracked at once; further ones are refused"
@@ -234,11 +234,6 @@ class Settings(BaseSettings):
         if self.listen is not None:
             return self.listen
         return (DEFAULT_LISTEN,) if self.is_router else ()
-
-    @property
-    def thread_count(self) -> int:
-        """Number of threads that track, of one process."""
-        return self.threads or min(8, os.cpu_count() or 1)
 
     @property
     def folder(self) -> Path | None:
