@@ -52,8 +52,8 @@ types: install
 
 # What only computes runs on two processors; what watches processes and clocks runs alone.
 tests: install
-	$(BIN)/pytest -n 2 --dist loadfile tests/clients tests/schemas tests/tracker tests/fuzz
-	$(BIN)/pytest tests/service tests/e2e tests/docker
+	$(BIN)/pytest -n 2 --dist loadfile -m "not alone"
+	$(BIN)/pytest -m alone
 
 schemas: install
 	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md schemas/json
