@@ -157,8 +157,7 @@ class Session:
         """Forget the density and begin anew; frames seen before stay seen, track ids go on, a quarantine ends."""
         outputs = self.flush()
         self._quarantine = ""
-        head = self._past.head
-        starts = head.starts + 1
+        head, starts = self._past.head, self._past.head.starts + 1
         self._begin(
             replace(
                 head,
@@ -203,9 +202,9 @@ class Session:
     # To be written down and taken up again
 
     def snapshot(self) -> Checkpoint:
-        """Return the state between two frames, as references to values that never change: cheap, to be encoded later.
+        """Return the state between two frames, without those held, which come again from the publisher's cache.
 
-        Frames that are held are not in it: they come again from the publisher's cache.
+        It refers to values that never change: cheap, to be encoded later.
         """
         base, window = self._past.portable()
         return Checkpoint(
@@ -241,10 +240,10 @@ class Session:
         Args:
             checkpoint: its state; its profile goes on too.
             now_ns: monotonic time; the waiting for missed frames begins now.
-            policy: this, and what follows, as in the constructor.
-            instance: the same.
-            tracker: the same.
-            clock: the same.
+            policy: waiting, restarting, going back.
+            instance: name of the service, for problems.
+            tracker: makes the tracker.
+            clock: measures how long a step takes, ns.
 
         Raises:
             CheckpointError: its frames do not fit together.
@@ -364,9 +363,9 @@ class Session:
         gone = self._past.settle(timeline)
         self._waiting.follow(self._past.timeline, self._past.base, gone)
         self._telling.deliveries.inserted += not behind
-        step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
         begun = self._telling.begun(outcomes, before, self.session)
-        return [*begun, *self._telling.tracked(outcomes, self.parameters, ticket, step_ns, self._run)]
+        took_ns = self._clock() - began_ns
+        return [*begun, *self._telling.tracked(outcomes, self.parameters, ticket, took_ns, self._run)]
 
     def _fail(self, error: Exception, placed: list[Entry], mark: Mark) -> list[Output]:
         """Take no more frames; the one that failed and what is held go, unprocessed."""

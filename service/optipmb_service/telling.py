@@ -55,7 +55,7 @@ class Telling:
         return [] if begins is None or session == before else [Begun(session, begins.reason, begins.jump_ns)]
 
     def tracked(
-        self, outcomes: Sequence[Outcome], parameters: optipmb.Parameters, ticket: Any, step_ns: int, run: int
+        self, outcomes: Sequence[Outcome], parameters: optipmb.Parameters, ticket: Any, took_ns: int, run: int
     ) -> list[Output]:
         """Tell the tracks of frames that were gone through, and what of these was left out.
 
@@ -63,10 +63,11 @@ class Telling:
             outcomes: what became of each frame.
             parameters: the profile.
             ticket: what came with the frame that is new.
-            step_ns: how long each took.
+            took_ns: how long they took together.
             run: see `Session.run`.
         """
         outputs: list[Output] = []
+        step_ns = took_ns // max(1, len(outcomes))
         for one in outcomes:
             outputs += self._left_out(one, parameters)
             if one.tracks is not None:

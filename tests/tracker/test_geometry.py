@@ -92,7 +92,7 @@ def test_iou_is_a_table_of_all_pairs() -> None:
 
 @pytest.mark.parametrize("mixed", [False, True])
 @pytest.mark.parametrize("seed", range(6))
-def test_suppression_is_the_greedy_one_per_class(seed: int, mixed: bool) -> None:  # noqa: FBT001 - parametrized
+def test_suppression_is_the_greedy_one_per_class(seed: int, *, mixed: bool) -> None:
     """A box goes when a better KEPT one of its class overlaps it by more than the threshold of the class."""
     rng = np.random.default_rng(seed)
     boxes = rng.uniform([0, 0, 1, 1, -3], [12, 12, 5, 2, 3], (60, 5))

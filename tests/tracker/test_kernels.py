@@ -234,7 +234,7 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
 
 @pytest.mark.parametrize("both", [True, False])
 @SEEDS
-def test_tracks_are_selected_by_two_thresholds(seed: int, both: bool) -> None:  # noqa: FBT001 - parametrized
+def test_tracks_are_selected_by_two_thresholds(seed: int, *, both: bool) -> None:
     """Never extracted: from the first threshold on; known: from the second on and seen of late."""
     rng = np.random.default_rng(seed)
     r, seen, label, known = rng.uniform(0, 1, 50), stamps(rng, 50), rng.integers(0, 2, 50), rng.random(50) < 0.5
@@ -248,7 +248,7 @@ def test_tracks_are_selected_by_two_thresholds(seed: int, both: bool) -> None:  
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
-def test_tracks_are_read_off_the_states(calibrated: bool) -> None:  # noqa: FBT001 - parametrized
+def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
     """Every column of the tracks, in the units that they promise, and calibrated where there is a calibration."""
     rng = np.random.default_rng(0)
     mean, auxiliary, born, seen = rng.normal(0, 3, (9, 6)), rng.uniform(1, 5, (9, 4)), stamps(rng, 9), stamps(rng, 9)
@@ -328,7 +328,7 @@ def test_low_scores_are_born_with_what_association_leaves(seed: int) -> None:
 
 @pytest.mark.parametrize("adaptive", [True, False])
 @SEEDS
-def test_what_is_undetected_stays_or_is_born(seed: int, adaptive: bool) -> None:  # noqa: FBT001 - parametrized
+def test_what_is_undetected_stays_or_is_born(seed: int, *, adaptive: bool) -> None:
     """The components that stay and behind them, under HABM, the births, each as the kernel of its own selects them."""
     rng = np.random.default_rng(seed)
     weight, p_d, label, born = rng.uniform(0, 2, 9), rng.uniform(0, 1, 9), rng.integers(0, 2, 9), stamps(rng, 9)

@@ -113,7 +113,7 @@ def test_a_missed_object_follows_the_misdetection_formula() -> None:
 
 
 @pytest.mark.parametrize("silent", [False, True])
-def test_a_certain_object_is_removed_after_its_misses(silent: bool) -> None:  # noqa: FBT001 - parametrized
+def test_a_certain_object_is_removed_after_its_misses(*, silent: bool) -> None:
     """With p_s = 1 r stays 1; six missed periods are kept, the seventh removes, with frames or without."""
     parameters = car(survival=1.0)
     seconds = [0.6, 0.7] if not silent else [0.7]
@@ -127,7 +127,7 @@ def test_a_certain_object_is_removed_after_its_misses(silent: bool) -> None:  # 
 
 @pytest.mark.parametrize("periods", [1, 3, 6, 7])
 @pytest.mark.parametrize("silent", [False, True])
-def test_an_object_that_returns_in_time_keeps_its_id(silent: bool, periods: int) -> None:  # noqa: FBT001 - parametrized
+def test_an_object_that_returns_in_time_keeps_its_id(*, silent: bool, periods: int) -> None:
     """Missed for up to max_misses periods, the object is found again under its id in the period after."""
     parameters = car(survival=1.0)
     between = [] if silent else [boxes(parameters, 0.1 * k) for k in range(1, periods)]

@@ -67,7 +67,7 @@ def assert_same_gaussian(found: tuple[Array, Array], wanted: tuple[Array, Array]
 @pytest.mark.parametrize("heading_sign", [True, False])
 @pytest.mark.parametrize("velocity", [True, False])
 @pytest.mark.parametrize("seed", range(10))
-def test_the_update_is_the_textbook_ukf(seed: int, velocity: bool, heading_sign: bool) -> None:  # noqa: FBT001 - parametrized
+def test_the_update_is_the_textbook_ukf(seed: int, *, velocity: bool, heading_sign: bool) -> None:
     """Mean and covariance equal K = C S^-1, m + K nu, P - K S K' written out with matrices."""
     rng = np.random.default_rng(seed)
     mean, covariance = random_state(rng)
@@ -93,7 +93,7 @@ def test_without_velocity_the_update_is_the_linear_kalman_filter(seed: int) -> N
 
 
 @pytest.mark.parametrize("velocity", [True, False])
-def test_a_box_turned_by_pi_changes_nothing_where_headings_may_flip(velocity: bool) -> None:  # noqa: FBT001 - parametrized
+def test_a_box_turned_by_pi_changes_nothing_where_headings_may_flip(*, velocity: bool) -> None:
     """With heading_sign_reliable false z_phi and z_phi + pi are one measurement; with true they are not."""
     rng = np.random.default_rng(3)
     mean, covariance = random_state(rng)
