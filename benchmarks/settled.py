@@ -57,7 +57,7 @@ def recorded(dataset: str) -> tuple[optipmb.Parameters, list[list[Arguments]]]:
     from real_data import kitti_root, nuscenes_root  # noqa: PLC0415 - the same
 
     if dataset == "kitti":
-        opened, classes = open_dataset("kitti", kitti_root(), clouds=False), ("Car",)
+        opened, classes = open_dataset("kitti", kitti_root(), "pointrcnn", clouds=False), ("Car",)
     else:
         root = nuscenes_root()
         opened, classes = open_dataset("nuscenes", root, root / "detections" / "centerpoint.json", clouds=False), ()

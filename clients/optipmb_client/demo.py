@@ -63,8 +63,7 @@ def demonstrate(
                 on_frame=on_frame,
             )
     on_stage("comparing the tracks with the truth, drawing them")
-    labels = next(sequence.frames()).labels
-    results = evaluate_files([sequence], out, labels, default_rules(dataset.name))
+    results = evaluate_files([sequence], out, sequence.labels, default_rules(dataset.name))
     figures = combine(result.sweep.results[result.sweep.best] for result in results)
     picture: Path | None = out / "tracks.png"
     try:

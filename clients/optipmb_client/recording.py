@@ -38,6 +38,7 @@ class Preloaded:
 
     def __init__(self, sequence: DataSequence) -> None:
         self.name = sequence.name
+        self.labels = sequence.labels
         self.has_clouds = sequence.has_clouds
         self.poses = sequence.poses
         self._frames = list(sequence.frames())

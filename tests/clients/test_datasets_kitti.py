@@ -71,15 +71,18 @@ def test_the_root_may_be_the_training_folder_itself(tmp_path: Path, below: str) 
 
 
 def test_the_detector_may_be_a_name_or_a_folder(tmp_path: Path) -> None:
-    """With two detectors one must be named; its folder does as well; an unknown one is an error."""
+    """With two detectors one must be named before frames are read; its folder does as well; an unknown is an error."""
     write_root(tmp_path / "data")
     (tmp_path / "data/detections/rcnn").rename(tmp_path / "elsewhere")
     assert len(KittiDataset(tmp_path / "data", tmp_path / "elsewhere").sequences(["all"])) == 1
     write_root(tmp_path / "data")
     (tmp_path / "elsewhere").rename(tmp_path / "data/detections/other")
     assert len(KittiDataset(tmp_path / "data", "other").sequences(["all"])) == 1
+    (sequence,) = KittiDataset(tmp_path / "data").sequences(["all"])
+    assert sequence.labels == ("Car", "Cyclist", "Pedestrian")
+    assert len(sequence.poses) == 3
     with pytest.raises(DatasetError, match="several: other, rcnn"):
-        KittiDataset(tmp_path / "data")
+        next(sequence.frames())
     with pytest.raises(DatasetError, match="detections/third"):
         KittiDataset(tmp_path / "data", "third")
 

@@ -53,6 +53,19 @@ def test_the_real_truth_scores_a_hundred(tmp_path: Path) -> None:
         assert one.everything.gospa.gospa == pytest.approx(0.0, abs=1e-6)
 
 
+def test_neither_figures_nor_pictures_need_detections(
+    kitti: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a root without any, `evaluate` gives the figures of all classes of the benchmark, and `plot` its picture."""
+    data = ("--dataset", "kitti", "--root", str(kitti[0]), "--tracks", str(kitti[1]))
+    assert run(["evaluate", *data, "--json"]) == 0
+    assert set(json.loads(capsys.readouterr().out)["classes"]) == set(CLASSES)
+    assert run(["plot", *data, "--sequences", "0000", "--out", str(tmp_path / "0000.png")]) == 0
+    assert (tmp_path / "0000.png").read_bytes().startswith(b"\x89PNG")
+    assert run(["track", *data[:4], "--out", str(tmp_path)]) == 2
+    assert "the name of a detector, or just one in detections/, received none" in capsys.readouterr().err
+
+
 def test_empty_results_score_zero(kitti: tuple[Path, Path], tmp_path: Path) -> None:
     """Result files without a line give zeros, or nothing where a figure is not defined, and no error."""
     sequences = open_dataset("kitti", kitti[0]).sequences(["all"])

@@ -88,7 +88,7 @@ CLASSES = {"Car": SIZE, "Van": (5.0, 2.0, 2.2), "Pedestrian": (0.8, 0.6, 1.75), 
 
 
 def write_kitti(root: Path, results: Path, seed: int, sequences: Sequence[str] = ("0000", "0001")) -> Path:
-    """Write a small benchmark with all that its rules name, and disturbed tracks of it; return its root.
+    """Write a small benchmark with all that its rules name but no detections, and disturbed tracks; return its root.
 
     Objects drive ahead of a camera that drives along a bend; some are vans, some hidden or cut by the image for a
     while, some so near to others that a track could be either's. Tracks are inaccurate, lost and taken up under another
@@ -97,8 +97,6 @@ def write_kitti(root: Path, results: Path, seed: int, sequences: Sequence[str] =
     chance = np.random.default_rng(seed)
     for folder in ("calib", "poses", "label_02"):
         (root / "training" / folder).mkdir(parents=True, exist_ok=True)
-    for name in CLASSES:
-        (root / "detections" / "made" / name).mkdir(parents=True, exist_ok=True)
     results.mkdir(parents=True, exist_ok=True)
     unit = "1 0 0 0 0 1 0 0 0 0 1 0"
     for sequence in sequences:
@@ -108,8 +106,6 @@ def write_kitti(root: Path, results: Path, seed: int, sequences: Sequence[str] =
         )
         (root / "training" / "calib" / f"{sequence}.txt").write_text(calibration)
         (root / "training" / "poses" / f"{sequence}.txt").write_text("".join(_pose(frame) for frame in range(frames)))
-        for name in ("Car", "Pedestrian", "Cyclist"):
-            (root / "detections" / "made" / name / f"{sequence}.txt").write_text("")
         labels, tracks = _drive(chance, frames)
         (root / "training" / "label_02" / f"{sequence}.txt").write_text("".join(labels))
         (results / f"{sequence}.txt").write_text("".join(tracks))

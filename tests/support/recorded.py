@@ -38,10 +38,10 @@ class Recording:
 
 def kitti(root: Path, name: str, stream: str, frames: int) -> Recording:
     """The first frames of a KITTI sequence, under a stream and an epoch of its own."""
-    return recording("kitti", root, None, name, stream, frames)
+    return recording("kitti", root, "pointrcnn", name, stream, frames)
 
 
-def recording(kind: str, root: Path, detector: str | None, name: str, stream: str, frames: int) -> Recording:
+def recording(kind: str, root: Path, detector: str, name: str, stream: str, frames: int) -> Recording:
     """The first frames of a sequence (or of the first one, for `all`), under a stream and an epoch of its own."""
     dataset = open_dataset(kind, root, detector)
     sequence = dataset.sequences([name])[0]

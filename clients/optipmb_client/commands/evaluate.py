@@ -53,6 +53,8 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     CLEAR MOT figures, HOTA of centres in the plane, GOSPA and OSPA; of KITTI, AB3DMOT's protocol and the HOTA of image
     boxes (where TrackEval is installed). Tracks that were written with --full are tested for calibration too.
 
+    No detections are needed; where they are named, or there is just one detector, only its classes are evaluated.
+
     The best threshold is the one on the mean score of a track that gives the highest MOTA.
     """
     from optipmb_client.commands.tables import (  # noqa: PLC0415  loads the solvers of scipy
@@ -105,8 +107,8 @@ def evaluate(  # noqa: PLR0913  these are the command's options
 
 
 def labels_of(sequences: Many[DataSequence]) -> tuple[str, ...]:
-    """Return the classes of the detections of some sequences, in their order."""
-    return tuple(dict.fromkeys(label for sequence in sequences for label in next(sequence.frames()).labels))
+    """Return the classes of some sequences, in their order."""
+    return tuple(dict.fromkeys(label for sequence in sequences for label in sequence.labels))
 
 
 def _rules(dataset: str, iou: float | None, distance: float | None) -> "Rules":

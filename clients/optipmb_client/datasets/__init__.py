@@ -40,7 +40,8 @@ def open_dataset(
     Args:
         name: one of `DATASETS`.
         root: the folder of a dataset on disk, the file of a recording; a generated one takes none.
-        detections: the detector whose results are used: its name, its folder or file, or None when there is just one.
+        detections: the detector whose results are used: its name, its folder or file. None when there is just one, or
+            when only truth, poses and clouds are read.
         options: of the dataset. kitti: `clouds`; nuscenes: `clouds`, `z_bottom`; scene: the fields of `SceneOptions`;
             mcap: none.
 

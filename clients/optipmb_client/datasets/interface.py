@@ -147,6 +147,9 @@ class DataSequence(Protocol):
     def name(self) -> str: ...  # noqa: D102 - as the dataset calls it
 
     @property
+    def labels(self) -> tuple[str, ...]: ...  # noqa: D102 - the classes of its detections; without any, the benchmark's
+
+    @property
     def poses(self) -> Sequence[Pose]: ...  # noqa: D102 - world from sensor, one per frame
 
     @property

@@ -6,7 +6,8 @@ Conventions: the sensor frame of detections is the rectified camera frame with i
 
 Layout, below a root that holds `training` or is itself such a folder: `calib/SSSS.txt`, `poses/SSSS.txt` or
 `oxts/SSSS.txt`, and, where there are any, `label_02/SSSS.txt` and `velodyne/SSSS/FFFFFF.bin`. Detections are
-`detections/DETECTOR/CLASS/SSSS.txt`, in the root or beside it.
+`detections/DETECTOR/CLASS/SSSS.txt`, in the root or beside it. Only tracking needs them: truth, poses and clouds can be
+read of a root with several detectors of which none is named, and of one with none.
 """
 
 from collections.abc import Iterator, Sequence
@@ -46,6 +47,7 @@ SPLITS = {
 """AB3DMOT's splits of the training sequences."""
 
 _TYPE_CODES = {"Pedestrian": 1, "Car": 2, "Cyclist": 3}
+_CLASSES = tuple(sorted(_TYPE_CODES))
 _DONT_CARE = "DontCare"
 _MAX_OCCLUSION = 2
 _SCAN_COLUMNS = 4
@@ -57,13 +59,25 @@ _AXES[:3, :3] = SENSOR_FROM_CAMERA
 class Layout:
     """Where the files of a KITTI root are."""
 
+    root: Path
     base: Path
-    detector: Path
-    """The folder with one folder per class."""
-    probability: bool
-    """Scores are probabilities already, not logits."""
+    detector: Path | None
+    """The folder with one folder per class; None where no detector is named and there is not just one."""
     clouds: bool
     """Clouds are wanted."""
+
+    @cached_property
+    def probability(self) -> bool:
+        """Whether the scores of the detector are probabilities already, not logits."""
+        return _are_probabilities(self.need_detector())
+
+    def need_detector(self) -> Path:
+        """Return the folder of the detector, which only tracking needs."""
+        if self.detector is None:
+            names = ", ".join(sorted(path.name for path in _detectors(self.root, self.base)))
+            received = f"several: {names}" if names else "none"
+            raise DatasetError(self.root, "the name of a detector, or just one in detections/", received)
+        return self.detector
 
     def text(self, kind: str, sequence: str) -> Path:
         """Return the path of one of the text files of a sequence."""
@@ -76,10 +90,11 @@ class KittiSequence:
     def __init__(self, name: str, layout: Layout) -> None:
         self.name = name
         self._layout = layout
-        classes = [path.parent.name for path in sorted(layout.detector.glob(f"*/{name}.txt"))]
-        if not classes:
-            raise DatasetError(layout.detector / "CLASS" / f"{name}.txt", "detections of at least one class", "none")
-        self.labels = tuple(classes)
+        self.labels = _CLASSES
+        if layout.detector is not None:
+            self.labels = tuple(path.parent.name for path in sorted(layout.detector.glob(f"*/{name}.txt")))
+        if not self.labels:
+            raise DatasetError(f"{layout.detector}/CLASS/{name}.txt", "detections of at least one class", "none")
 
     def __len__(self) -> int:
         return len(self._world_from_camera)
@@ -123,9 +138,9 @@ class KittiSequence:
 
     def frames(self) -> Iterator[DetectionFrame]:
         """Yield every frame in order, also those without detections."""
-        count = len(self)
+        count, detector = len(self), self._layout.need_detector()
         files = [
-            read_detections(self._layout.detector / label / f"{self.name}.txt", count, _TYPE_CODES.get(label))
+            read_detections(detector / label / f"{self.name}.txt", count, _TYPE_CODES.get(label))
             for label in self.labels
         ]
         label = np.concatenate([np.full(len(file.frame), i, dtype=np.int64) for i, file in enumerate(files)])
@@ -207,7 +222,7 @@ def read_scan(path: Path) -> Points:
 
 
 class KittiDataset:
-    """A KITTI tracking root together with one detector's results."""
+    """A KITTI tracking root, together with the results of a detector for tracking."""
 
     name = "kitti"
     profile = "kitti"
@@ -217,11 +232,12 @@ class KittiDataset:
         if not (base / "calib").is_dir():
             received = "a folder without them" if root.is_dir() else "no such folder"
             raise DatasetError(root, "a KITTI tracking root (with training/calib or calib)", received)
-        detector = _find_detector(root, base, detections)
-        self._layout = Layout(base, detector, _are_probabilities(detector), clouds)
+        self._layout = Layout(root, base, _find_detector(root, base, detections), clouds)
 
     def sequences(self, names: Sequence[str]) -> list[KittiSequence]:
-        """Return the sequences of these names; `all` are those with detections, `train` and `val` the splits.
+        """Return the sequences of these names; `train` and `val` are the splits.
+
+        `all` are those that the detector has, or all where none is chosen.
 
         Raises:
             DatasetError: a named sequence is not there, or none is.
@@ -235,7 +251,7 @@ class KittiDataset:
         if missing:
             raise DatasetError(
                 self._layout.base,
-                f"calib and detections ({self._layout.detector}) of the sequences asked for",
+                f"{self._needed()} of the sequences asked for",
                 f"none for {' '.join(missing)}; there are {' '.join(present) or 'none'}",
             )
         if not wanted:
@@ -249,25 +265,33 @@ class KittiDataset:
 
     def _present(self) -> list[str]:
         calibrated = {path.stem for path in (self._layout.base / "calib").glob("*.txt")}
+        if self._layout.detector is None:
+            return sorted(calibrated)
         detected = {path.stem for path in self._layout.detector.glob("*/*.txt")}
         return sorted(calibrated & detected)
 
+    def _needed(self) -> str:
+        return "calib" if self._layout.detector is None else f"calib and detections ({self._layout.detector})"
 
-def _find_detector(root: Path, base: Path, detections: str | Path | None) -> Path:
-    """Return the folder of a detector, given its name, its path, or nothing when there is just one."""
-    folders = dict.fromkeys(place / "detections" for place in (root, base, base.parent, root.parent))
-    if detections is not None:
-        for place in (*(folder / detections for folder in folders), Path(detections)):
-            if any(place.glob("*/*.txt")):
-                return place
-        raise DatasetError(root, f"detections/{detections}/CLASS/SSSS.txt below or beside it", "no such files")
-    found = dict.fromkeys(path.parents[1].resolve() for folder in folders for path in folder.glob("*/*/*.txt"))
-    if len(found) != 1:
-        names = ", ".join(sorted(path.name for path in found))
-        raise DatasetError(
-            root, "the name of a detector, or just one in detections/", f"several: {names}" if found else "none"
-        )
-    return next(iter(found))
+
+def _find_detector(root: Path, base: Path, detections: str | Path | None) -> Path | None:
+    """Return the folder of a detector, given its name or its path, or the only one there is; None where it is open."""
+    if detections is None:
+        found = _detectors(root, base)
+        return found[0] if len(found) == 1 else None
+    for place in (*(folder / detections for folder in _detector_folders(root, base)), Path(detections)):
+        if any(place.glob("*/*.txt")):
+            return place
+    raise DatasetError(root, f"detections/{detections}/CLASS/SSSS.txt below or beside it", "no such files")
+
+
+def _detectors(root: Path, base: Path) -> list[Path]:
+    files = (path for folder in _detector_folders(root, base) for path in folder.glob("*/*/*.txt"))
+    return list(dict.fromkeys(path.parents[1].resolve() for path in files))
+
+
+def _detector_folders(root: Path, base: Path) -> list[Path]:
+    return list(dict.fromkeys(place / "detections" for place in (root, base, base.parent, root.parent)))
 
 
 def _are_probabilities(detector: Path) -> bool:
