@@ -57,7 +57,7 @@ tests: install
 
 schemas: install
 	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md schemas/json
-	$(BIN)/python -m optipmb_service.reference --check docs/operation.md
+	$(BIN)/python docs/reference.py --check docs/operation.md
 
 wheel: install
 	sh tests/wheel.sh $(PYTHON) $(BIN)

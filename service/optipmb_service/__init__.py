@@ -7,10 +7,10 @@ From the outside in:
     cli, settings, logs     the command
     supervisor, child, whole, worker, share    several processes as one instance
     service, loops          the control loop: start, signals, timers, end
-    vitals, metrics, figures, http, health    how it is, for those who ask from outside
+    health, metrics, figures, http, health    how it is, for those who ask from outside
     transport/              Zenoh, behind the protocols of ports
     registry, queries       streams and questions, found and sorted
-    lane, inbox             one stream: its queue, its worker's turn
+    actor, mailbox             one stream: its queue, its worker's turn
     session, timing         one density and all decisions about it; pure
     convert, clouds, records, profiles, problems, meter
 

@@ -16,7 +16,7 @@ import dockerfile
 import kubernetes_validate
 import pytest
 import yaml
-from optipmb_service.metrics import METRICS, NAMESPACE
+from optipmb_service.observability.metrics import METRICS, NAMESPACE
 from optipmb_service.settings import Settings
 from routers import free_endpoint
 from service_process import ServiceProcess

@@ -10,9 +10,9 @@ import pytest
 from fleet import Fleet, freeze, thaw
 from optipmb_client import Publisher
 from optipmb_schemas import Keys, ServiceStatus, SessionState, Tracks
-from optipmb_service.checkpoint import digest_of
-from optipmb_service.records import Tracked
-from optipmb_service.session import Session
+from optipmb_service.session.checkpoint import digest_of
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Tracked
 from router import Node, Sensor, plain, until
 
 import optipmb
@@ -72,7 +72,7 @@ def published_by(node: Node, instance: str) -> list[Tracks]:
 def test_who_stands_by_takes_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Fault 17: SIGKILL of the owner, then SIGSTOP of its successor: each time another goes on, to the byte.
 
-    The frozen one finds its tenure lapsed when it wakes up, publishes nothing more and stands by.
+    The frozen one finds its write lease lapsed when it wakes up, publishes nothing more and stands by.
     """
     with Fleet(tmp_path) as fleet, Node(fleet.endpoint) as node:
         first = fleet.service("a")
@@ -148,7 +148,7 @@ def test_a_router_that_is_killed(tmp_path: Path) -> None:
         node.tracks(SENSOR.stream, 10)
         fleet.router.kill()
         send(node, 10, 40)
-        service.wait_log("tenure_lapsed")
+        service.wait_log("write_lease_lapsed")
         fleet.router.start()
         send(node, 40, 45)
         state = check(node, 45, owner="a")

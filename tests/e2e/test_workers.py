@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import pytest
 from commands import optipmb as optipmb_command
 from optipmb_schemas import Keys, MoveRequest, ServiceStatus, Tracks, decode
-from optipmb_service.records import Tracked
-from optipmb_service.session import Session
-from optipmb_service.share import worker_of
+from optipmb_service.cluster.assignment import worker_of
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Tracked
 from processes import descendants, wait_until_ended
 from router import Node, Sensor, plain
 from service_process import ServiceProcess

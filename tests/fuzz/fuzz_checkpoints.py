@@ -13,8 +13,8 @@ import atheris
 import optipmb  # noqa: F401 - first, and not instrumented: its kernels are compiled
 
 with atheris.instrument_imports(include=["optipmb_schemas", "optipmb_service"]):
-    from optipmb_service.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
-    from optipmb_service.session import Session
+    from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
+    from optipmb_service.session.session import Session
 
 
 class Idle:

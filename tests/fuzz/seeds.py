@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import optipmb_schemas as schemas
-from optipmb_service.checkpoint import HEAD, encode_checkpoint
-from optipmb_service.session import Session
+from optipmb_service.session.checkpoint import HEAD, encode_checkpoint
+from optipmb_service.session.session import Session
 from router import Sensor
 from sessions import chained, feed
 

@@ -8,8 +8,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from optipmb_service.profiles import Profiles
-from optipmb_service.service import Service
+from optipmb_service.app.service import Service
+from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.settings import load
 from router import Node
 from routers import free_endpoint
@@ -19,8 +19,8 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from optipmb_service.circle import Member
-    from optipmb_service.share import Share
+    from optipmb_service.cluster.assignment import Assignment
+    from optipmb_service.runtime.context import Actor
 
     Start = Callable[..., tuple[Service, str]]
 
@@ -35,7 +35,9 @@ def start(_compiled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
     """Start services; each is stopped at the end. Options are settings; `tracker` and `share` are the service's own."""
     with contextlib.ExitStack() as stack:
 
-        def begin(*, tracker: Any = optipmb.Tracker, share: Share | None = None, **options: Any) -> tuple[Service, str]:
+        def begin(
+            *, tracker: Any = optipmb.Tracker, share: Assignment | None = None, **options: Any
+        ) -> tuple[Service, str]:
             endpoint = free_endpoint()
             given = {"listen": [endpoint], "instance": "test", "threads": 2, "grace_s": 0.2, "store": "none"} | options
             settings = load(None, given).settings
@@ -55,8 +57,8 @@ def node(start: Start) -> Iterator[Node]:
         yield one
 
 
-def arm(lane: Member, at_ns: int) -> None:
-    """Wake a lane in time, as the control loop does."""
-    timer = threading.Timer(max(0.0, at_ns - time.monotonic_ns()) / 1e9, lane.wake)
+def arm(actor: Actor, at_ns: int) -> None:
+    """Wake an actor in time, as the control loop does."""
+    timer = threading.Timer(max(0.0, at_ns - time.monotonic_ns()) / 1e9, actor.wake)
     timer.daemon = True
     timer.start()

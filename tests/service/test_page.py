@@ -11,11 +11,11 @@ from typing import get_args
 import optipmb_service
 import pytest
 from optipmb_schemas import Code
-from optipmb_service import cli
-from optipmb_service.logs import EVENTS
-from optipmb_service.problems import CODES
-from optipmb_service.reference import main, page
+from optipmb_service.app import cli
+from optipmb_service.observability.logs import EVENTS
+from optipmb_service.session.problems import CODES
 from optipmb_service.settings import load
+from reference import main, page
 
 FILE = Path(__file__).parents[2] / "docs" / "operation.md"
 SOURCES = sorted(Path(optipmb_service.__file__).parent.rglob("*.py"))
@@ -41,7 +41,7 @@ def texts(part: ast.AST) -> set[str]:
 
 
 def test_the_tables_are_current() -> None:
-    """`python -m optipmb_service.reference docs/operation.md` would change nothing."""
+    """`python docs/reference.py docs/operation.md` would change nothing."""
     assert page(FILE.read_text(encoding="utf-8")) == FILE.read_text(encoding="utf-8")
     assert main(["--check", str(FILE)]) == 0
 

@@ -14,10 +14,10 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
-from optipmb_service.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, state_bytes
-from optipmb_service.records import Policy
-from optipmb_service.session import Session
-from optipmb_service.store import MemoryStore, load_whole
+from optipmb_service.cluster.store import MemoryStore, load_newest
+from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Policy
 from router import SECOND, Sensor
 from sessions import Merged, chained
 
@@ -235,7 +235,7 @@ class World:
             )
         for one in self.streams:
             stream = one.sensor.stream
-            session = load_whole(self.store, stream, self._restored, CheckpointError, lambda _: None)
+            session = load_newest(self.store, stream, self._restored, CheckpointError, lambda _: None)
             self.sessions[stream] = session or self._fresh(stream)
             self.store.save({stream: encode_checkpoint(self.sessions[stream].snapshot())})
             # Some live frames come before the cached ones, as they do on a network.

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from optipmb_client.datasets import open_dataset
 from optipmb_schemas import Detections, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
-from optipmb_service.checkpoint import digest_of
-from optipmb_service.records import Policy, Tracked
-from optipmb_service.session import Session
+from optipmb_service.session.checkpoint import digest_of
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Policy, Tracked
 from router import plain
 
 import optipmb

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import uvicorn
 
-from optipmb_service.ports import HttpError
+from optipmb_service.runtime.ports import HttpError
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp

@@ -1,0 +1,102 @@
+"""The tables of `docs/operation.md`, made from the code that they describe.
+
+python docs/reference.py docs/operation.md            write them
+python docs/reference.py --check docs/operation.md    status 1 when they are not current
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
+
+from optipmb_service.observability.logs import EVENTS
+from optipmb_service.observability.metrics import METRICS, NAMESPACE
+from optipmb_service.session.problems import CODES
+from optipmb_service.settings import LimitSettings, Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from pydantic.fields import FieldInfo
+
+_TABLE: Final = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_BOUNDS: Final = {"ge": "≥", "gt": ">", "le": "≤"}
+
+
+def page(text: str) -> str:
+    """Return a page with its tables made anew."""
+    tables = {"settings": settings(), "problems": problems(), "events": events(), "metrics": metrics()}
+    return _TABLE.sub(lambda match: f"{match[1]}{tables[match[2]]}{match[3]}", text)
+
+
+def settings() -> str:
+    """Return the table of all settings."""
+    rows = [_setting(name, field) for name, field in Settings.model_fields.items() if name != "limits"]
+    rows += [_setting(f"limits.{name}", field) for name, field in LimitSettings.model_fields.items()]
+    return _table(("setting", "default", "allowed", "meaning"), rows)
+
+
+def problems() -> str:
+    """Return the table of the codes of problems."""
+    return _table(("code", "meaning", "what to do"), [(f"`{code}`", *texts) for code, texts in CODES.items()])
+
+
+def events() -> str:
+    """Return the table of the log events."""
+    return _table(("event", "meaning"), [(f"`{event}`", text) for event, text in EVENTS.items()])
+
+
+def metrics() -> str:
+    """Return the table of the metrics."""
+    rows = [
+        (f"`{NAMESPACE}{name}`", metric.kind, ", ".join(f"`{label}`" for label in metric.labels), metric.meaning)
+        for name, metric in METRICS.items()
+    ]
+    return _table(("metric", "kind", "labels", "meaning"), rows)
+
+
+def _setting(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
+    default = field.get_default(call_default_factory=False) if field.default_factory is None else None
+    shown = "" if default is None or default == () else f"`{_plain(default)}`"
+    bounds = [
+        f"{sign} {_plain(getattr(rule, kind))}"
+        for rule in field.metadata
+        for kind, sign in _BOUNDS.items()
+        if getattr(rule, kind, None) is not None
+    ]
+    if get_origin(field.annotation) is Literal:
+        bounds = [", ".join(f"`{choice}`" for choice in get_args(field.annotation))]
+    if bool in (field.annotation, *get_args(field.annotation)):
+        bounds = ["`true`, `false`"]
+    return f"`{name}`", shown, ", ".join(bounds), field.description or ""
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |\n" for line in lines)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Write or check the page; returns the exit status."""
+    check = "--check" in arguments
+    (file,) = (Path(argument) for argument in arguments if argument != "--check")
+    old = file.read_text(encoding="utf-8")
+    new = page(old)
+    if not check:
+        file.write_text(new, encoding="utf-8")
+    elif new != old:
+        print(f"{file} is not current: python docs/reference.py {file}", file=sys.stderr)  # noqa: T201 - a command
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""The command line, and how the service is started, supervised and ended."""

@@ -1,0 +1,258 @@
+"""What the workers of one instance are together: status and metrics asked of each and put together, and the moves.
+
+Implements `http.Source`, and answers the queries about the instance. A worker that does not answer in time is left out
+and makes the state `degraded`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import optipmb_schemas as schemas
+import structlog
+from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
+from prometheus_client.parser import text_string_to_metric_families
+from prometheus_client.samples import Sample
+
+from optipmb_service import __version__
+from optipmb_service.observability import collectors
+from optipmb_service.observability.health import STUCK_S
+from optipmb_service.observability.metrics import ReadOnDemand
+from optipmb_service.runtime.ports import TransportError
+from optipmb_service.session.problems import problem_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from prometheus_client.metrics_core import Metric
+
+    from optipmb_service.runtime.ports import Request
+    from optipmb_service.settings import Settings
+
+log = structlog.get_logger("optipmb_service")
+
+ANSWER_S: Final = 1.0
+"""How long a worker may take to answer for its part."""
+
+MOVE_S: Final = 20.0
+TEXT: Final = "text/plain;version=0.0.4"
+PROBLEMS: Final = 100
+SESSIONS: Final = 10_000
+
+
+class Workers(Protocol):
+    """What is asked of the supervisor."""
+
+    @property
+    def count(self) -> int:
+        """How many workers there are."""
+
+    @property
+    def states(self) -> Sequence[str]:
+        """How each is."""
+
+    @property
+    def began(self) -> bool:
+        """Whether all have been ready at once."""
+
+    async def move(self, stream: str, worker: int) -> None:
+        """Give a stream to a worker."""
+
+
+class Network(Protocol):
+    """What is asked of the transport."""
+
+    def ask(self, key: str, timeout: float) -> bytes | None:
+        """Return the first answer at a key."""
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
+        """Hand over what comes on a stream, until the result is called."""
+
+
+class AggregateView:
+    """All workers of one instance.
+
+    Args:
+        settings: of the instance.
+        workers: the supervisor.
+        network: where the workers are asked.
+        loop: where the supervisor lives.
+    """
+
+    def __init__(self, settings: Settings, workers: Workers, network: Network, loop: asyncio.AbstractEventLoop) -> None:
+        self._instance = settings.instance
+        self._keys = schemas.Keys(settings.prefix)
+        self._limits = settings.limits.limits()
+        self._workers = workers
+        self._network = network
+        self._loop = loop
+        self._started_ns = time.time_ns()
+        self._began_ns = self._beat_ns = time.monotonic_ns()
+        self._ending = False
+        self._asking = ThreadPoolExecutor(workers.count, "asking")
+        self._registry = CollectorRegistry()
+        ProcessCollector(registry=self._registry)
+
+    # As http.Source
+
+    def beat(self) -> None:
+        """Say that the control loop turns."""
+        self._beat_ns = time.monotonic_ns()
+
+    def beat_age_s(self) -> float:
+        """Return the seconds since the control loop last turned."""
+        return (time.monotonic_ns() - self._beat_ns) / 1e9
+
+    def alive(self) -> bool:
+        """Tell whether the control loop turns."""
+        return self.beat_age_s() < STUCK_S
+
+    def ends(self) -> None:
+        """Report the end from now on."""
+        self._ending = True
+        self._asking.shutdown(wait=False, cancel_futures=True)
+
+    def ready(self) -> bool:
+        """Tell whether streams are tracked, be it not all of them."""
+        return self.state() in {"ready", "degraded"} and "ready" in self._workers.states
+
+    def state(self) -> str:
+        """Return the state of the whole: degraded when a worker is down."""
+        if self._ending:
+            return "stopping"
+        if not self._workers.began:
+            return "starting"
+        return "ready" if all(state == "ready" for state in self._workers.states) else "degraded"
+
+    def status(self) -> schemas.ServiceStatus:
+        """Return the status: the sessions of all workers by stream, each with its worker, and the sums."""
+        parts = [
+            None if answer is None else schemas.decode(answer, schemas.ServiceStatus)
+            for answer in self._ask(self._keys.status)
+        ]
+        answered = [part for part in parts if part is not None]
+        sums: dict[str, int] = {}
+        for part in answered:
+            for name, value in part.present():
+                if type(value) is int and name != "started_ns":
+                    sums[name] = sums.get(name, 0) + value
+        sessions = [
+            session.model_copy(update={"worker": index})
+            for index, part in enumerate(parts)
+            if part is not None
+            for session in part.sessions
+        ]
+        state = self.state()
+        well = len(answered) == self._workers.count and all(part.state == "ready" for part in answered)
+        return schemas.ServiceStatus(
+            instance=self._instance,
+            version=__version__,
+            started_ns=self._started_ns,
+            uptime_s=(time.monotonic_ns() - self._began_ns) / 1e9,
+            state="degraded" if state == "ready" and not well else state,
+            sessions=tuple(sorted(sessions, key=lambda session: session.stream)[:SESSIONS]),
+            problems=tuple(problem for part in answered for problem in part.problems)[-PROBLEMS:],
+            **sums,
+        )
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
+        """Hand over what comes on a stream to a viewer, whichever worker tracks it, until the result is called."""
+        return None if self._ending else self._network.tap(stream, receive)
+
+    def text(self) -> bytes:
+        """Return the metrics of all processes in Prometheus' text format; those of a worker have its label."""
+        registry = CollectorRegistry()
+        registry.register(_Merged(self._families))
+        return generate_latest(registry)
+
+    # Queries
+
+    def answer(self, request: Request) -> None:
+        """Answer a query about the instance, and finish it whatever happens."""
+        status, metrics, move = (
+            make(self._instance) for make in (self._keys.status, self._keys.metrics, self._keys.move)
+        )
+        try:
+            if request.key == move:
+                self._move(request)
+                return
+            if request.matches(status):
+                request.answer(status, self.status())
+            if request.matches(metrics):
+                request.answer_text(metrics, self.text(), TEXT)
+        except schemas.MessageError as error:
+            request.refuse(self._problem(error))
+        except TransportError as error:
+            log.warning("reply_failed", key=request.key, error=str(error))
+        finally:
+            request.finish()
+
+    def _move(self, request: Request) -> None:
+        """Carry out a move.
+
+        Raises:
+            MessageError: what was asked cannot be.
+        """
+        asked = schemas.decode(
+            request.payload or b"", schemas.MoveRequest, encoding=request.encoding, limits=self._limits
+        )
+        if asked.worker >= self._workers.count:
+            expected = f"a worker from 0 to {self._workers.count - 1}"
+            raise schemas.MessageError("invalid_value", "worker", expected, str(asked.worker))
+        moving = asyncio.run_coroutine_threadsafe(self._workers.move(asked.stream, asked.worker), self._loop)
+        try:
+            moving.result(MOVE_S)
+        except TimeoutError:
+            raise schemas.MessageError("invalid_value", "worker", "workers that answer", "none in time") from None
+        request.answer(request.key, asked)
+
+    # The parts
+
+    def _ask(self, key: Callable[[str], str]) -> list[bytes | None]:
+        """Ask every worker at the key of its name, all at once."""
+        if self._ending:
+            return []
+        keys = [key(f"{self._instance}-w{index}") for index in range(self._workers.count)]
+        return list(self._asking.map(lambda one: self._network.ask(one, ANSWER_S), keys))
+
+    def _families(self) -> Iterator[Metric]:
+        merged: dict[str, Metric] = {}
+        own = ReadOnDemand(lambda: collectors.of_process(self._instance, self.state())).collect()
+        texts: list[tuple[str, Any]] = [("", [*own, *self._registry.collect()])]
+        for index, text in enumerate(self._ask(self._keys.metrics)):
+            if text is not None:
+                texts.append((str(index), text_string_to_metric_families(text.decode())))
+        for worker, families in texts:
+            for family in families:
+                into = merged.setdefault(family.name, family)
+                samples = [
+                    Sample(sample.name, {**sample.labels, "worker": worker} if worker else sample.labels, *sample[2:])
+                    for sample in family.samples
+                ]
+                into.samples = samples if into is family else [*into.samples, *samples]
+        yield from merged.values()
+
+    def _problem(self, error: schemas.MessageError) -> schemas.Problem:
+        return problem_of(
+            error.code,
+            stream="",
+            instance=self._instance,
+            path=error.path,
+            expected=error.expected,
+            received=error.received,
+            message=f"Query: {error.path or 'payload'}: expected {error.expected}, received {error.received}.",
+        )
+
+
+class _Merged:
+    def __init__(self, families: Callable[[], Iterator[Metric]]) -> None:
+        self._families = families
+
+    def collect(self) -> Iterator[Metric]:
+        return self._families()
+
+    def describe(self) -> list[Metric]:
+        return []

@@ -1,0 +1,196 @@
+"""The command `optipmb-service`: run the service (the default), ask how it is, or print the settings in force.
+
+Exit status: 0 after SIGINT or SIGTERM, 1 when the network cannot be used, 2 for a wrong option, path or setting; an
+error is one clear line on stderr.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from inspect import Parameter, Signature, signature
+from pathlib import Path  # noqa: TC003 - typer reads the annotations at run time
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TypedDict, Unpack, get_type_hints
+
+import typer
+from typer.main import get_command
+
+from optipmb_service import __version__
+from optipmb_service.app import health_command
+from optipmb_service.app.loops import leave
+from optipmb_service.app.router import route
+from optipmb_service.observability import logs
+from optipmb_service.settings import Loaded, Settings, SettingsInvalidError, load
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+WRONG_USE: Final = 2
+PASSED_ON: Final = {"allow_extra_args": True, "ignore_unknown_options": True}
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    help="Track objects in detections that come in over Zenoh. Without a command: run.",
+)
+
+
+class RouterOptions(TypedDict, total=False):
+    """What a router and the service take; None: not given."""
+
+    settings: Annotated[Path | None, typer.Option("--settings", metavar="FILE", help="Settings, a TOML file.")]
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", help="Endpoint to listen on, repeatable; as tcp/127.0.0.1:7447."),
+    ]
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", help="Router to connect to, repeatable; as tcp/10.0.0.1:7447."),
+    ]
+    zenoh_config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Zenoh configuration (JSON5): TLS, access control, limits.")
+    ]
+    instance: Annotated[str | None, typer.Option(metavar="NAME", help="Name of this instance.")]
+    http: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Serve health and metrics there; as 127.0.0.1:8080.")
+    ]
+    log_format: Annotated[str | None, typer.Option(metavar="console|json", help="Form of the log lines on stderr.")]
+    log_level: Annotated[str | None, typer.Option(metavar="LEVEL", help="debug, info, warning or error.")]
+
+
+class Options(RouterOptions, total=False):
+    """What the service takes beyond that."""
+
+    router: Annotated[
+        bool | None,
+        typer.Option("--router/--no-router", help="Be a Zenoh router oneself. Default: yes unless --connect is given."),
+    ]
+    profile: Annotated[
+        str | None, typer.Option(metavar="NAME|FILE", help="Profile of streams that no pattern in the settings names.")
+    ]
+    workers: Annotated[int | None, typer.Option(metavar="N", help="Processes that track, each a share of the streams.")]
+
+
+def _taking(options: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Let a command with `**given` have the options of a class: typer reads a command's signature, and no `Unpack`."""
+
+    def spread(command: Callable[..., None]) -> Callable[..., None]:
+        own = [
+            one
+            for one in signature(command, eval_str=True).parameters.values()
+            if one.kind is not Parameter.VAR_KEYWORD
+        ]
+        shared = [
+            Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+            for name, annotation in get_type_hints(options, include_extras=True).items()
+        ]
+        command.__signature__ = Signature([*shared, *own])  # type: ignore[attr-defined]  # read by inspect.signature
+        return command
+
+    return spread
+
+
+@app.command("run")
+@_taking(Options)
+def run_command(**given: Unpack[Options]) -> None:
+    """Run the service until SIGINT or SIGTERM. Prints one line, `ready …`, when it can be used; logs go to stderr."""
+    settings = _begin(_load(given))
+    leave(_run_one(settings) if settings.workers == 1 else _run_many(settings))
+
+
+@app.command("config")
+@_taking(Options)
+def config_command(
+    *,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with where each value came from.")] = False,
+    **given: Unpack[Options],
+) -> None:
+    """Print the settings in force as TOML, each with where it came from, and do nothing else."""
+    loaded = _load(given)
+    values = loaded.settings.model_dump(mode="json")
+    values |= {"router": loaded.settings.is_router, "listen": list(loaded.settings.endpoints)}
+    if as_json:
+        typer.echo(json.dumps({"settings": values, "sources": loaded.sources}, indent=2))
+        return
+    plain = {name: value for name, value in values.items() if not isinstance(value, dict)}
+    for name, value in plain.items():
+        # TOML has no null: what is not set is a comment.
+        shown = f"# {name} is not set" if value is None else f"{name} = {_toml(value)}"
+        typer.echo(f"{shown}  # {loaded.sources[name]}")
+    for name in values.keys() - plain.keys():
+        typer.echo(f"\n[{name}]  # {loaded.sources[name]}")
+        for key, value in values[name].items():
+            typer.echo(f"{_toml(key) if name == 'profiles' else key} = {_toml(value)}")
+
+
+@app.command("router")
+@_taking(RouterOptions)
+def router_command(**given: Unpack[RouterOptions]) -> None:
+    """Run a Zenoh router alone, without tracking, until SIGINT or SIGTERM."""
+    leave(route(_begin(_load({**given, "router": True}))))
+
+
+@app.command("health", add_help_option=False, context_settings=PASSED_ON)
+def health(context: typer.Context) -> None:
+    """Ask a running service how it is; status 0 when well, else 1. See `health --help`."""
+    raise typer.Exit(health_command.main(context.args))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:
+        typer.echo(f"optipmb-service {__version__}")
+        return
+    if given[:1] != ["--help"] and (not given or given[0].startswith("-")):
+        given = ["run", *given]
+    try:
+        status = get_command(app).main(given, prog_name="optipmb-service", standalone_mode=False)
+    except Exception as error:
+        # Errors of use are not of one public class in all versions of typer; all of them know this method.
+        describe = getattr(error, "format_message", None)
+        if describe is None:
+            raise
+        _wrong(describe())
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _run_one(settings: Settings) -> int:
+    # It takes the tracker along: 150 MB and seconds.
+    from optipmb_service.app.worker import run_alone  # noqa: PLC0415 - neither a parent nor a question needs it
+
+    return run_alone(settings)
+
+
+def _run_many(settings: Settings) -> int:
+    from optipmb_service.app.supervisor import supervise  # noqa: PLC0415 - a process that tracks needs none
+
+    return asyncio.run(supervise(settings))
+
+
+def _load(given: Mapping[str, Any]) -> Loaded:
+    """Return the settings in force with what the command line gives; None and no endpoints: not given."""
+    options = {name: value or None if name in {"listen", "connect"} else value for name, value in given.items()}
+    file = options.pop("settings")
+    try:
+        return load(file, options)
+    except SettingsInvalidError as error:
+        _wrong(str(error))
+
+
+def _begin(loaded: Loaded) -> Settings:
+    """Let logs go where the settings want them."""
+    logs.configure(loaded.settings.log_format, loaded.settings.log_level)
+    logs.unknown_environment(loaded.unknown)
+    return loaded.settings
+
+
+def _wrong(message: str) -> NoReturn:
+    typer.echo(f"optipmb-service: {' '.join(message.split())}", err=True)
+    raise SystemExit(WRONG_USE)
+
+
+def _toml(value: object) -> str:
+    """Return a value as TOML; for what settings hold, that is JSON."""
+    return json.dumps(value)

@@ -1,0 +1,117 @@
+"""What the control loops of a worker and of its parent share: waiting for the end, blocking work, leaving."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import sys
+import threading
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+import structlog
+
+from optipmb_service.observability.health import BEAT_S
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from optipmb_service.settings import Settings
+
+log = structlog.get_logger("optipmb_service")
+
+_T = TypeVar("_T")
+
+
+class StopRequest:
+    """Whether somebody wants the end: SIGINT, SIGTERM, or whoever calls it; to be made inside the loop."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._event = asyncio.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._loop.add_signal_handler(number, self.ask, number.name)
+
+    def ask(self, reason: str) -> None:
+        """Ask for the end."""
+        log.info("stop_asked" if not self.is_set() else "stop_asked_again", signal=reason)
+        self._event.set()
+
+    def ask_threadsafe(self, reason: str) -> None:
+        """Ask for the end, from any thread."""
+        with contextlib.suppress(RuntimeError):  # the loop has ended already
+            self._loop.call_soon_threadsafe(self.ask, reason)
+
+    def is_set(self) -> bool:
+        """Whether the end was asked for."""
+        return self._event.is_set()
+
+    async def wait(self, seconds: float | None = None) -> None:
+        """Wait until the end is asked for, at most so long."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._event.wait(), seconds)
+
+
+class Heartbeat(Protocol):
+    """What is told that the loop turns."""
+
+    def beat(self) -> None:
+        """Take it in."""
+
+
+def say_ready(settings: Settings) -> None:
+    """Print the line that starters wait for, the only one on stdout."""
+    endpoints = ",".join((*settings.endpoints, *settings.connect))
+    print(f"ready instance={settings.instance} endpoints={endpoints}", flush=True)  # noqa: T201 - it is the interface
+
+
+def leave(status: int) -> None:
+    """End the process; at once where a thread is stuck in machine code, which would crash an orderly end."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if any(thread.daemon and thread.is_alive() for thread in threading.enumerate()):
+        os._exit(status)
+    sys.exit(status)
+
+
+async def beat(health: Heartbeat) -> None:
+    """Say that the loop turns, for ever."""
+    while True:
+        health.beat()
+        await asyncio.sleep(BEAT_S)
+
+
+async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
+    """Do blocking work on a thread; None when the end was asked for before it was done, the work is then abandoned."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[_T] = loop.create_future()
+
+    def settle(value: _T | None, error: BaseException | None) -> None:
+        if done.cancelled():
+            return
+        if error is not None:
+            done.set_exception(error)
+        else:
+            done.set_result(value)  # type: ignore[arg-type]  # without an error there is a value
+
+    def call() -> None:
+        value: _T | None = None
+        error: BaseException | None = None
+        try:
+            value = work()
+        except BaseException as raised:  # noqa: BLE001 - handed to whoever awaits it
+            error = raised
+        with contextlib.suppress(RuntimeError):  # the loop has ended: the work was abandoned
+            loop.call_soon_threadsafe(settle, value, error)
+
+    # A daemon: neither compiling nor waiting for a router can be interrupted, and neither may keep the process.
+    threading.Thread(target=call, name="start", daemon=True).start()
+    stop = loop.create_task(asked.wait())
+    waits: set[asyncio.Future[Any]] = {done, stop}
+    await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    stop.cancel()
+    if not done.done():
+        done.cancel()
+        return None
+    return done.result()

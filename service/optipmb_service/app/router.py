@@ -1,0 +1,71 @@
+"""A Zenoh router alone, for networks whose services and nodes are all clients.
+
+It is the same router as the one inside the service, with the same tuning; access control, TLS and limits come from
+the Zenoh configuration file. Health and readiness are those of the service.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import structlog
+
+from optipmb_service import __version__
+from optipmb_service.app.monitoring import monitoring
+from optipmb_service.observability.health import BEAT_S, ProcessHealth
+from optipmb_service.runtime.ports import HttpError, TransportError
+from optipmb_service.zenoh import Router
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from optipmb_service.settings import Settings
+
+log = structlog.get_logger("optipmb_service")
+
+
+@dataclass(frozen=True)
+class _Routing:
+    """What a router reports: that it routes."""
+
+    state: str = "ready"
+
+    def status(self) -> None:
+        """Return nothing: a router has no streams."""
+
+
+def route(settings: Settings) -> int:
+    """Route until SIGINT or SIGTERM; to be called on the main thread.
+
+    Returns:
+        The exit status: 0, or 1 when an address or the configuration cannot be used.
+    """
+    asked = threading.Event()
+
+    def ask(number: int, _frame: FrameType | None) -> None:
+        asked.set()
+        log.info("stop_asked", signal=signal.Signals(number).name)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, ask)
+    health = ProcessHealth(settings.instance)
+    log.info("starting", instance=settings.instance, version=__version__)
+    try:
+        with monitoring(settings, health):
+            router = Router(settings)
+            health.report(_Routing())
+            print(f"ready router={settings.instance} endpoints={','.join(settings.endpoints)}", flush=True)  # noqa: T201 - what starters wait for
+            log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+            while not asked.wait(BEAT_S):
+                health.beat()
+            health.ends()
+            router.close()
+    except (TransportError, HttpError) as error:
+        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+        return 1
+    log.info("stopped", drained=True)
+    return 0

@@ -1,0 +1,337 @@
+"""The control loop: starts everything in order, keeps the timers, ends everything in order.
+
+asyncio runs on the main thread and does little: signals, the deadlines of frames that wait for their clouds, and once a
+second the streams that fell silent and the summaries of problems. Messages never pass through it; they go from a reader
+thread to a stream's mailbox to a worker thread.
+
+Start: read the profiles, compile the kernels, open Zenoh, subscribe, answer queries, say alive, print the ready line.
+End (SIGINT, SIGTERM): withdraw the alive token, stop receiving, track what was received as long as the grace lasts,
+close.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import sys
+import time
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import optipmb_schemas as schemas
+import structlog
+
+import optipmb
+from optipmb_service import __version__
+from optipmb_service.app.kernels import warm_up
+from optipmb_service.app.loops import StopRequest, beat, say_ready, unless
+from optipmb_service.app.monitoring import monitoring
+from optipmb_service.cluster.assignment import Assignment
+from optipmb_service.cluster.coordinator import Coordinator
+from optipmb_service.observability import collectors
+from optipmb_service.observability.health import ProcessHealth
+from optipmb_service.observability.metrics import Metrics
+from optipmb_service.observability.problem_reporter import ProblemReporter
+from optipmb_service.runtime.persistence import open_persistence
+from optipmb_service.runtime.ports import HttpError, TransportError
+from optipmb_service.runtime.queries import Queries
+from optipmb_service.runtime.registry import Registry
+from optipmb_service.runtime.scheduler import Scheduler
+from optipmb_service.zenoh import Transport
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from optipmb_service.observability.metrics import Value
+    from optipmb_service.runtime.context import Actor
+    from optipmb_service.runtime.profiles import Profiles
+    from optipmb_service.settings import Settings
+
+log = structlog.get_logger("optipmb_service")
+
+SWITCH_S: Final = 0.0005
+"""By default it is ten times as long, and a frame that meets two other threads waits 10 ms."""
+
+HOUSEKEEPING_S: Final = 0.5
+DRAIN_POLL_S: Final = 0.01
+JOIN_S: Final = 0.3
+
+
+class Service:
+    """A service on the network, without signals or a loop of its own: `run` adds these, tests use it as it is.
+
+    Args:
+        settings: what is in force.
+        profiles: the parameters that can be had.
+        arm: has `StreamActor.wake` called at a monotonic time (ns).
+        tracker: makes the trackers of sessions.
+        share: the streams of this process; all of them where it is the only one.
+        metrics: what counts; its own by default.
+
+    Raises:
+        TransportError: the network cannot be used.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        profiles: Profiles,
+        arm: Callable[[Actor, int], None],
+        tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
+        share: Assignment | None = None,
+        metrics: Metrics | None = None,
+    ) -> None:
+        self._settings = settings
+        self._started_ns = time.time_ns()
+        self._began_ns = time.monotonic_ns()
+        self._state = "starting"
+        self._metrics = metrics or Metrics()
+        self._transport = Transport(settings)
+        self._reporter = ProblemReporter(self._transport.publish_problem, _log_problem)
+        self._scheduler = Scheduler(settings.threads)
+        self._coordinator = Coordinator(settings.instance, self._transport, settings.lease_s)
+        self._persistence = open_persistence(settings, self._coordinator.may_write)
+        self._registry = Registry(
+            settings,
+            profiles,
+            sink=self._transport,
+            reporter=self._reporter,
+            scheduler=self._scheduler,
+            coordinator=self._coordinator,
+            persistence=self._persistence,
+            arm=arm,
+            metrics=self._metrics,
+            tracker=tracker,
+            share=share,
+        )
+        self._metrics.add(self._figures)
+        self._queries = Queries(self._registry, self.status, self._metrics.text)
+
+    def start(self, *, announce: bool = True) -> None:
+        """Receive, answer, and say so."""
+        self._transport.watch()
+        self._transport.watch_owners(
+            lambda stream, instance, present: self._coordinator.token_changed(stream, instance, present=present)
+        )
+        self._coordinator.start(self._registry.changed, self._registry.resume)
+        self._persistence.start(self._registry.keep)
+        self._transport.subscribe(self._registry.frame, self._registry.cloud, self._registry.wants)
+        self._transport.serve(self._queries.about_streams, self._queries.about_service)
+        self._state = "ready"
+        if announce:
+            self._transport.announce()
+
+    def housekeeping(self) -> None:
+        """Do what is due about once a second."""
+        now_ns = time.monotonic_ns()
+        self._registry.sweep(now_ns)
+        self._reporter.flush(now_ns)
+
+    def stop(self) -> bool:
+        """Track what was received, within the grace, and close; False when a step would not end."""
+        self._state = "stopping"
+        ends = time.monotonic() + self._settings.grace_s
+        self._transport.stop(JOIN_S)
+        if not self._persistence.durable:
+            self._registry.finish()  # else what waits for its cloud comes again from the publishers' caches
+        while self._registry.busy and time.monotonic() < ends:
+            time.sleep(DRAIN_POLL_S)
+        ended = self._scheduler.close(JOIN_S)
+        if ended:
+            self._registry.keep_now()
+        self._persistence.close(JOIN_S)
+        self._coordinator.close(JOIN_S)
+        self._reporter.flush(time.monotonic_ns())
+        self._transport.close()
+        return ended
+
+    def give_up(self, stream: str, then: Callable[[], None]) -> bool:
+        """End the session of a stream after what was received, then call `then`; False when there can be none."""
+        return self._registry.command(stream, lambda actor: actor.hand_over(then), urgent=False)
+
+    @property
+    def state(self) -> str:
+        """What the service is: starting, ready, degraded (it tracks, and cannot keep checkpoints) or stopping."""
+        return "degraded" if self._state == "ready" and self._persistence.failure else self._state
+
+    def status(self) -> schemas.ServiceStatus:
+        """Return the answer to `q/status`."""
+        now_ns = time.monotonic_ns()
+        totals = self._registry.totals()
+        return schemas.ServiceStatus(
+            instance=self._settings.instance,
+            version=__version__,
+            started_ns=self._started_ns,
+            uptime_s=(now_ns - self._began_ns) / 1e9,
+            state=self.state,
+            sessions=self._summaries(now_ns),
+            standby=self._registry.standing_by,
+            received=totals.received,
+            frames=totals.frames,
+            duplicates=totals.duplicates,
+            late=totals.late,
+            refused=totals.refused,
+            shed=totals.shed,
+            clouds_refused=totals.clouds_refused,
+            problems=self._reporter.newest(),
+        )
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
+        """Hand over what comes on a stream to a viewer, until the result is called."""
+        return self._transport.tap(stream, receive)
+
+    def _summaries(self, now_ns: int) -> tuple[schemas.SessionSummary, ...]:
+        summaries = (actor.summary(now_ns) for actor in self._registry.actors())
+        return tuple(summary for summary in summaries if summary is not None)
+
+    def _figures(self) -> Iterator[Value]:
+        """Read what `metrics` does not count itself."""
+        sessions = self._summaries(time.monotonic_ns())
+        densities = [session.density for actor in self._registry.actors() if (session := actor.session) is not None]
+        yield from collectors.of_problems(self._reporter.counts())
+        yield from collectors.of_totals(self._registry.totals())
+        yield from collectors.of_durability(
+            self._persistence.written,
+            self._persistence.complete_ns,
+            owned=len(sessions),
+            standing_by=self._registry.standing_by,
+            now_ns=time.monotonic_ns(),
+        )
+        yield from collectors.of_sessions(sessions)
+        yield from collectors.of_densities(densities)
+        yield from collectors.of_streams(sessions, self._settings.http_streams)
+
+
+class Parent(Protocol):
+    """What a process that tracks is to the one that started it."""
+
+    @property
+    def share(self) -> Assignment:
+        """The streams that it tracks."""
+
+    @property
+    def announces(self) -> bool:
+        """Whether it is an instance of its own to the network."""
+
+    def begin(self, asked: StopRequest) -> None:
+        """Listen for orders; the end may be one."""
+
+    def warm_up(self) -> None:
+        """Have the kernels ready."""
+
+    def ready(self, service: Service) -> None:
+        """Say that streams are served."""
+
+
+class NoParent:
+    """A process of its own: prints the ready line.
+
+    Args:
+        settings: what is in force.
+    """
+
+    announces: Final = True
+
+    def __init__(self, settings: Settings) -> None:
+        self.share = Assignment()
+        self._settings = settings
+
+    def begin(self, asked: StopRequest) -> None:
+        """Do nothing: signals are enough."""
+
+    def warm_up(self) -> None:
+        """Compile the kernels, or load them."""
+        warm_up()
+
+    def ready(self, service: Service) -> None:
+        """Print the line that starters wait for."""
+        del service
+        say_ready(self._settings)
+
+
+async def run(settings: Settings, profiles: Profiles, parent: Parent | None = None) -> int:
+    """Run the service until SIGINT or SIGTERM.
+
+    Args:
+        settings: what is in force.
+        profiles: the parameters that can be had.
+        parent: the parent and the share of a worker process; default: this process is alone and tracks all streams.
+
+    Returns:
+        The exit status: 0, or 1 when the network could not be used.
+    """
+    parent = parent or NoParent(settings)
+    loop = asyncio.get_running_loop()
+    asked = StopRequest()
+    parent.begin(asked)
+    log.info("starting", instance=settings.instance, version=__version__, profiles=profiles.names)
+    health = ProcessHealth(settings.instance)
+    try:
+        with monitoring(settings, health):
+            beating = loop.create_task(beat(health))
+            try:
+                return await _serve(settings, profiles, asked, health, parent)
+            finally:
+                beating.cancel()
+    except (TransportError, HttpError) as error:
+        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+        return 1
+
+
+async def _serve(
+    settings: Settings, profiles: Profiles, asked: StopRequest, health: ProcessHealth, parent: Parent
+) -> int:
+    """Run the service until the end is asked for.
+
+    Raises:
+        TransportError: the network cannot be used.
+    """
+    loop = asyncio.get_running_loop()
+
+    def arm(actor: Actor, at_ns: int) -> None:
+        # The loop's time and the deadlines are one clock, the monotonic one.
+        loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, actor.wake)
+
+    await unless(asked, parent.warm_up)
+    if asked.is_set():
+        return 0
+    if not settings.is_router:
+        log.info("connecting", endpoints=settings.connect)
+    service = await unless(asked, lambda: Service(settings, profiles, arm, metrics=health.metrics, share=parent.share))
+    if service is None:
+        return 0
+    service.start(announce=parent.announces)
+    health.report(service)
+    settle()
+    parent.ready(service)
+    log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+    while not asked.is_set():
+        await asked.wait(HOUSEKEEPING_S)
+        service.housekeeping()
+    health.ends()
+    ended = await asyncio.to_thread(service.stop)
+    log.info("stopped", drained=ended)
+    return 0
+
+
+def settle() -> None:
+    """Take what the start has made out of the garbage collector's sight, and let threads take turns more often.
+
+    150,000 objects of libraries and kernels live for ever. A full collection walks them all, and for as long no frame
+    moves: 50 ms on an idle machine. Without them it takes microseconds.
+    A thread that has been waited for gives the interpreter's lock away after `SWITCH_S`.
+    """
+    gc.collect()
+    gc.freeze()
+    sys.setswitchinterval(SWITCH_S)
+
+
+def _log_problem(problem: schemas.Problem, count: int) -> None:
+    log.warning(
+        "problem",
+        stream=problem.stream,
+        code=problem.code,
+        path=problem.path,
+        expected=problem.expected,
+        received=problem.received,
+        count=count,
+    )

@@ -1,0 +1,263 @@
+"""The parent of worker processes: starts them, starts again those that die, speaks for them, and tracks nothing itself.
+
+With a router, the router lives in the parent, and the workers connect to it over a socket in a private folder: no port,
+no password. Else the workers connect where the parent does. To the network the workers are one instance: the parent
+holds its alive token and answers its queries; the owner tokens of streams carry the names of the workers.
+
+A worker that dies is started again at once; if it dies again soon, after a pause that doubles. It has the same share of
+the streams then. The others do not notice.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+import time
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import structlog
+
+from optipmb_service import __version__
+from optipmb_service.app.aggregate import AggregateView
+from optipmb_service.app.loops import StopRequest, beat, say_ready, unless
+from optipmb_service.app.monitoring import monitoring
+from optipmb_service.app.private_folder import private_folder
+from optipmb_service.app.worker_process import WorkerProcess
+from optipmb_service.runtime.ports import HttpError, TransportError
+from optipmb_service.zenoh import Transport
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from optipmb_service.settings import Settings
+
+log = structlog.get_logger("optipmb_service")
+
+FIRST_PAUSE_S: Final = 0.5
+LONGEST_PAUSE_S: Final = 30.0
+STEADY_S: Final = 60.0
+"""A worker that has lived for so long is taken for sound: if it dies, it is started again at once."""
+
+END_S: Final = 3.0
+"""Beyond the grace, how long workers may take to end before they are killed."""
+
+OVERLAP_S: Final = 0.25
+"""How much later than the new worker of a stream the old one may receive a message, without a loss."""
+
+ORDER_S: Final = 9.0
+"""Longest wait for an order to be carried out."""
+
+State = Literal["starting", "ready", "down"]
+
+
+class Supervisor:
+    """The workers of one instance.
+
+    Args:
+        settings: what the workers run with, but for their names.
+        asked: whether the end was asked for.
+        lock: file by which the workers compile one after the other.
+    """
+
+    def __init__(self, settings: Settings, asked: StopRequest, lock: Path) -> None:
+        self.count = settings.workers
+        self.states: list[State] = ["down"] * self.count
+        self.restarts = [0] * self.count
+        self.began = False
+        """Whether all workers have been ready at once."""
+        self.failed: int | None = None
+        """Exit status of a worker that could not even start."""
+        self._settings = settings
+        self._asked = asked
+        self._lock = lock
+        self._children: list[WorkerProcess | None] = [None] * self.count
+        self._tasks: list[asyncio.Task[None]] = []
+        self._changed = asyncio.Event()
+        self._moved: dict[str, int] = {}
+        self._orders: dict[int, asyncio.Future[None]] = {}
+        self._number = 0
+        self._moving = asyncio.Lock()
+
+    async def start(self) -> bool:
+        """Start the workers and wait until all are ready; False when that will not be."""
+        self._tasks = [asyncio.create_task(self._kept(index)) for index in range(self.count)]
+        stop = asyncio.create_task(self._asked.wait())
+        while not self._over and any(state != "ready" for state in self.states):
+            self._changed.clear()
+            change = asyncio.create_task(self._changed.wait())
+            await asyncio.wait({change, stop}, return_when=asyncio.FIRST_COMPLETED)
+            change.cancel()
+        stop.cancel()
+        self.began = not self._over
+        return self.began
+
+    async def stop(self) -> bool:
+        """End the workers; False when one had to be killed."""
+        if not self._asked.is_set():
+            self._asked.ask("failed start")
+        for child in self._children:
+            if child is not None:
+                child.end()
+        if not self._tasks:
+            return True
+        _, late = await asyncio.wait(self._tasks, timeout=self._settings.grace_s + END_S)
+        for child in self._children:
+            if child is not None:
+                child.kill()
+        if late:
+            await asyncio.wait(late)
+        return not late
+
+    async def move(self, stream: str, worker: int) -> None:
+        """Give a stream to a worker, from whichever has it.
+
+        The new one is told first: it keeps what arrives from then on. For a moment both receive, so that a message
+        which reaches one of them later than the other is not lost between them. Then the old one gives the stream up
+        after what it has received, and the new one goes on from there.
+
+        Raises:
+            TimeoutError: a worker did not follow; all are told nevertheless.
+        """
+        async with self._moving:
+            self._moved[stream] = worker
+            others = [index for index in range(self.count) if index != worker]
+            await self._ordered([worker], stream, worker)
+            await asyncio.sleep(OVERLAP_S)
+            await self._ordered(others, stream, worker)
+            log.info("stream_moved", stream=stream, to=worker)
+
+    async def _ordered(self, indices: list[int], stream: str, worker: int) -> None:
+        waits = []
+        for index in indices:
+            child = self._children[index]
+            if child is None or self.states[index] == "down":
+                continue  # it learns of it at its start
+            self._number += 1
+            waits.append(asyncio.get_running_loop().create_future())
+            self._orders[self._number] = waits[-1]
+            child.order(order=self._number, stream=stream, worker=worker)
+        if waits:
+            async with asyncio.timeout(ORDER_S):
+                await asyncio.gather(*waits)
+
+    @property
+    def _over(self) -> bool:
+        return self._asked.is_set() or self.failed is not None
+
+    async def _kept(self, index: int) -> None:
+        """Have a worker run until the end."""
+        folder = self._settings.folder  # one for all, wherever the workers connect
+        settings = self._settings.model_copy(
+            update={"instance": f"{self._settings.instance}-w{index}", "store": str(folder) if folder else "none"}
+        )
+        pause_s = 0.0
+        while not self._over:
+            child = self._children[index] = WorkerProcess(index, lambda event: self._take_in(index, event))
+            self._set(index, "starting")
+            began = time.monotonic()
+            status = await child.run(settings, self.count, self._moved, self._lock)
+            lived_s = time.monotonic() - began
+            never_ready = self.states[index] != "ready"
+            self._set(index, "down")
+            if self._asked.is_set():
+                return
+            if never_ready and not self.began:
+                self.failed = status or 1
+                self._changed.set()
+                return
+            pause_s = 0.0 if lived_s > STEADY_S else min(LONGEST_PAUSE_S, max(FIRST_PAUSE_S, 2 * pause_s))
+            again_s = 0.0 if self.restarts[index] == 0 else pause_s
+            self.restarts[index] += 1
+            log.error("worker_ended", worker=index, status=status, again_s=again_s)
+            if again_s:
+                await self._asked.wait(again_s)
+
+    def _take_in(self, index: int, event: dict[str, Any]) -> None:
+        match event:
+            case {"event": "ready"}:
+                self._set(index, "ready")
+            case {"event": "done", "order": int(number)} if (waits := self._orders.pop(number, None)) is not None:
+                if not waits.done():
+                    waits.set_result(None)
+
+    def _set(self, index: int, state: State) -> None:
+        self.states[index] = state
+        self._changed.set()
+
+
+async def supervise(settings: Settings) -> int:
+    """Run the service as worker processes until SIGINT or SIGTERM.
+
+    Returns:
+        The exit status: 0, 1 when the network could not be used, or that of a worker which could not start.
+    """
+    asked = StopRequest()
+    log.info("starting", instance=settings.instance, version=__version__, workers=settings.workers)
+    with private_folder() as folder:
+        socket = f"unixsock-stream/{folder / 'router'}"
+        own, workers = divided(settings, socket)
+        if not settings.is_router:
+            log.info("connecting", endpoints=settings.connect)
+        try:
+            transport = await unless(asked, lambda: Transport(own))
+            if transport is None:
+                return 0
+            return await _supervised(settings, workers, transport, asked, folder / "lock")
+        except (TransportError, HttpError) as error:
+            print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+            return 1
+
+
+async def _supervised(
+    settings: Settings, workers: Settings, transport: Transport, asked: StopRequest, lock: Path
+) -> int:
+    """Run the workers until the end is asked for.
+
+    Raises:
+        HttpError: the address cannot be listened on.
+    """
+    supervisor = Supervisor(workers, asked, lock)
+    view = AggregateView(settings, supervisor, transport, asyncio.get_running_loop())
+    beating = asyncio.create_task(beat(view))
+    ended = True
+    try:
+        with monitoring(settings, view):
+            if await supervisor.start():
+                transport.watch()
+                transport.serve_service(view.answer)
+                transport.announce()
+                say_ready(settings)
+                log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+                await asked.wait()
+            view.ends()
+            ended = await supervisor.stop()
+    finally:
+        beating.cancel()
+        with contextlib.suppress(Exception):
+            await asyncio.to_thread(transport.close)
+    log.info("stopped", drained=ended)
+    return supervisor.failed or 0
+
+
+def divided(settings: Settings, socket: str) -> tuple[Settings, Settings]:
+    """Return the settings of the parent and those of its workers, which have no names yet.
+
+    Args:
+        settings: of the whole.
+        socket: endpoint where the parent's router listens for the workers, where it is one.
+    """
+    router = settings.is_router
+    own = settings.model_copy(update={"listen": (*settings.endpoints, socket) if router else settings.endpoints})
+    workers = settings.model_copy(
+        update={
+            "router": False,
+            "listen": (),
+            "connect": (socket,) if router else settings.connect,
+            "http": "",
+            # Its name follows from the endpoints, and those of the workers are the parent's own affair.
+            "store": "none" if settings.folder is None else str(settings.folder),
+            "zenoh_config": None if router else settings.zenoh_config,
+        }
+    )
+    return own, workers

@@ -1,0 +1,1 @@
+"""Which process has which stream, and where checkpoints are kept."""

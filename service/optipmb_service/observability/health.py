@@ -1,0 +1,105 @@
+"""How the process is, for those who ask from outside: from before the service exists until after its end.
+
+The control loop beats; whoever asks sees for how long it has not. States: `starting`, then what the service says
+(`ready`, or `degraded` when it works with a part missing), then `stopping`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
+
+from optipmb_service.observability import collectors
+from optipmb_service.observability.metrics import Metrics
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import optipmb_schemas as schemas
+
+
+BEAT_S: Final = 0.5
+STUCK_S: Final = 10.0
+"""A loop that has not turned for so long is taken for stuck."""
+
+USABLE: Final = frozenset({"ready", "degraded"})
+
+
+class StatusSource(Protocol):
+    """What works, seen from here."""
+
+    @property
+    def state(self) -> str:
+        """How it is, as in the status."""
+
+    def status(self) -> schemas.ServiceStatus | None:
+        """Return its report; None when it makes none."""
+
+
+@runtime_checkable
+class LiveSource(Protocol):
+    """What has streams that can be looked at."""
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
+        """Hand over what comes on a stream to a viewer, until the result is called."""
+
+
+class ProcessHealth:
+    """Implements `http.Source`.
+
+    Args:
+        instance: name of the instance.
+    """
+
+    def __init__(self, instance: str) -> None:
+        self.metrics = Metrics()
+        self._service: StatusSource | None = None
+        self._state = "starting"
+        self._lock = threading.Lock()
+        self._beat_ns = time.monotonic_ns()
+        self.metrics.add(lambda: collectors.of_process(instance, self.state()))
+
+    def beat(self) -> None:
+        """Say that the control loop turns."""
+        self._beat_ns = time.monotonic_ns()
+
+    def report(self, service: StatusSource) -> None:
+        """Say what this one says, from now on."""
+        with self._lock:
+            self._service = service
+
+    def ends(self) -> None:
+        """Report the end."""
+        self._state = "stopping"
+
+    def beat_age_s(self) -> float:
+        """Return the seconds since the control loop last turned."""
+        return (time.monotonic_ns() - self._beat_ns) / 1e9
+
+    def alive(self) -> bool:
+        """Tell whether the control loop turns."""
+        return self.beat_age_s() < STUCK_S
+
+    def state(self) -> str:
+        """Return the state of the process."""
+        service = self._service
+        return self._state if service is None or self._state == "stopping" else service.state
+
+    def ready(self) -> bool:
+        """Tell whether the service can be used."""
+        return self.state() in USABLE
+
+    def status(self) -> schemas.ServiceStatus | None:
+        """Return the service's own report; None while it starts."""
+        service = self._service
+        return None if service is None else service.status()
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
+        """Hand over what comes on a stream to a viewer, until the result is called; None while the service starts."""
+        service = self._service
+        return service.tap(stream, receive) if isinstance(service, LiveSource) else None
+
+    def text(self) -> bytes:
+        """Return the metrics in Prometheus' text format."""
+        return self.metrics.text()

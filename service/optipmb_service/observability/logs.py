@@ -1,0 +1,136 @@
+"""Logs: one line per event that an operator can act on, on stderr; stdout holds nothing but the ready line."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+import time
+from collections import Counter
+from typing import TYPE_CHECKING, Final, Literal
+
+import structlog
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from structlog.typing import EventDict, Processor, WrappedLogger
+
+EVENTS: Final = {
+    "starting": "The service compiles or loads its kernels; the first start after an installation takes a minute.",
+    "connecting": "As a client it waits for a router; nothing else happens until one answers. Check `connect`.",
+    "http": "Health, metrics and the live page are served at `address`.",
+    "ready": "Streams and queries are served. stdout has the ready line.",
+    "unknown_environment": "Variables that start with `OPTIPMB_` and are no setting: usually a typing error.",
+    "peer_connected": "A node, router or service is linked to this process.",
+    "peer_lost": "That link is gone. A client links again by itself and recovers what the caches still hold.",
+    "session_opened": "A stream sent its first valid message, or parameters were set for it.",
+    "session_restored": "A stream's session goes on from its checkpoint; what it missed is asked of the publishers.",
+    "session_begun": "A density began: `first` frame, `publisher` restarted with a jump, a `jump` of stamps, `reset`, "
+    "`parameters`, a `pose` far off, the end of a `quarantine`. Repeated jumps: check the sensor's clock.",
+    "session_quarantined": "Tracking a stream raised `error`: its frames are refused until a reset or another start of "
+    "the publisher. Its last frames are saved; report them.",
+    "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` to another worker, or `superseded` "
+    "by another instance.",
+    "checkpoint_torn": "A checkpoint cannot be read; it is set aside and the one before it is used.",
+    "checkpoint_refused": "Another instance has taken the stream over; this one's checkpoint was not written.",
+    "store_failed": "Checkpoints cannot be written (disk full, read-only?): tracking goes on, the state is `degraded`.",
+    "store_back": "Checkpoints are written again.",
+    "write_lease_lapsed": "This process was frozen, starved or cut off: nothing is published until it has looked"
+    " whether another instance took over.",
+    "write_lease_renewed": "It has looked; what is still its own goes on.",
+    "stream_stale": "No frame for `stale_s`: check the publisher.",
+    "stream_back": "Frames came again.",
+    "problem": "Something was refused or lost; `count` equal ones since the last line. See the problems below.",
+    "claim_failed": "The tracks of a stream cannot be published; the network is closing.",
+    "publish_failed": "Tracks could not be handed to Zenoh; the network is closing.",
+    "reply_failed": "Who asked was gone before the answer.",
+    "query": "A query was answered (level debug).",
+    "internal_error": "A fault of the service, with its traceback: report it. The stream goes on.",
+    "worker_started": "The parent has started a worker process.",
+    "worker_ended": "A worker process has ended by itself, with this status (below 0: killed by this signal). It is"
+    " started again after `again_s`, and its streams come back; until then the state is `degraded`.",
+    "worker_killed": "A worker process did not end in time.",
+    "parent_gone": "A worker noticed that its parent has died, and ends.",
+    "stream_moved": "An operator gave the stream to another worker.",
+    "stop_asked": "SIGINT or SIGTERM came, or the parent ends its worker; it ends within two seconds.",
+    "stop_asked_again": "Another signal came; it changes nothing.",
+    "stopped": "The end. `drained` is false when a step was abandoned because it took too long.",
+}
+"""Every event that is logged, and what an operator makes of it."""
+
+
+BURST: Final = 50
+"""Lines of one event that are written at once."""
+
+LINES_PER_SECOND: Final = 5.0
+"""Lines of one event that are written in the long run."""
+
+
+class Limiter:
+    """Drops lines of an event that comes too often; the next one that is written says how many (`suppressed`).
+
+    A thousand streams that fall silent together must neither fill a disk nor hide what else happens.
+
+    Args:
+        clock: seconds, monotonic.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._left: dict[str, tuple[float, float]] = {}
+        self._dropped: Counter[str] = Counter()
+
+    def __call__(self, _logger: WrappedLogger, _method: str, event: EventDict) -> EventDict:
+        """Let a line pass, or drop it.
+
+        Raises:
+            structlog.DropEvent: it is one too many.
+        """
+        name = str(event.get("event"))
+        now = self._clock()
+        with self._lock:
+            left, before = self._left.get(name, (float(BURST), now))
+            left = min(BURST, left + (now - before) * LINES_PER_SECOND)
+            self._left[name] = (left - 1 if left >= 1 else left, now)
+            if left < 1:
+                self._dropped[name] += 1
+                raise structlog.DropEvent
+            if suppressed := self._dropped.pop(name, 0):
+                event["suppressed"] = suppressed
+        return event
+
+
+def configure(form: Literal["console", "json"], level: str, worker: int | None = None) -> None:
+    """Send the log lines to stderr, as coloured text on a terminal, plain text elsewhere, or JSON.
+
+    Args:
+        form: text or JSON.
+        level: the least that is logged.
+        worker: number of the worker process, written into every line; None: it is none.
+    """
+    processors: list[Processor] = [] if worker is None else [lambda _logger, _name, event: {**event, "worker": worker}]
+    processors += [
+        Limiter(),
+        structlog.contextvars.merge_contextvars,
+        structlog.processors.add_log_level,
+        structlog.processors.TimeStamper(fmt="iso", utc=True),
+    ]
+    if form == "json":
+        processors += [structlog.processors.dict_tracebacks, structlog.processors.JSONRenderer()]
+    else:
+        plain = structlog.dev.plain_traceback
+        colors = sys.stderr.isatty()
+        processors.append(structlog.dev.ConsoleRenderer(colors=colors, pad_event_to=0, exception_formatter=plain))
+    structlog.configure(
+        processors=processors,
+        wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
+        logger_factory=structlog.WriteLoggerFactory(file=sys.stderr),
+    )
+
+
+def unknown_environment(names: tuple[str, ...]) -> None:
+    """Log environment variables that look like settings and are none: usually a typing error."""
+    if names:
+        structlog.get_logger("optipmb_service").warning("unknown_environment", names=names)

@@ -1,0 +1,153 @@
+"""Reports problems to people and programs, at a bounded rate whatever arrives.
+
+The first problem of a kind is published and logged at once; what follows becomes one summary a second that counts them
+all. Kinds that come and go without end (garbage on ever new keys) share a total rate. Nothing here reads a clock or
+sends anything.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections import Counter, OrderedDict, deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import optipmb_schemas as schemas
+
+MAX_KINDS: Final = 4096
+"""Kinds of problems remembered for their rate."""
+
+NEWEST: Final = 20
+"""Problems kept for the status."""
+
+SECOND: Final = 1_000_000_000
+PUBLISH_EVERY_NS: Final = SECOND
+LOG_EVERY_NS: Final = 10 * SECOND
+PUBLISHED_PER_SECOND: Final = 200
+LOGGED_PER_SECOND: Final = 20
+
+
+@dataclass(slots=True)
+class _Kind:
+    """What is known of one kind: when it was last told, and what has gathered since."""
+
+    published_ns: int
+    logged_ns: int
+    gathered: int = 0
+    unlogged: int = 0
+    last: schemas.Problem | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Summary:
+    """A problem, and how many it stands for where it is published and where it is logged; 0: it is not."""
+
+    problem: schemas.Problem
+    published: int
+    logged: int
+
+
+class _Budget:
+    """At most so many a second, over all kinds."""
+
+    def __init__(self, per_second: int) -> None:
+        self._per_second = per_second
+        self._second = -1
+        self._used = 0
+
+    def take(self, now_ns: int) -> bool:
+        second = now_ns // SECOND
+        if second != self._second:
+            self._second, self._used = second, 0
+        self._used += 1
+        return self._used <= self._per_second
+
+
+class ProblemReporter:
+    """Takes problems from any thread.
+
+    Args:
+        publish: sends a problem on its stream's key.
+        log: writes a line about a problem; the second argument is how many it stands for.
+    """
+
+    def __init__(self, publish: Callable[[schemas.Problem], None], log: Callable[[schemas.Problem, int], None]) -> None:
+        self._publish = publish
+        self._log = log
+        self._lock = threading.Lock()
+        self._kinds: OrderedDict[tuple[str, str, str], _Kind] = OrderedDict()
+        self._newest: deque[schemas.Problem] = deque(maxlen=NEWEST)
+        self._published = _Budget(PUBLISHED_PER_SECOND)
+        self._logged = _Budget(LOGGED_PER_SECOND)
+        self._counts: Counter[str] = Counter()
+
+    def report(self, problem: schemas.Problem, now_ns: int) -> None:
+        """Tell of a problem now or, when its kind was told of just before, in the next summary."""
+        # Elements of an array are one kind. Classes are few and each is told of once, so each is a kind of its own.
+        detail = problem.received if problem.code == "unknown_class" else re.sub(r"\[\d+\]", "[]", problem.path)
+        key = (problem.stream, problem.code, detail)
+        with self._lock:
+            self._counts[problem.code] += problem.count
+            kind = self._kinds.get(key)
+            if kind is None:
+                kind = _Kind(published_ns=now_ns - PUBLISH_EVERY_NS, logged_ns=now_ns - LOG_EVERY_NS)
+                self._kinds[key] = kind
+                if len(self._kinds) > MAX_KINDS:
+                    self._kinds.popitem(last=False)
+            kind.gathered += problem.count
+            kind.unlogged += problem.count
+            kind.last = problem
+            told = self._tell(kind, now_ns)
+        self._send(told)
+
+    def flush(self, now_ns: int) -> None:
+        """Send the summaries that are due; to be called about once a second."""
+        due: list[_Summary | None] = []
+        with self._lock:
+            for key, kind in list(self._kinds.items()):
+                if kind.gathered or kind.unlogged:
+                    due.append(self._tell(kind, now_ns))
+                elif now_ns - kind.logged_ns >= LOG_EVERY_NS:
+                    del self._kinds[key]
+        for told in due:
+            self._send(told)
+
+    def newest(self) -> tuple[schemas.Problem, ...]:
+        """Return the newest problems, the oldest first."""
+        with self._lock:
+            return tuple(self._newest)
+
+    def counts(self) -> dict[str, int]:
+        """Return how many problems there were since the start, by code."""
+        with self._lock:
+            return dict(self._counts)
+
+    def _tell(self, kind: _Kind, now_ns: int) -> _Summary | None:
+        """Take what may be told of a kind now; called with the lock."""
+        problem = kind.last
+        publish = bool(kind.gathered) and now_ns - kind.published_ns >= PUBLISH_EVERY_NS
+        log = bool(kind.unlogged) and now_ns - kind.logged_ns >= LOG_EVERY_NS
+        publish = publish and self._published.take(now_ns)
+        log = log and self._logged.take(now_ns)
+        if problem is None or not (publish or log):
+            return None
+        told = _Summary(problem, published=kind.gathered if publish else 0, logged=kind.unlogged if log else 0)
+        if publish:
+            kind.gathered, kind.published_ns = 0, now_ns
+            self._newest.append(told.problem.model_copy(update={"count": told.published}))
+        if log:
+            kind.unlogged, kind.logged_ns = 0, now_ns
+        return told
+
+    def _send(self, told: _Summary | None) -> None:
+        """Publish and log outside the lock: both may take a while."""
+        if told is None:
+            return
+        if told.published:
+            self._publish(told.problem.model_copy(update={"count": told.published}))
+        if told.logged:
+            self._log(told.problem, told.logged)

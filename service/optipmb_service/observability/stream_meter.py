@@ -1,0 +1,79 @@
+"""Figures of a stream that an operator reads: rate, latency, age. The clock is handed in, monotonic nanoseconds."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Final
+
+import optipmb_schemas as schemas
+
+LATENCIES: Final = 512
+ARRIVALS: Final = 64
+
+
+class StreamMeter:
+    """Written by the worker of a stream, read by whoever asks."""
+
+    def __init__(self, now_ns: int) -> None:
+        self._lock = threading.Lock()
+        self._latencies: deque[int] = deque(maxlen=LATENCIES)
+        self._arrivals: deque[int] = deque(maxlen=ARRIVALS)
+        self.active_ns = now_ns
+        """When the last valid message arrived."""
+        self.frame_ns: int | None = None
+        """When the last frame arrived."""
+
+    def arrived(self, now_ns: int, *, frame: bool) -> None:
+        """Note a valid message."""
+        self.active_ns = max(self.active_ns, now_ns)
+        if frame:
+            with self._lock:
+                self._arrivals.append(now_ns)
+                self.frame_ns = now_ns
+
+    def published(self, latency_ns: int) -> None:
+        """Note the time from the arrival of a frame to the publication of its tracks."""
+        with self._lock:
+            self._latencies.append(latency_ns)
+
+    def rate_hz(self, now_ns: int) -> float:
+        """Return frames per second over the last arrivals, falling while none comes; 0 with fewer than two."""
+        with self._lock:
+            count = len(self._arrivals)
+            first, last = (self._arrivals[0], self._arrivals[-1]) if count else (0, 0)
+        if count < 2 or last <= first:  # noqa: PLR2004 - a rate needs two frames
+            return 0.0
+        silent = (now_ns - last) * (count - 1) > 3 * (last - first)
+        return (count - 1) * 1e9 / ((now_ns if silent else last) - first)
+
+    def latency_ms(self) -> tuple[float, float]:
+        """Return the median and the 99th percentile over the last frames; zeros without any."""
+        with self._lock:
+            values = sorted(self._latencies)
+        if not values:
+            return 0.0, 0.0
+        return values[len(values) // 2] / 1e6, values[min(len(values) - 1, len(values) * 99 // 100)] / 1e6
+
+    def age_s(self, now_ns: int) -> float | None:
+        """Return the seconds since the last frame; None before the first."""
+        return None if self.frame_ns is None else max(0.0, (now_ns - self.frame_ns) / 1e9)
+
+    def summary(self, state: schemas.SessionState, now_ns: int, *, stale: bool) -> schemas.SessionSummary:
+        """Return the line of the service's status for a stream in a state; may be called by any thread."""
+        p50, p99 = self.latency_ms()
+        return schemas.SessionSummary(
+            stream=state.stream,
+            profile=state.profile,
+            state="stale" if stale else state.state,
+            rate_hz=self.rate_hz(now_ns),
+            latency_p50_ms=p50,
+            latency_p99_ms=p99,
+            frames=state.frames,
+            refused=state.refused,
+            shed=state.shed,
+            gaps=state.gaps,
+            tracks=state.tracks,
+            queue=state.queue,
+            age_s=self.age_s(now_ns),
+        )

@@ -1,0 +1,105 @@
+"""What the actors of a service share, and what they need of those around them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import optipmb_schemas as schemas
+
+    import optipmb
+    from optipmb_service.cluster.ownership import Role
+    from optipmb_service.observability.metrics import Metrics
+    from optipmb_service.observability.problem_reporter import ProblemReporter
+    from optipmb_service.runtime.persistence import Persistence
+    from optipmb_service.runtime.ports import MessageSink
+    from optipmb_service.runtime.takeover_buffer import ByteBudget
+    from optipmb_service.session.session import Session
+    from optipmb_service.session.values import Lineage, Policy
+
+
+class Actor(Protocol):
+    """An actor, as those around it know it."""
+
+    @property
+    def stream(self) -> str:
+        """Its stream, `site/node/sensor`."""
+
+    def wake(self) -> None:
+        """Send a worker though nothing came."""
+
+    def work(self) -> bool:
+        """Take some of what waits; True: come again."""
+
+
+class Ownership(Protocol):
+    """What an actor needs of the coordinator."""
+
+    def role(self, stream: str) -> Role:
+        """Return what this instance is to a stream."""
+
+    def may_write(self, stream: str) -> bool:
+        """Whether this instance may publish and store for a stream now."""
+
+    def elsewhere(self, stream: str) -> bool:
+        """Whether another instance tracks a stream."""
+
+    def request(self, stream: str) -> None:
+        """Ask for a stream."""
+
+    def release(self, stream: str) -> None:
+        """Give up a stream."""
+
+
+@dataclass(frozen=True)
+class ActorContext:
+    """What all actors share.
+
+    Attributes:
+        instance: name of the service.
+        limits: bounds on messages.
+        policy: waiting and restarting of sessions.
+        queue_frames: most frames waiting per stream.
+        queue_clouds: most clouds waiting per stream.
+        outlet: where results go.
+        problem reporter: where problems go.
+        parameters_of: profile of a stream.
+        coordinator: says which streams this instance owns.
+        checkpoint writer: where checkpoints go and come from.
+        standby_ns: how long packets wait for a takeover.
+        budget: bytes that may wait for takeovers, over all streams.
+        dump: saves what is needed to see an error of a session again; returns the file.
+        room: whether a further session has room.
+        admit: asked before a session begins; returns what the stream had before, None when there is no room.
+        release: called when a session has ended.
+        discard: called when an actor without a session has nothing left to do.
+        submit: sends a worker to an actor.
+        arm: has `wake` of an actor called at a monotonic time (ns).
+        metrics: counts what is published.
+        tracker: makes trackers.
+    """
+
+    instance: str
+    limits: schemas.Limits
+    policy: Policy
+    queue_frames: int
+    queue_clouds: int
+    sink: MessageSink
+    reporter: ProblemReporter
+    parameters_of: Callable[[str], optipmb.Parameters]
+    coordinator: Ownership
+    persistence: Persistence
+    standby_ns: int
+    budget: ByteBudget
+    dump: Callable[[str, bytes], str]
+    room: Callable[[], bool]
+    admit: Callable[[str], Lineage | None]
+    release: Callable[[Session], None]
+    discard: Callable[[Actor], None]
+    submit: Callable[[Actor], None]
+    arm: Callable[[Actor, int], None]
+    metrics: Metrics
+    tracker: Callable[[optipmb.Parameters], Any]

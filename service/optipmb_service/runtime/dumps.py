@@ -1,0 +1,44 @@
+"""Where the dumps of sessions whose step raised are kept."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from pathlib import Path
+from typing import Final
+
+SUFFIX: Final = ".dump"
+
+
+def save(folder: Path, stream: str, dump: bytes, *, most: int) -> Path:
+    """Write a dump into a folder, whole or not at all; the oldest dumps go when there are more than `most`.
+
+    Returns:
+        The file: the name of the stream and a number that counts up.
+
+    Raises:
+        OSError: the folder cannot be written to.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    number = 1 + max((_number(file) for file in folder.glob(f"*{SUFFIX}")), default=0)
+    name = re.sub(r"[^A-Za-z0-9_.-]", "_", stream)
+    handle, temporary = tempfile.mkstemp(dir=folder)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(dump)
+            file.flush()
+            os.fsync(file.fileno())
+        target = folder / f"{name}-{number:06d}{SUFFIX}"
+        Path(temporary).replace(target)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    for old in sorted(folder.glob(f"*{SUFFIX}"), key=_number)[:-most]:
+        old.unlink(missing_ok=True)
+    return target
+
+
+def _number(file: Path) -> int:
+    match = re.search(r"-(\d+)$", file.name.removesuffix(SUFFIX))
+    return int(match[1]) if match else 0

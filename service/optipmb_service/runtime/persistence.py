@@ -1,0 +1,246 @@
+"""Checkpoints on their way to the store, off the path of the frames: one thread encodes and writes them all.
+
+A worker gives references to values that never change, which costs it microseconds. The checkpoint writer waits a moment
+before it
+writes: what a checkpoint contains must have left this process as tracks, or a kill between the two would swallow them
+(what is tracked again after a restore is published again, what the checkpoint holds is not). Then it writes all
+sessions that changed in one transaction.
+
+A store that fails (disk full, read-only, gone) costs durability and nothing else: tracking goes on, the status of the
+service is `degraded`, and every interval tries again with the newest state.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING, Final, Protocol, TypeVar
+
+import structlog
+
+from optipmb_service.cluster.store import SqliteStore, Store, StoreError, load_newest
+from optipmb_service.session.checkpoint import Checkpoint, CheckpointError, decode_checkpoint, encode_checkpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from optipmb_service.settings import Settings
+
+log = structlog.get_logger("optipmb_service")
+
+_T = TypeVar("_T")
+
+STORE_FILE: Final = "sessions.db"
+
+SETTLE_S: Final = 0.25
+"""Between a checkpoint and its writing, time for the tracks to leave."""
+
+
+PAUSE_S: Final = 0.003
+"""Between two checkpoints that are encoded; less where there are so many that it would take half the interval."""
+
+
+class Persistence(Protocol):
+    """What the service needs of a checkpoint writer."""
+
+    @property
+    def failure(self) -> str:
+        """Why the store fails at present; empty while it does not."""
+
+    @property
+    def durable(self) -> bool:
+        """Whether what is put is there after a restart."""
+
+    @property
+    def written(self) -> int:
+        """Checkpoints written since the start."""
+
+    @property
+    def complete_ns(self) -> int | None:
+        """Monotonic time at which the store last had all that it should; None when nothing is to be kept."""
+
+    def start(self, gather: Callable[[], None]) -> None:
+        """Begin the rounds; `gather` has every session that changed give its checkpoint to `put`, soon."""
+
+    def put(self, checkpoint: Checkpoint, then: Callable[[], None] | None = None) -> None:
+        """Have a checkpoint written, and `then` called when that was tried."""
+
+    def recall(self, stream: str, restore: Callable[[Checkpoint], _T]) -> _T | None:
+        """Return what `restore` makes of the newest checkpoint of a stream, None without one."""
+
+    def close(self, timeout: float) -> None:
+        """Write what is pending and end."""
+
+
+class NoPersistence:
+    """Keeps nothing.
+
+    Args:
+        failure: why nothing can be kept; empty when nothing is to be.
+    """
+
+    durable = False
+    written = 0
+
+    def __init__(self, failure: str = "") -> None:
+        self.failure = failure
+        self.complete_ns = time.monotonic_ns() if failure else None
+
+    def start(self, gather: Callable[[], None]) -> None:
+        """Do without rounds."""
+
+    def put(self, checkpoint: Checkpoint, then: Callable[[], None] | None = None) -> None:
+        """Forget the checkpoint."""
+        del checkpoint
+        if then is not None:
+            then()
+
+    def recall(self, stream: str, restore: Callable[[Checkpoint], _T]) -> _T | None:  # noqa: ARG002 - see Persistence
+        """Remember nothing."""
+        return None
+
+    def close(self, timeout: float) -> None:
+        """Nothing is open."""
+
+
+class CheckpointWriter:
+    """Writes and reads the checkpoints of one process.
+
+    Args:
+        store: where they go.
+        interval_s: time between two rounds.
+        may_write: whether this process owns a stream.
+    """
+
+    durable = True
+
+    def __init__(self, store: Store, interval_s: float, may_write: Callable[[str], bool]) -> None:
+        self._store = store
+        self._interval_s = interval_s
+        self._gather: Callable[[], None] = lambda: None
+        self._may_write = may_write
+        self._lock = threading.Lock()
+        self._pending: dict[str, Checkpoint] = {}
+        self._thens: list[Callable[[], None]] = []
+        self._hurry = threading.Event()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="checkpoints", daemon=True)
+        self.failure = ""
+        """Why the store fails at present; empty while it does not."""
+        self.written = 0
+        """Checkpoints written since the start."""
+        self.complete_ns = time.monotonic_ns()
+        """When the store last had all that it should, monotonic."""
+
+    def start(self, gather: Callable[[], None]) -> None:
+        """Begin the rounds."""
+        self._gather = gather
+        self._thread.start()
+
+    def put(self, checkpoint: Checkpoint, then: Callable[[], None] | None = None) -> None:
+        """Have a checkpoint written in this round; with `then`, soon, and `then` called when that was tried."""
+        with self._lock:
+            self._pending[checkpoint.stream] = checkpoint
+            if then is not None:
+                self._thens.append(then)
+        if then is not None:
+            self._hurry.set()
+
+    def recall(self, stream: str, restore: Callable[[Checkpoint], _T]) -> _T | None:
+        """Make a stream this process's own in the store; return what `restore` makes of its newest whole checkpoint.
+
+        None when there is none, and also when the store fails: then the stream begins anew.
+        """
+        with self._lock:
+            pending = self._pending.get(stream)
+        try:
+            self._store.claim([stream])
+            if pending is not None:
+                return restore(pending)
+            return load_newest(
+                self._store,
+                stream,
+                lambda data: restore(decode_checkpoint(data)),
+                CheckpointError,
+                lambda reason: log.warning("checkpoint_torn", stream=stream, reason=reason),
+            )
+        except StoreError as error:
+            self._failed(error)
+            return None if pending is None else restore(pending)
+
+    def close(self, timeout: float) -> None:
+        """Write what is pending and end; to be called when nothing is tracked any more."""
+        self._ended.set()
+        self._hurry.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout)
+        self._write()
+        self._store.close()
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            self._hurry.wait(max(0.0, self._interval_s - SETTLE_S))
+            self._hurry.clear()
+            self._gather()
+            if not self._ended.wait(SETTLE_S):
+                self._write()
+
+    def _write(self) -> None:
+        """Write all that is pending; what the store refuses stays pending."""
+        with self._lock:
+            taken, self._pending = self._pending, {}
+            thens, self._thens = self._thens, []
+        mine = {stream: checkpoint for stream, checkpoint in taken.items() if self._may_write(stream)}
+        try:
+            lost = self._store.save(self._encoded(mine)) if mine else ()
+        except StoreError as error:
+            self._failed(error)
+            with self._lock:
+                self._pending = mine | self._pending
+        except Exception:
+            log.exception("internal_error", thread="checkpoints")
+        else:
+            self.written += len(mine) - len(lost)
+            if mine or not self.failure:
+                self.complete_ns = time.monotonic_ns()
+            if mine and self.failure:
+                self.failure = ""
+                log.info("store_back")
+            for stream in lost:
+                log.warning("checkpoint_refused", stream=stream)
+        for then in thens:
+            then()
+
+    def _encoded(self, checkpoints: Mapping[str, Checkpoint]) -> dict[str, bytes]:
+        """Encode one after the other, with pauses between them.
+
+        Encoding holds the interpreter's lock for a millisecond. Forty in a row are forty milliseconds in which frames
+        only get what the interpreter takes away from this thread; a pause gives the lock to whoever waits for it.
+        """
+        pause_s = 0.0 if self._ended.is_set() else min(PAUSE_S, self._interval_s / 2 / len(checkpoints))
+        encoded = {}
+        for stream, one in checkpoints.items():
+            encoded[stream] = encode_checkpoint(one)
+            if pause_s:
+                self._ended.wait(pause_s)
+        return encoded
+
+    def _failed(self, error: StoreError) -> None:
+        if not self.failure:
+            log.error("store_failed", error=str(error))
+        self.failure = str(error)
+
+
+def open_persistence(settings: Settings, may_write: Callable[[str], bool]) -> Persistence:
+    """Return the checkpoint writer; where its store cannot be opened, one that keeps nothing and says why."""
+    folder = settings.folder
+    if folder is None:
+        return NoPersistence()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        store = SqliteStore(folder / STORE_FILE, settings.instance)
+    except (OSError, StoreError) as error:
+        # Tracking without memory is better than none; the status says that it is so.
+        log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
+        return NoPersistence(str(error))
+    return CheckpointWriter(store, settings.checkpoint_s, may_write)

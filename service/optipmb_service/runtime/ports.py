@@ -1,0 +1,89 @@
+"""What the service needs of the network, as plain values and protocols; `transport` implements them over Zenoh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    import optipmb_schemas as schemas
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """A message as it arrived, not decoded.
+
+    Attributes:
+        key: where it was published.
+        payload: its bytes; None when they are more than the limit and were not taken over.
+        size: number of bytes.
+        encoding: the Zenoh encoding, as a text.
+        wall_ns: arrival by the wall clock, ns since 1970; only reported, never decided by.
+        now_ns: arrival by the monotonic clock, ns.
+    """
+
+    key: str
+    payload: bytes | None
+    size: int
+    encoding: str
+    wall_ns: int
+    now_ns: int
+
+
+class Publisher(Protocol):
+    """The publisher of a stream's tracks."""
+
+    def publish(self, payload: bytes) -> None:
+        """Send encoded tracks; never waits for a receiver."""
+
+    def release(self) -> None:
+        """Withdraw the publisher."""
+
+
+class MessageSink(Protocol):
+    """Where results go."""
+
+    def claim(self, stream: str) -> Publisher:
+        """Open the publisher of a stream that this instance owns."""
+
+    def publish_problem(self, problem: schemas.Problem) -> None:
+        """Send a problem on its stream's key; never waits for a receiver."""
+
+
+class Request(Protocol):
+    """A query that waits for its replies; every request must be finished, on any thread."""
+
+    @property
+    def key(self) -> str:
+        """The key, or key expression, that was asked."""
+
+    @property
+    def payload(self) -> bytes | None:
+        """What was sent along."""
+
+    @property
+    def encoding(self) -> str:
+        """The encoding of the payload."""
+
+    def matches(self, key: str) -> bool:
+        """Tell whether the key expression that was asked includes a key."""
+
+    def answer(self, key: str, message: schemas.Message) -> None:
+        """Reply."""
+
+    def answer_text(self, key: str, text: bytes, encoding: str) -> None:
+        """Reply with text that is no message."""
+
+    def refuse(self, problem: schemas.Problem) -> None:
+        """Reply with an error."""
+
+    def finish(self) -> None:
+        """Tell the asker that nothing follows."""
+
+
+class TransportError(Exception):
+    """The network cannot be used; the text is one clear line."""
+
+
+class HttpError(Exception):
+    """The address of the HTTP endpoint cannot be listened on; the text is one clear line."""

@@ -1,0 +1,266 @@
+"""Answers to queries: the state and density of sessions, resets, parameters, the status of the service.
+
+What concerns a session is run by the worker of its stream, so that nothing else happens to it meanwhile: a question
+about the state or the density goes before the frames that wait, a reset or a change of parameters takes its turn among
+them. The query thread itself only sorts. An error is a reply too: a `Problem`, as an error reply.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING, Literal, TypeVar
+
+import optipmb_schemas as schemas
+import structlog
+
+import optipmb
+from optipmb_service.runtime.ports import TransportError
+from optipmb_service.session.convert import density_of
+from optipmb_service.session.problems import problem_of
+from optipmb_service.session.values import RefusedError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from optipmb_service.runtime.ports import Request
+    from optipmb_service.runtime.registry import Registry
+    from optipmb_service.runtime.stream_actor import StreamActor
+
+log = structlog.get_logger("optipmb_service")
+
+TEXT = "text/plain;version=0.0.4"
+"""Zenoh encoding of the metrics."""
+
+NO_SESSION = "0" * 32
+"""Session id in the state of a stream that has none."""
+
+_T = TypeVar("_T", bound=schemas.Message)
+
+
+class Queries:
+    """Answers every request, and finishes it whatever happens.
+
+    Args:
+        registry: the streams.
+        status: makes the status of the service.
+        metrics: makes its metrics, in Prometheus' text format.
+    """
+
+    def __init__(
+        self, registry: Registry, status: Callable[[], schemas.ServiceStatus], metrics: Callable[[], bytes]
+    ) -> None:
+        self._registry = registry
+        self._status = status
+        self._metrics = metrics
+        self._keys = registry.keys
+
+    def about_service(self, request: Request) -> None:
+        """Answer with the status of the service, its metrics, or both when the key has a `*`."""
+        instance = self._registry.instance
+        _guarded(request, lambda: self._report(request, self._keys.status(instance), self._keys.metrics(instance)))
+
+    def _report(self, request: Request, status: str, metrics: str) -> None:
+        if request.matches(status):
+            request.answer(status, self._status())
+        if request.matches(metrics):
+            request.answer_text(metrics, self._metrics(), TEXT)
+
+    def about_streams(self, request: Request) -> None:
+        """Answer what concerns sessions, here or on the worker of the stream."""
+        name = request.key.rpartition("/")[2]
+        if "*" in request.key:
+            self._answer_many(request)
+            return
+        stream = request.key.removeprefix(f"{self._keys.prefix}/").removesuffix(f"/q/{name}")
+        try:
+            self._keys.tracks(stream)
+        except schemas.MessageError as error:
+            nowhere = self._problem("", error)
+            _guarded(request, lambda: request.refuse(nowhere))
+            return
+        if not self._registry.share.has(stream):
+            request.finish()  # another process has the stream, and answers
+            return
+        commands: dict[str, tuple[Callable[[StreamActor, Request], None], bool]] = {
+            "state": (self._state, True),
+            "density": (self._density, True),
+            "reset": (self._reset, False),
+            "parameters": (self._parameters, False),
+        }
+        if name not in commands:
+            unknown = schemas.MessageError("invalid_value", "key", f"one of q/{', q/'.join(commands)}", f"q/{name}")
+            _guarded(request, lambda: request.refuse(self._problem(stream, unknown)))
+            return
+        command, urgent = commands[name]
+
+        def answer(actor: StreamActor) -> None:
+            # Where several instances run, the one that tracks the stream answers.
+            _guarded(request, lambda: None if actor.elsewhere else command(actor, request))
+
+        # A stream can be set up ahead of its first frame, by a valid request.
+        seeks = name == "parameters" and self._sets(request)
+        taken = self._registry.command(stream, lambda actor: actor.ask(answer, seek=seeks), urgent=urgent)
+        if not taken:
+            full = schemas.MessageError("too_large", "key", "fewer new streams at once", "another one")
+            _guarded(request, lambda: request.refuse(self._problem(stream, full)))
+
+    def _sets(self, request: Request) -> bool:
+        """Whether a request for parameters is valid and changes any."""
+        try:
+            asked = schemas.decode(
+                request.payload or b"",
+                schemas.SessionParameters,
+                encoding=request.encoding,
+                limits=self._registry.limits,
+            )
+        except schemas.MessageError:
+            return False
+        known = asked.profile is None or self._registry.profiles.named(asked.profile) is not None
+        return known and asked != schemas.SessionParameters()
+
+    def _answer_many(self, request: Request) -> None:
+        """Answer a question about the state of all streams that a key expression includes; many answer nothing else."""
+        actors = [
+            actor for actor in self._registry.actors() if request.matches(self._keys.query(actor.stream, "state"))
+        ]
+        if not actors:
+            request.finish()
+            return
+        left = _Countdown(len(actors), request.finish)
+        for actor in actors:
+            if not self._registry.command(actor.stream, self._one_of_many(request, left), urgent=True):
+                left.one()
+
+    def _one_of_many(self, request: Request, left: _Countdown) -> Callable[[StreamActor], None]:
+        def command(actor: StreamActor) -> None:
+            try:
+                self._state(actor, request)
+            except TransportError as error:
+                log.warning("reply_failed", key=request.key, error=str(error))
+            finally:
+                left.one()
+
+        return command
+
+    # Run by the workers
+
+    def _state(self, actor: StreamActor, request: Request) -> None:
+        request.answer(self._keys.query(actor.stream, "state"), actor.state() or self._nothing(actor.stream, "new"))
+
+    def _density(self, actor: StreamActor, request: Request) -> None:
+        session = actor.session
+        message = density_of(
+            session.density if session else optipmb.Density.empty(),
+            stream=actor.stream,
+            session=session.session if session else NO_SESSION,
+            parameters=session.parameters if session else self._registry.profiles.of(actor.stream),
+        )
+        request.answer(self._keys.query(actor.stream, "density"), message)
+
+    def _reset(self, actor: StreamActor, request: Request) -> None:
+        asked = self._payload(actor, request, schemas.ResetRequest, schemas.ResetRequest())
+        if asked is None:
+            return
+        session = actor.session
+        state = self._nothing(actor.stream, "closed" if asked.close else "new")
+        if session is not None and asked.close:
+            actor.close_session("query")
+            state = session.state(closed=True)
+        elif session is not None:
+            actor.deliver(session.reset())
+            state = actor.state() or state
+        request.answer(self._keys.query(actor.stream, "reset"), state)
+
+    def _parameters(self, actor: StreamActor, request: Request) -> None:
+        empty = schemas.SessionParameters()
+        asked = self._payload(actor, request, schemas.SessionParameters, empty)
+        if asked is None:
+            return
+        parameters = None
+        if asked.profile is not None:
+            parameters = self._registry.profiles.named(asked.profile)
+            if parameters is None:
+                expected = f"one of {', '.join(self._registry.profiles.names)}"
+                error = schemas.MessageError("invalid_value", "profile", expected, repr(asked.profile))
+                request.refuse(self._problem(actor.stream, error))
+                return
+        if asked != empty and actor.session is None:
+            full = schemas.MessageError(
+                "too_large", "stream", "a stream that is tracked already", "no room for another"
+            )
+            request.refuse(self._problem(actor.stream, full, code="refused"))
+            return
+        session = actor.session
+        if session is not None and asked != empty:
+            try:
+                actor.deliver(session.configure(parameters, asked.cloud_wait_s, restart=asked.restart))
+            except RefusedError as error:
+                refusal = schemas.MessageError("invalid_value", error.path, error.expected, error.received)
+                request.refuse(self._problem(actor.stream, refusal, code="refused"))
+                return
+        request.answer(self._keys.query(actor.stream, "parameters"), self._in_force(actor))
+
+    def _in_force(self, actor: StreamActor) -> schemas.SessionParameters:
+        session = actor.session
+        parameters: optipmb.Parameters = session.parameters if session else self._registry.profiles.of(actor.stream)
+        return schemas.SessionParameters(
+            profile=parameters.name,
+            cloud_wait_s=session.cloud_wait_s if session else self._registry.cloud_wait_s,
+            values=parameters.model_dump(mode="json"),
+        )
+
+    def _nothing(self, stream: str, state: Literal["new", "closed"]) -> schemas.SessionState:
+        """Return the state of a stream that has no session."""
+        return schemas.SessionState(
+            stream=stream, session=NO_SESSION, state=state, profile=self._registry.profiles.of(stream).name
+        )
+
+    def _payload(self, actor: StreamActor, request: Request, expected: type[_T], empty: _T) -> _T | None:
+        """Return what was sent along, `empty` when nothing was, None after a refusal."""
+        if not request.payload:
+            return empty
+        try:
+            return schemas.decode(request.payload, expected, encoding=request.encoding, limits=self._registry.limits)
+        except schemas.MessageError as error:
+            request.refuse(self._problem(actor.stream, error))
+            return None
+
+    def _problem(self, stream: str, error: schemas.MessageError, *, code: str = "") -> schemas.Problem:
+        return problem_of(
+            code or error.code,
+            stream=stream,
+            instance=self._registry.instance,
+            path=error.path,
+            expected=error.expected,
+            received=error.received,
+            message=f"Query: {error.path or 'payload'}: expected {error.expected}, received {error.received}.",
+        )
+
+
+class _Countdown:
+    """Calls `last` when `one` has been called so many times, by any threads."""
+
+    def __init__(self, count: int, last: Callable[[], None]) -> None:
+        self._lock = threading.Lock()
+        self._left = count
+        self._last = last
+
+    def one(self) -> None:
+        with self._lock:
+            self._left -= 1
+            done = self._left == 0
+        if done:
+            self._last()
+
+
+def _guarded(request: Request, answer: Callable[[], None]) -> None:
+    """Answer, and finish the request whatever happens: an asker must not wait for its timeout."""
+    began_ns = time.monotonic_ns()
+    try:
+        answer()
+    except TransportError as error:
+        log.warning("reply_failed", key=request.key, error=str(error))
+    finally:
+        request.finish()
+        log.debug("query", key=request.key, took_ms=(time.monotonic_ns() - began_ns) / 1e6)

@@ -1,0 +1,359 @@
+"""All streams of the service: finds the actor of a message, makes and frees actors, and sees to those that fell silent.
+
+Called by the readers, the workers, the query thread and the control loop; one lock guards the tables, and nothing slow
+is done under it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Any, Final
+
+import optipmb_schemas as schemas
+import structlog
+
+import optipmb
+from optipmb_service.cluster.assignment import Assignment
+from optipmb_service.cluster.ownership import RoleChange
+from optipmb_service.runtime import dumps
+from optipmb_service.runtime.context import Actor, ActorContext, Ownership
+from optipmb_service.runtime.stream_actor import StreamActor
+from optipmb_service.runtime.takeover_buffer import ByteBudget
+from optipmb_service.session.problems import problem_of
+from optipmb_service.session.values import SECOND, Lineage, MessageCounters, Policy
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from optipmb_service.observability.metrics import Metrics
+    from optipmb_service.observability.problem_reporter import ProblemReporter
+    from optipmb_service.runtime.persistence import Persistence
+    from optipmb_service.runtime.ports import MessageSink, Packet
+    from optipmb_service.runtime.profiles import Profiles
+    from optipmb_service.runtime.scheduler import Scheduler
+    from optipmb_service.session.session import Session
+    from optipmb_service.settings import Settings
+
+log = structlog.get_logger("optipmb_service")
+
+MAX_UNPROVEN: Final = 256
+"""Lanes at once of streams that have not sent a valid message yet."""
+
+MAX_LIVES: Final = 65_536
+"""Streams without a session whose past is remembered."""
+
+DUMPS: Final = "quarantine"
+MAX_DUMPS: Final = 32
+
+MEGABYTE: Final = 2**20
+
+MAX_KEYS: Final = 8192
+"""Keys whose stream is remembered."""
+
+
+class Registry:
+    """The streams of one service.
+
+    Args:
+        settings: what is in force.
+        profiles: the parameters that can be had.
+        outlet: where results go.
+        problem reporter: where problems go.
+        scheduler: the workers.
+        coordinator: says which streams this instance owns.
+        checkpoint writer: where checkpoints go and come from.
+        arm: has `StreamActor.wake` called at a monotonic time (ns).
+        metrics: counts what comes and goes.
+        tracker: makes the trackers of sessions.
+        share: the streams of this process; all of them where it is the only one.
+    """
+
+    def __init__(  # noqa: PLR0913 - the parts that it brings together
+        self,
+        settings: Settings,
+        profiles: Profiles,
+        *,
+        sink: MessageSink,
+        reporter: ProblemReporter,
+        scheduler: Scheduler,
+        coordinator: Ownership,
+        persistence: Persistence,
+        arm: Callable[[Actor, int], None],
+        metrics: Metrics,
+        tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
+        share: Assignment | None = None,
+    ) -> None:
+        self.share = share or Assignment()
+        self.profiles = profiles
+        self.instance = settings.instance
+        self.keys = schemas.Keys(settings.prefix)
+        self.limits = settings.limits.limits()
+        self.cloud_wait_s = settings.cloud_wait_s
+        self._settings = settings
+        self._reporter = reporter
+        self._scheduler = scheduler
+        self._lock = threading.Lock()
+        self._actors: dict[str, StreamActor] = {}
+        self._sessions = 0
+        self._lives: OrderedDict[str, Lineage] = OrderedDict()
+        self._streams: dict[str, str] = {}
+        self._past = MessageCounters()
+        self._metrics = metrics
+        self._context = ActorContext(
+            instance=settings.instance,
+            limits=self.limits,
+            policy=Policy(
+                gap_limit_ns=round(settings.gap_limit_s * SECOND),
+                cloud_wait_ns=round(settings.cloud_wait_s * SECOND),
+                cloud_memory_ns=round(settings.cloud_memory_s * SECOND),
+                clouds=settings.queue_clouds,
+                rewind_ns=round(settings.rewind_s * SECOND),
+                late_clouds=settings.late_clouds,
+                recovery_wait_ns=round(settings.recovery_wait_s * SECOND),
+                max_speed=settings.max_speed,
+            ),
+            queue_frames=settings.queue_frames,
+            queue_clouds=settings.queue_clouds,
+            sink=sink,
+            reporter=reporter,
+            parameters_of=profiles.of,
+            coordinator=coordinator,
+            persistence=persistence,
+            standby_ns=round(settings.standby_s * SECOND),
+            dump=lambda stream, dump: _save(settings.folder, stream, dump),
+            budget=ByteBudget(settings.standby_mb * MEGABYTE),
+            room=lambda: self._sessions < settings.max_sessions,
+            admit=self._admit,
+            release=self._release,
+            discard=self._discard,
+            submit=scheduler.submit,
+            arm=arm,
+            metrics=metrics,
+            tracker=tracker,
+        )
+
+    # Messages, from the readers
+
+    def wants(self, key: str) -> bool:
+        """Whether a message on a key is for this process; asked before its payload is touched."""
+        share = self.share
+        if share.count == 1:
+            return True
+        try:
+            return share.has(self._parsed(key))
+        except schemas.MessageError:
+            return share.index == 0  # a key that is none of a stream is reported by one of the processes
+
+    def frame(self, packet: Packet) -> None:
+        """Hand detections to their stream; never waits."""
+        self._metrics.received("detections", packet.size)
+        if (stream := self._stream_of(packet)) is not None:
+            self._offer(stream, lambda actor: actor.mailbox.offer_frame(packet))
+
+    def cloud(self, packet: Packet) -> None:
+        """Hand a point cloud to its stream; never waits."""
+        self._metrics.received("points", packet.size)
+        if (stream := self._stream_of(packet)) is not None:
+            self._offer(stream, lambda actor: actor.mailbox.offer_cloud(packet))
+
+    def command(self, stream: str, command: Callable[[StreamActor], None], *, urgent: bool) -> bool:
+        """Have a worker run a command for a stream; False when the service takes no more streams."""
+        return self._offer(stream, lambda actor: actor.mailbox.offer_command(lambda: command(actor), urgent=urgent))
+
+    # What is there
+
+    def actors(self) -> list[StreamActor]:
+        """Return the actors that have a session, by stream name."""
+        with self._lock:
+            actors = sorted(self._actors.items())
+        return [actor for _, actor in actors if actor.session is not None]
+
+    def actor(self, stream: str) -> StreamActor | None:
+        """Return the actor of a stream that has a session."""
+        with self._lock:
+            actor = self._actors.get(stream)
+        return actor if actor is not None and actor.session is not None else None
+
+    def totals(self) -> MessageCounters:
+        """Return what became of all messages since the start."""
+        with self._lock:
+            totals, actors = self._past, list(self._actors.values())
+        for actor in actors:
+            totals += actor.totals()
+        return totals
+
+    @property
+    def standing_by(self) -> int:
+        """Streams of which packets wait here for a takeover."""
+        with self._lock:
+            actors = list(self._actors.values())
+        return sum(actor.buffers_for_takeover for actor in actors)
+
+    @property
+    def busy(self) -> bool:
+        """Whether something waits to be worked on."""
+        with self._lock:
+            actors = list(self._actors.values())
+        return any(not actor.mailbox.idle for actor in actors)
+
+    # What the control loop has done now and then
+
+    def sweep(self, now_ns: int) -> None:
+        """Log streams that fell silent, close sessions that have been idle for long, or are another worker's."""
+        for actor in self.actors():
+            if not self.share.has(actor.stream):
+                # What was on its way while the stream was moved began a session once more.
+                self.command(actor.stream, StreamActor.hand_over, urgent=False)
+            age_s = actor.meter.age_s(now_ns)
+            if age_s is not None and age_s > self._settings.stale_s and not actor.stale:
+                actor.stale = True
+                log.warning("stream_stale", stream=actor.stream, age_s=round(age_s, 3))
+            if now_ns - actor.meter.active_ns > self._settings.idle_s * SECOND:
+                self.command(actor.stream, self._close_idle, urgent=False)
+        with self._lock:
+            waiting = [actor for actor in self._actors.values() if actor.buffers_for_takeover]
+        for actor in waiting:
+            actor.tell(StreamActor.trim)
+
+    def changed(self, stream: str, change: RoleChange) -> None:
+        """Tell a stream's worker that this instance owns the stream now, or does not."""
+        command = StreamActor.on_granted if change is RoleChange.GRANTED else StreamActor.on_lost
+        self.command(stream, command, urgent=True)
+
+    def resume(self) -> None:
+        """Send workers to all streams: they paused, and need not any longer."""
+        for actor in self.actors():
+            actor.wake()
+
+    def keep(self) -> None:
+        """Have every session that changed give its state to the checkpoint writer."""
+        for actor in self.actors():
+            actor.tell(StreamActor.keep)
+
+    def keep_now(self) -> None:
+        """Do the same in the calling thread, when the workers have ended."""
+        for actor in self.actors():
+            actor.keep()
+
+    def finish(self) -> None:
+        """Process what is held for clouds, in every session; the workers do it."""
+        for actor in self.actors():
+            self.command(actor.stream, _flush, urgent=False)
+
+    def _close_idle(self, actor: StreamActor) -> None:
+        # Asked again: a message may have come between the sweep and the worker's turn.
+        if time.monotonic_ns() - actor.meter.active_ns > self._settings.idle_s * SECOND:
+            actor.close_session("idle")
+
+    # Lanes
+
+    def _offer(self, stream: str, offer: Callable[[StreamActor], bool | None]) -> bool:
+        while True:
+            actor = self._actor(stream)
+            if actor is None:
+                self._refuse(stream)
+                return False
+            sent = offer(actor)
+            if sent is not None:
+                break
+            # The actor has closed since it was found: once more, with a new one.
+            self._discard(actor)
+        if sent:
+            self._scheduler.submit(actor)
+        return True
+
+    def _actor(self, stream: str) -> StreamActor | None:
+        with self._lock:
+            actor = self._actors.get(stream)
+            if actor is None and self._unproven < MAX_UNPROVEN:
+                actor = self._actors[stream] = StreamActor(stream, self._context)
+            return actor
+
+    @property
+    def _unproven(self) -> int:
+        """Lanes of streams that have not sent a valid message, as far as is known; called with the lock."""
+        if len(self._actors) < MAX_UNPROVEN:
+            return 0
+        return sum(not actor.proven for actor in self._actors.values())
+
+    def _discard(self, actor: Actor) -> None:
+        with self._lock:
+            if self._actors.get(actor.stream) is actor:
+                del self._actors[actor.stream]
+                self._past += actor.totals()
+
+    def _admit(self, stream: str) -> Lineage | None:
+        with self._lock:
+            if self._sessions >= self._settings.max_sessions:
+                return None
+            self._sessions += 1
+            return self._lives.pop(stream, Lineage())
+
+    def _release(self, session: Session) -> None:
+        with self._lock:
+            self._sessions -= 1
+            self._lives[session.stream] = session.life
+            if len(self._lives) > MAX_LIVES:
+                self._lives.popitem(last=False)
+
+    def _refuse(self, stream: str) -> None:
+        self._count_refused()
+        self._report("shed", stream, f"fewer than {MAX_UNPROVEN} new streams at once", "another one")
+
+    def _count_refused(self) -> None:
+        with self._lock:
+            self._past += MessageCounters(received=1, refused=1)
+
+    def _stream_of(self, packet: Packet) -> str | None:
+        try:
+            return self._parsed(packet.key)
+        except schemas.MessageError as error:
+            self._count_refused()
+            self._report("invalid_value", "", error.expected, error.received)
+            return None
+
+    def _parsed(self, key: str) -> str:
+        """Return the stream of a key, remembered.
+
+        Raises:
+            MessageError: it is none.
+        """
+        stream = self._streams.get(key)
+        if stream is None:
+            stream = self.keys.stream_of(key)
+            if len(self._streams) >= MAX_KEYS:
+                self._streams.clear()
+            self._streams[key] = stream
+        return stream
+
+    def _report(self, code: str, stream: str, expected: str, received: str) -> None:
+        message = f"Key: expected {expected}, received {received}."
+        problem = problem_of(
+            code,
+            stream=stream,
+            instance=self.instance,
+            path="key",
+            expected=expected,
+            received=received,
+            message=message,
+        )
+        self._reporter.report(problem, time.monotonic_ns())
+
+
+def _save(folder: Path | None, stream: str, dump: bytes) -> str:
+    """Write what is needed to see an error again into the folder of the state; return the file, empty without one."""
+    if folder is None:
+        return ""
+    try:
+        return str(dumps.save(folder / DUMPS, stream, dump, most=MAX_DUMPS))
+    except OSError as error:
+        log.warning("store_failed", error=str(error))
+        return ""
+
+
+def _flush(actor: StreamActor) -> None:
+    if actor.session is not None:
+        actor.deliver(actor.session.flush())

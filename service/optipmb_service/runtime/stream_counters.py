@@ -1,0 +1,79 @@
+"""What became of a stream's messages: what its sessions count while they last, and what never came to one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from optipmb_service.session.values import Counters, MessageCounters
+
+if TYPE_CHECKING:
+    import optipmb_schemas as schemas
+
+    from optipmb_service.runtime.mailbox import Mailbox
+    from optipmb_service.session.session import Session
+
+
+class StreamCounters:
+    """The counts of one stream, so kept that every message received ends in one of them.
+
+    Written by the worker of the stream, read by whoever asks.
+
+    Args:
+        mailbox: of the stream; it counts what it sheds.
+    """
+
+    def __init__(self, mailbox: Mailbox) -> None:
+        self._mailbox = mailbox
+        self._traffic = MessageCounters()
+        self._base = Counters()
+        self._opened = MessageCounters()
+        self._shed_told = 0
+        self._clouds_shed_told = 0
+
+    def receive(self, *, frame: bool) -> None:
+        """Count a message that goes to the session."""
+        self._traffic.received += frame
+
+    def refuse(self, session: Session | None, *, frame: bool) -> None:
+        """Count a message that was none, or had no room."""
+        if not frame:
+            self._traffic.clouds_refused += 1
+        elif session is not None:
+            session.refuse()
+        else:
+            self._traffic.received += 1
+            self._traffic.refused += 1
+
+    def shed(self) -> int:
+        """Count what the mailbox shed since the last time; returns how many frames."""
+        shed, _, clouds = self._mailbox.counts()
+        fresh, self._shed_told = shed - self._shed_told, shed
+        self._traffic.clouds_shed += clouds - self._clouds_shed_told
+        self._clouds_shed_told = clouds
+        self._traffic.shed += fresh
+        self._traffic.received += fresh
+        return fresh
+
+    def open(self, session: Session) -> None:
+        """Begin to count with a session, which may have counted elsewhere before."""
+        self._base, self._opened = session.counters, replace(self._traffic)
+
+    def close(self, session: Session) -> None:
+        """Take over what a session that ends has counted here."""
+        self._traffic = self._traffic.since(self._base, session.counters)
+
+    def totals(self, session: Session | None) -> MessageCounters:
+        """Return what became of messages since the actor is there."""
+        return self._traffic if session is None else self._traffic.since(self._base, session.counters)
+
+    def state(self, session: Session) -> schemas.SessionState:
+        """Return the state of a session with what was received and shed since it was opened."""
+        shed, waiting, _ = self._mailbox.counts()
+        untold = shed - self._shed_told
+        base, opened = self._base, self._opened
+        before = base.frames + base.duplicates + base.late + base.refused
+        state = session.state(shed=self._traffic.shed - opened.shed + untold, queue=waiting)
+        received = before + self._traffic.received - opened.received + untold + waiting
+        clouds_refused = self._traffic.clouds_refused - opened.clouds_refused
+        return state.model_copy(update={"received": received, "clouds_refused": clouds_refused})

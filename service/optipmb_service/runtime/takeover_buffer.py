@@ -1,0 +1,85 @@
+"""What a stream sent while nobody here tracked it: raw packets of the last seconds, for the moment of a takeover.
+
+Who takes over restores the checkpoint, which is as old as the interval between checkpoints and the time in which the
+death of the owner was noticed, and then hands these packets to the session. Most of them the session has seen; it drops
+them. They wait undecoded, so standing by costs little but memory, which is bounded by time and, over all streams of the
+instance, by bytes.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from optipmb_service.runtime.ports import Packet
+
+
+class ByteBudget:
+    """Bytes that all streams share.
+
+    Args:
+        most: how many there are.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._lock = threading.Lock()
+        self.used = 0
+
+    def add(self, size: int) -> bool:
+        """Take bytes, or give back with a negative size; False when more are taken than there are."""
+        with self._lock:
+            self.used += size
+            return self.used <= self._most
+
+
+class TakeoverBuffer:
+    """The waiting packets of one stream; used by the worker of the stream alone.
+
+    Args:
+        keep_ns: age at which a packet is dropped.
+        budget: bytes that all streams share.
+    """
+
+    def __init__(self, keep_ns: int, budget: ByteBudget) -> None:
+        self._keep_ns = keep_ns
+        self._budget = budget
+        self._packets: deque[tuple[Packet, bool]] = deque()
+        self.dropped = 0
+        """Packets that went before they were old, for lack of room."""
+
+    def __len__(self) -> int:
+        return len(self._packets)
+
+    def add(self, packet: Packet, *, frame: bool) -> None:
+        """Keep a packet; when there is no room, the oldest clouds of the stream go first, then its oldest frames."""
+        self.trim(packet.now_ns)
+        self._packets.append((packet, frame))
+        fits = self._budget.add(_size(packet))
+        while not fits and self._packets:
+            cloud = next((index for index, (_, is_frame) in enumerate(self._packets) if not is_frame), 0)
+            fits = self._drop(cloud)
+            self.dropped += 1
+
+    def trim(self, now_ns: int) -> None:
+        """Drop what is old."""
+        while self._packets and now_ns - self._packets[0][0].now_ns > self._keep_ns:
+            self._drop(0)
+
+    def take(self) -> list[tuple[Packet, bool]]:
+        """Take all packets, the oldest first, each with whether it is a frame."""
+        taken = list(self._packets)
+        self._budget.add(-sum(_size(packet) for packet, _ in taken))
+        self._packets.clear()
+        return taken
+
+    def _drop(self, index: int) -> bool:
+        packet, _ = self._packets[index]
+        del self._packets[index]
+        return self._budget.add(-_size(packet))
+
+
+def _size(packet: Packet) -> int:
+    return 0 if packet.payload is None else packet.size

@@ -1,0 +1,139 @@
+"""The tracks of one stream on their way out: delivery, encoding, publisher, and what must wait for a write lease.
+
+Used by the worker of the stream alone.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Protocol
+
+import optipmb_schemas as schemas
+import structlog
+
+from optipmb_service.runtime.ports import TransportError
+from optipmb_service.session.values import SECOND
+
+if TYPE_CHECKING:
+    from optipmb_service.observability.metrics import Metrics
+    from optipmb_service.observability.stream_meter import StreamMeter
+    from optipmb_service.runtime.ports import MessageSink, Publisher
+    from optipmb_service.session.values import Tracked
+
+log = structlog.get_logger("optipmb_service")
+
+MILLISECOND: Final = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """What is known of a frame's way when its tracks come out."""
+
+    wall_ns: int
+    now_ns: int
+    decode_ns: int
+
+
+class WriteLeaseHolder(Protocol):
+    """What it needs of the coordinator."""
+
+    def may_write(self, stream: str) -> bool:
+        """Whether this instance may publish for a stream now."""
+
+
+class TrackPublisher:
+    """The publisher of a stream, while this instance owns it.
+
+    Args:
+        stream: `site/node/sensor`.
+        instance: name of the service.
+        outlet: the network.
+        meter: the figures of the stream, told of every publication.
+        metrics: the figures of the process, told too.
+        coordinator: says whether the write lease holds; tracks wait while it does not.
+    """
+
+    def __init__(
+        self,
+        stream: str,
+        instance: str,
+        sink: MessageSink,
+        meter: StreamMeter,
+        metrics: Metrics,
+        coordinator: WriteLeaseHolder,
+    ) -> None:
+        self._stream = stream
+        self._instance = instance
+        self._sink = sink
+        self._meter = meter
+        self._metrics = metrics
+        self._coordinator = coordinator
+        self._claim: Publisher | None = None
+        self._waiting: list[tuple[bytes, Arrival, int, int]] = []
+        self._ids: frozenset[int] = frozenset()
+
+    def open(self) -> None:
+        """Open the publisher."""
+        try:
+            self._claim = self._sink.claim(self._stream)
+        except TransportError as error:
+            log.warning("claim_failed", stream=self._stream, error=str(error))
+
+    def close(self) -> None:
+        """Withdraw the publisher; what waits is dropped: another owner publishes it."""
+        self._waiting.clear()
+        self._count_tracks(frozenset())
+        if self._claim is not None:
+            self._claim.release()
+            self._claim = None
+
+    def send(self, tracked: Tracked) -> None:
+        """Publish the tracks of a frame, now or when the write lease holds again."""
+        ticket: Arrival = tracked.ticket
+        passed_ns = time.monotonic_ns() - ticket.now_ns
+        waited_ns = max(0, passed_ns - ticket.decode_ns - tracked.step_ns)
+        delivery = schemas.Delivery.trusted(
+            instance=self._instance,
+            received_ns=ticket.wall_ns,
+            published_ns=time.time_ns(),
+            queue_ms=waited_ns / MILLISECOND,
+            decode_ms=ticket.decode_ns / MILLISECOND,
+            step_ms=tracked.step_ns / MILLISECOND,
+            run=tracked.run,
+        )
+        self._count_tracks(frozenset(tracked.tracks.id.tolist()))
+        self._waiting.append(
+            (
+                schemas.encode(tracked.tracks.model_copy(update={"delivery": delivery})),
+                ticket,
+                waited_ns,
+                tracked.step_ns,
+            )
+        )
+        self.flush()
+
+    def flush(self) -> None:
+        """Publish what waits, if the write lease holds."""
+        if not self._waiting or not self._coordinator.may_write(self._stream):
+            return
+        waiting, self._waiting = self._waiting, []
+        for payload, ticket, waited_ns, step_ns in waiting:
+            try:
+                if self._claim is not None:
+                    self._claim.publish(payload)
+            except TransportError as error:
+                log.warning("publish_failed", stream=self._stream, error=str(error))
+            else:
+                latency_ns = time.monotonic_ns() - ticket.now_ns
+                self._meter.published(latency_ns)
+                self._metrics.published(
+                    latency_s=latency_ns / SECOND,
+                    queue_s=waited_ns / SECOND,
+                    decode_s=ticket.decode_ns / SECOND,
+                    step_s=step_ns / SECOND,
+                )
+
+    def _count_tracks(self, ids: frozenset[int]) -> None:
+        self._metrics.tracks(started=len(ids - self._ids), ended=len(self._ids - ids))
+        self._ids = ids

@@ -1,0 +1,308 @@
+"""The state of a session as bytes and back: whole or not at all.
+
+The bytes are a head (magic, version, BLAKE2b digest of version and body) and a body, one msgpack map. Equal checkpoints
+give equal bytes. Reading is total and bounded: it returns a checkpoint or raises `CheckpointError`, and the digest is
+compared before anything else is looked at. A service reads the versions that earlier ones wrote, and refuses later ones
+by number.
+
+What depends on how messages were delivered (duplicates, the revisions of corrected tracks, crashes) is kept, but is no
+state: `state_bytes` leaves it out, so that two sessions that took the same frames can be compared.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Final
+
+import msgpack
+import optipmb_schemas as schemas
+
+import optipmb
+from optipmb_service.session.document import Document
+from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory
+from optipmb_service.session.timeline import WINDOW, Cursor, FrameId, SeenNumbers
+from optipmb_service.session.values import Deliveries
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+VERSION: Final = 1
+MAGIC: Final = b"OPTIPMB\0"
+DIGEST: Final = 16
+HEAD: Final = len(MAGIC) + 2 + DIGEST
+MAX_BYTES: Final = 2**28
+
+_msgpack: Any = msgpack  # its type information is partial
+_SOFTWARE: Final = version("optipmb")
+
+
+class CheckpointError(ValueError):
+    """The bytes are no checkpoint that this service can read; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A frame of the window.
+
+    Attributes:
+        message: its detections.
+        points: its cloud.
+        missed: whether it waited for a cloud in vain.
+        revision: of the tracks that were published last for it.
+        packed: both as bytes, as soon as they were made.
+    """
+
+    message: schemas.Detections
+    points: schemas.Points | None
+    missed: bool
+    revision: int
+    packed: dict[str, bytes] = field(default_factory=dict, compare=False)
+
+    @property
+    def frame_id(self) -> FrameId:
+        """Which frame it is."""
+        return FrameId(self.message.epoch, self.message.seq, self.message.stamp_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """What a session is made of, between two frames. Nothing in it changes any more.
+
+    Attributes:
+        stream: `site/node/sensor`.
+        parameters: the profile.
+        cloud_wait_ns: the wait for clouds that was asked for, None where the service's own holds.
+        quarantine: the error for which frames are refused; empty while they are not.
+        epochs: which frames came.
+        base: the state before the window.
+        window: the frames of the window.
+        head: the present state.
+        deliveries: what was not tracked, and what was corrected.
+        newest_cloud_ns: stamp of the cloud that arrived last.
+        run: how often the session was taken up again.
+        software: version of the service that wrote it.
+    """
+
+    stream: str
+    parameters: optipmb.Parameters
+    cloud_wait_ns: int | None
+    quarantine: str
+    epochs: tuple[SeenNumbers, ...]
+    base: FilterState
+    window: tuple[Recorded, ...]
+    head: FilterState
+    deliveries: Deliveries
+    newest_cloud_ns: int | None
+    run: int = 0
+    software: str = _SOFTWARE
+
+    @property
+    def session(self) -> str:
+        """The id of the present life of the density."""
+        return self.head.session
+
+
+def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
+    """Return the bytes of a checkpoint; equal ones give equal bytes."""
+    return seal(_msgpack.packb(_body(checkpoint)))
+
+
+def state_bytes(checkpoint: Checkpoint) -> bytes:
+    """Return the bytes of what does not depend on how messages were delivered."""
+    window = tuple(replace(one, revision=0) for one in checkpoint.window)
+    bare = replace(checkpoint, window=window, deliveries=Deliveries(), newest_cloud_ns=None, run=0, software="")
+    return encode_checkpoint(bare)
+
+
+def decode_checkpoint(data: bytes) -> Checkpoint:
+    """Return the checkpoint that bytes hold.
+
+    Raises:
+        CheckpointError: torn, changed, of a later version, or not valid.
+    """
+    version_, body = _open(data)
+    try:
+        return _READERS[version_](Document.of(body))
+    except (schemas.MessageError, optipmb.OptipmbError) as error:
+        raise CheckpointError(str(error)) from error
+
+
+def seal(body: bytes) -> bytes:
+    """Return a body with the head that names its version and guards it."""
+    return b"".join((MAGIC, VERSION.to_bytes(2, "big"), _digest(VERSION, body), body))
+
+
+def _open(data: bytes) -> tuple[int, bytes]:
+    if len(data) < HEAD or data[: len(MAGIC)] != MAGIC:
+        raise CheckpointError("no checkpoint: its first bytes are others")
+    if len(data) > MAX_BYTES:
+        raise CheckpointError(f"{len(data)} bytes: more than a checkpoint has")
+    version_ = int.from_bytes(data[len(MAGIC) : len(MAGIC) + 2], "big")
+    if version_ > VERSION:
+        raise CheckpointError(f"version {version_}: from a newer service; this one reads versions up to {VERSION}")
+    if version_ not in _READERS:
+        raise CheckpointError(f"version {version_}: there is none such")
+    body = data[HEAD:]
+    if data[len(MAGIC) + 2 : HEAD] != _digest(version_, body):
+        raise CheckpointError("torn or changed: the digest is that of other bytes")
+    return version_, body
+
+
+def _digest(version_: int, body: bytes) -> bytes:
+    digest = hashlib.blake2b(version_.to_bytes(2, "big"), digest_size=DIGEST, person=b"optipmb-check")
+    digest.update(body)
+    return digest.digest()
+
+
+# Writing
+
+
+def _body(checkpoint: Checkpoint) -> dict[str, Any]:
+    parameters = checkpoint.parameters.model_dump(mode="json")
+    # Most sessions of a store have one of a few profiles; the order of the classes is that of their indices.
+    return {
+        "software": checkpoint.software,
+        "stream": checkpoint.stream,
+        "parameters": parameters,
+        "cloud_wait_ns": checkpoint.cloud_wait_ns,
+        "quarantine": checkpoint.quarantine,
+        "epochs": [[seen.epoch, seen.highest, _mask(seen.mask)] for seen in checkpoint.epochs],
+        "base": _state(checkpoint.base),
+        "window": [
+            {
+                "detections": _packed(one, "detections", one.message),
+                "points": None if one.points is None else _packed(one, "points", one.points),
+                "missed": one.missed,
+                "revision": one.revision,
+            }
+            for one in checkpoint.window
+        ],
+        # Without a window the present is its beginning.
+        "head": _state(checkpoint.head) if checkpoint.window else None,
+        "deliveries": asdict(checkpoint.deliveries),
+        "newest_cloud_ns": checkpoint.newest_cloud_ns,
+        "run": checkpoint.run,
+    }
+
+
+def _packed(one: Recorded, name: str, message: schemas.Message) -> bytes:
+    packed = one.packed.get(name)
+    if packed is None:
+        packed = one.packed[name] = schemas.encode(message)
+    return packed
+
+
+def _mask(mask: int) -> bytes:
+    return mask.to_bytes((mask.bit_length() + 7) // 8, "big")
+
+
+def _state(state: FilterState) -> dict[str, Any]:
+    density, cursor = state.density, state.cursor
+    return {
+        "stamp_ns": density.stamp_ns,
+        "next_id": density.next_id,
+        "density": schemas.pack_columns(optipmb.columns_of(density)),
+        "session": state.session,
+        "starts": state.starts,
+        "generation": state.generation,
+        "course": [cursor.epoch, cursor.seq, cursor.era, cursor.generation, cursor.newest_ns, cursor.floor_ns],
+        "last": None if state.last is None else [state.last.epoch, state.last.seq, state.last.stamp_ns],
+        "tracked": None if state.tracked is None else list(state.tracked),
+        "tracks": state.tracks,
+        "counts": asdict(state.counts),
+        "reported": sorted(state.reported),
+        "whereabouts": asdict(state.pose_history),
+    }
+
+
+# Reading version 1
+
+
+def _read_1(body: Document) -> Checkpoint:
+    parameters = optipmb.parse_parameters(body.map("parameters"))
+    base = _read_state(body.document("base"), len(parameters.classes))
+    window = tuple(_read_recorded(one) for one in body.documents("window"))
+    if len({one.frame_id for one in window}) != len(window):
+        raise body.wrong("window", "every frame once", "one again")
+    head = _read_state(body.document("head"), len(parameters.classes)) if window else base
+    return Checkpoint(
+        stream=body.stream("stream"),
+        parameters=parameters,
+        cloud_wait_ns=body.optional("cloud_wait_ns", body.whole),
+        quarantine=body.text("quarantine"),
+        epochs=tuple(_read_seen(one) for one in body.rows("epochs", 3)),
+        base=base,
+        window=window,
+        head=head,
+        deliveries=Deliveries(**body.document("deliveries").wholes(Deliveries.__slots__)),
+        newest_cloud_ns=body.optional("newest_cloud_ns", body.whole),
+        run=body.whole("run"),
+        software=body.text("software"),
+    )
+
+
+def _read_seen(row: Document) -> SeenNumbers:
+    mask = int.from_bytes(row.binary("2"), "big")
+    if not 0 < mask.bit_length() <= WINDOW:
+        raise row.wrong("2", f"a mask of 1 to {WINDOW} bits", f"{mask.bit_length()} bits")
+    return SeenNumbers(row.epoch("0"), row.whole("1"), mask)
+
+
+def _read_recorded(one: Document) -> Recorded:
+    points = one.optional("points", one.binary)
+    return Recorded(
+        schemas.decode(one.binary("detections"), schemas.Detections, limits=schemas.STORED),
+        None if points is None else schemas.decode(points, schemas.Points, limits=schemas.STORED),
+        one.flag("missed"),
+        one.whole("revision"),
+    )
+
+
+def _read_state(one: Document, classes: int) -> FilterState:
+    columns = schemas.read_columns(one.map("density"))
+    cursor = one.row("course", 6)
+    last = None if one.absent("last") else one.row("last", 3)
+    tracked = None if one.absent("tracked") else one.row("tracked", 2)
+    where = one.document("whereabouts")
+    return FilterState(
+        density=optipmb.density_of(one.whole("stamp_ns", low=-1), one.whole("next_id"), columns, classes),
+        session=one.text("session"),
+        starts=one.whole("starts"),
+        generation=one.whole("generation"),
+        cursor=Cursor(
+            cursor.optional("0", cursor.epoch),
+            cursor.whole("1"),
+            cursor.whole("2"),
+            cursor.whole("3"),
+            cursor.whole("4"),
+            cursor.optional("5", cursor.whole),
+        ),
+        last=None if last is None else FrameId(last.epoch("0"), last.whole("1"), last.whole("2")),
+        tracked=None if tracked is None else (tracked.epoch("0"), tracked.whole("1")),
+        tracks=one.whole("tracks"),
+        counts=FrameCounts(**one.document("counts").wholes(FrameCounts.__slots__)),
+        reported=frozenset(one.texts("reported")),
+        pose_history=PoseHistory(
+            stamp_ns=where.optional("stamp_ns", where.whole),
+            position=where.position("position"),
+            astray=where.whole("astray"),
+            astray_ns=where.whole("astray_ns"),
+            astray_position=where.position("astray_position"),
+        ),
+    )
+
+
+_READERS: Final[dict[int, Callable[[Document], Checkpoint]]] = {1: _read_1}
+
+
+def digest_of(checkpoint: Checkpoint) -> str:
+    """Return 32 hexadecimal digits over all that later tracks depend on, which counts of messages are no part of."""
+    return hashlib.blake2b(state_bytes(checkpoint), digest_size=DIGEST).hexdigest()
+
+
+def forgotten(checkpoint: Checkpoint) -> Checkpoint:
+    """Return a checkpoint of a session that was reset, without its counts: what remains of a stream that was closed."""
+    state = replace(checkpoint.head, counts=FrameCounts())
+    return replace(checkpoint, base=state, head=state, window=(), deliveries=Deliveries())

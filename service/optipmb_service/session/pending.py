@@ -1,0 +1,180 @@
+"""What arrived and was not gone through yet: clouds, and frames that are held until they are ready.
+
+A frame is held for its point cloud and, after a restore, for frames before it that may still come. The timeline here is
+that of the past with the frames held: a frame is judged by it when it arrives, and by the past's when its turn comes.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from optipmb_service.session.cloud_buffer import CloudBuffer
+from optipmb_service.session.timeline import FrameId, hold_until
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import optipmb_schemas as schemas
+
+    import optipmb
+    from optipmb_service.session.state import FilterState
+    from optipmb_service.session.timeline import Timeline
+    from optipmb_service.session.values import Policy
+
+    Order = tuple[int, int, int]
+
+MAX_HELD: Final = 64
+"""Frames held for their clouds at once; beyond it the oldest goes on without."""
+
+MAX_RECOVERING: Final = 1024
+"""Frames held for missed ones at once; beyond it they go on with a gap."""
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """A frame that arrived.
+
+    Attributes:
+        message: as it came.
+        mark: what identifies it.
+        order: where it belongs among the others.
+        frame: what the tracker takes.
+        ignored: objects left out of it.
+        deadline_ns: until when it waits for its cloud (monotonic); None: it does not.
+        ticket: what the caller gave with it.
+    """
+
+    message: schemas.Detections
+    frame_id: FrameId
+    order: Order
+    frame: optipmb.Frame
+    ignored: int
+    deadline_ns: int | None
+    ticket: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """A frame whose turn it is, with its cloud; `missed` says that it waited for one in vain."""
+
+    held: Held
+    points: schemas.Points | None
+    missed: bool
+
+
+class PendingFrames:
+    """The frames held, in the order in which they will be processed, and the clouds.
+
+    Args:
+        policy: how long frames wait; may be replaced.
+        timeline: of the past.
+    """
+
+    def __init__(self, policy: Policy, timeline: Timeline) -> None:
+        self.policy = policy
+        self.timeline = timeline
+        self.clouds = CloudBuffer(policy.clouds)
+        self._held: list[Held] = []
+        self.recovery_ns: int | None = None
+        """Until when frames behind a gap are held for those missing (monotonic); None: they are not."""
+
+    def __len__(self) -> int:
+        return len(self._held)
+
+    def add(
+        self,
+        message: schemas.Detections,
+        order: Order,
+        frame: optipmb.Frame,
+        ignored: int,
+        arrived_ns: int,
+        ticket: Any,
+    ) -> None:
+        """Put a frame where it belongs; the arguments are those of `Held`, and when it arrived (monotonic)."""
+        frame_id = FrameId(message.epoch, message.seq, message.stamp_ns)
+        deadline_ns = hold_until(
+            has_points=message.has_points,
+            stamp_ns=frame_id.stamp_ns,
+            arrived_ns=arrived_ns,
+            newest_cloud_ns=self.clouds.newest_ns,
+            cloud_wait_ns=self.policy.cloud_wait_ns,
+            cloud_memory_ns=self.policy.cloud_memory_ns,
+        )
+        insort(
+            self._held, Held(message, frame_id, order, frame, ignored, deadline_ns, ticket), key=lambda one: one.order
+        )
+
+    def follow(self, past: Timeline, base: FilterState, gone: frozenset[FrameId]) -> None:
+        """Take over where the past is now.
+
+        Args:
+            past: its timeline.
+            base: the state before its window.
+            gone: the frames that have left the window.
+        """
+        if gone:
+            self.timeline = self.timeline.settle(base.cursor, base.last, gone)
+            if base.last is not None:
+                self.clouds.forget_before(base.last.stamp_ns, self.policy.gap_limit_ns)
+        if not self._held:
+            self.timeline = past
+
+    def clear(self) -> int:
+        """Drop all; returns how many there were."""
+        count = len(self._held)
+        self._held.clear()
+        return count
+
+    def deadline_ns(self, complete: Callable[[FrameId], bool]) -> int | None:
+        """Return when `take` is due (monotonic); None while nothing waits.
+
+        Args:
+            complete: whether no frame is missing before one.
+        """
+        if not self._held:
+            return None
+        head = self._held[0]
+        return self.recovery_ns if self._behind_gap(head, complete) else head.deadline_ns
+
+    def take(
+        self,
+        now_ns: int | None,
+        complete: Callable[[FrameId], bool],
+    ) -> Ready | None:
+        """Return the next frame if it is ready, None otherwise.
+
+        Args:
+            now_ns: monotonic time; None: nothing waits any longer.
+            complete: whether no frame is missing before one.
+        """
+        if now_ns is not None and self.recovery_ns is not None and now_ns >= self.recovery_ns:
+            self.recovery_ns = None
+        if not self._held:
+            return None
+        head = self._held[0]
+        if now_ns is not None and len(self._held) <= MAX_RECOVERING and self._behind_gap(head, complete):
+            return None
+        points = self._cloud(head)
+        missed = points is None and head.deadline_ns is not None
+        many = len(self._held) > MAX_HELD and self.recovery_ns is None
+        if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not (many or self._crowded(head)):
+            return None
+        del self._held[0]
+        return Ready(head, points, missed)
+
+    def _cloud(self, held: Held) -> schemas.Points | None:
+        if held.message.has_points is False:
+            return None
+        return self.clouds.get(held.frame_id.epoch, held.frame_id.stamp_ns, self.timeline.knows)
+
+    def _crowded(self, held: Held) -> bool:
+        """Whether longer waiting for a cloud would cost the frames behind it theirs.
+
+        Else one lost cloud would: each frame would find its own pushed off by the time that the one before was let go.
+        """
+        return self.clouds.full_behind(held.frame_id.stamp_ns)
+
+    def _behind_gap(self, head: Held, complete: Callable[[FrameId], bool]) -> bool:
+        return self.recovery_ns is not None and not complete(head.frame_id)

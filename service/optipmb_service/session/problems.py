@@ -1,0 +1,76 @@
+"""The problems that a service reports: their codes, and how a problem is made so that its texts fit the message."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import optipmb_schemas as schemas
+
+CODES: Final = {
+    "malformed": ("The bytes are no message.", "Check the publisher's encoder; compare with the JSON Schemas."),
+    "wrong_type": ("Another message type than belongs on the key.", "Check the key and the encoding of the publisher."),
+    "unsupported_version": ("A major version that this service does not know.", "Update the service or the publisher."),
+    "too_large": ("A size, count or nesting above the limit.", "Send less, or raise `limits`."),
+    "missing_field": ("A required field is absent.", "Send the field that `path` names."),
+    "invalid_value": ("A field has a wrong value; the whole frame is refused.", "Look at `path`: NaN, sizes, scores?"),
+    "unknown_class": (
+        "Objects of a class that the profile lacks are left out; told once per session.",
+        "Choose another profile, or send the names of its classes.",
+    ),
+    "late": (
+        "The frame came later than the window in which tracks are corrected.",
+        "Publish in order, or raise `rewind_s`.",
+    ),
+    "duplicate_epoch": ("A publisher that another one has replaced still sends.", "Stop one of the two publishers."),
+    "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or give more processors."),
+    "refused": ("No room for another session, or a change that needs a restart.", "Raise `max_sessions`; see `path`."),
+    "astray": (
+        "The sensor cannot have got there since its last frame; the frame is refused.",
+        "Check the localisation; if it is right, raise `max_speed`.",
+    ),
+    "internal": (
+        "A fault of the service; the session is quarantined, its last frames are saved.",
+        "Report it with the saved file; `optipmb track --dump` replays it.",
+    ),
+    "quarantined": (
+        "Tracking this stream failed, see `internal`; its frames are refused.",
+        "Reset the session, or restart the publisher.",
+    ),
+}
+"""Every code of a problem: what it means, and what to do."""
+
+MAX_TEXT: Final = 500
+"""Characters of a text in a problem."""
+
+
+def problem_of(  # noqa: PLR0913 - all keywords, each a field of the message
+    code: str,
+    *,
+    stream: str,
+    instance: str,
+    message: str,
+    path: str = "",
+    expected: str = "",
+    received: str = "",
+    seq: int | None = None,
+    stamp_ns: int | None = None,
+    count: int = 1,
+) -> schemas.Problem:
+    """Return a problem, its texts printable and cut to what the message allows."""
+    return schemas.Problem(
+        stream=stream,
+        instance=instance,
+        code=code,
+        path=_fit(path),
+        expected=_fit(expected),
+        received=_fit(received),
+        message=_fit(message),
+        seq=seq,
+        stamp_ns=stamp_ns,
+        count=count,
+    )
+
+
+def _fit(text: str) -> str:
+    text = "".join(character if character.isprintable() else "?" for character in text[: MAX_TEXT + 1])
+    return text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 3] + "..."

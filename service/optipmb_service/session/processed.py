@@ -1,0 +1,124 @@
+"""What a session has gone through and where it stands: the timeline of its frames, its window and what steps them.
+
+The three change together. A frame that is ready is put among the others (`placed`, `amended`: pure), the frames
+are gone through (`go`), and what no longer belongs to the window leaves it (`settle`). Whatever a step raises, nothing
+has changed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from optipmb_service.session.checkpoint import Recorded
+from optipmb_service.session.reorder_window import ReorderWindow
+from optipmb_service.session.restored_window import window_of
+from optipmb_service.session.state import Entry, weigh
+from optipmb_service.session.timeline import Timeline
+from optipmb_service.session.transition import Transition, empty
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import optipmb_schemas as schemas
+
+    from optipmb_service.session.checkpoint import Checkpoint
+    from optipmb_service.session.pending import Ready
+    from optipmb_service.session.state import FilterState
+    from optipmb_service.session.timeline import Decision, FrameId
+    from optipmb_service.session.transition import Outcome
+    from optipmb_service.session.values import Lineage, Policy
+
+
+class ProcessedFrames:
+    """The frames that a session processed, up to the present state.
+
+    Args:
+        transition: goes from one state to the next.
+        policy: how far back the window reaches.
+        life: what an earlier session of the stream left behind.
+    """
+
+    def __init__(self, transition: Transition, policy: Policy, life: Lineage) -> None:
+        self.transition = transition
+        self._policy = policy
+        self.timeline = Timeline(policy.gap_limit_ns)
+        self._history = ReorderWindow(empty(transition, None, life.next_id, life.starts), transition.step)
+
+    @property
+    def head(self) -> FilterState:
+        """The present state."""
+        return self._history.head
+
+    @property
+    def base(self) -> FilterState:
+        """The moment before the window."""
+        return self._history.base
+
+    @property
+    def entries(self) -> Sequence[Entry]:
+        """The frames of the window in the order of processing."""
+        return self._history.entries
+
+    def complete_until(self, frame_id: FrameId) -> bool:
+        """Whether no frame is missing between the last one tracked of its epoch and this one."""
+        return self.timeline.complete_until(frame_id, self.head.tracked)
+
+    def placed(self, ready: Ready, decision: Decision, timeline: Timeline) -> list[Entry]:
+        """Return the frames of the window with one more among them.
+
+        Args:
+            ready: the frame.
+            decision: that it is admitted.
+            timeline: with it.
+        """
+        frame_id, message, points = ready.held.frame_id, ready.held.message, ready.points
+        frame, ignored, weight = ready.held.frame, ready.held.ignored, weigh(message, points)
+        entry = Entry(frame_id, decision.place, message, points, ready.missed, 0, frame, ignored, weight)
+        return [*self.entries, entry] if decision.last else self._history.inserted(entry, timeline.places())
+
+    def amended(self, points: schemas.Points) -> list[Entry] | None:
+        """Return the frames of the window, a late cloud given to those that lack it; None when none does."""
+        placed = self._history.amended(points, self.timeline.knows)
+        return None if all(new is old for new, old in zip(placed, self.entries, strict=True)) else placed
+
+    def go(self, placed: Sequence[Entry], *, behind: bool) -> list[Outcome]:
+        """Go through the frames from the first that is not as it was; returns what became of each in order.
+
+        Args:
+            placed: the frames of the window as they are to be.
+            behind: whether the last one alone is new.
+
+        Raises:
+            Exception: whatever the tracker raises.
+        """
+        return self._history.append(placed[-1]) if behind else self._history.redo(placed)
+
+    def settle(self, timeline: Timeline) -> frozenset[FrameId]:
+        """Take over the timeline with what was gone through; returns the frames that have left the window by it."""
+        gone = self._history.trim(self._policy)
+        self.timeline = timeline.settle(self.base.cursor, self.base.last, gone) if gone else timeline
+        return gone
+
+    def note(self, frame_id: FrameId) -> None:
+        """Remember that a frame came which is not to be processed."""
+        self.timeline = self.timeline.note(frame_id)
+
+    def begin(self, state: FilterState, transition: Transition | None = None) -> None:
+        """Go on from a moment without a way back behind it; with another transition when the profile changes."""
+        self.transition = transition or self.transition
+        self._history = ReorderWindow(state, self.transition.step)
+        self.timeline = self.timeline.settle(state.cursor, state.last, frozenset(self.timeline.frame_ids))
+
+    def portable(self) -> tuple[FilterState, tuple[Recorded, ...]]:
+        """Return the beginning and the frames of as much of the window as a checkpoint takes along."""
+        base, entries = self._history.portable(self._policy.checkpoint_bytes)
+        return base, tuple(Recorded(one.message, one.points, one.missed, one.revision, one.packed) for one in entries)
+
+    def resume(self, checkpoint: Checkpoint) -> None:
+        """Take up what was written down.
+
+        Raises:
+            CheckpointError: its frames do not fit together.
+        """
+        self.timeline, entries = window_of(checkpoint, self._policy.gap_limit_ns)
+        self._history = ReorderWindow(checkpoint.base, self.transition.step, entries, checkpoint.head)

@@ -1,0 +1,83 @@
+"""What a session has to say about frames that it does not take, as the messages that are published for them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from optipmb_service.session.problems import problem_of
+from optipmb_service.session.values import SECOND
+
+if TYPE_CHECKING:
+    import optipmb_schemas as schemas
+
+    import optipmb
+    from optipmb_service.session.state import Entry
+    from optipmb_service.session.timeline import FrameId
+    from optipmb_service.session.values import Policy
+
+
+class Refusals:
+    """Makes the problems of one stream.
+
+    Args:
+        stream: `site/node/sensor`.
+        instance: name of the service.
+    """
+
+    def __init__(self, stream: str, instance: str) -> None:
+        self._stream = stream
+        self._instance = instance
+
+    def invalid(self, frame_id: FrameId, error: optipmb.OptipmbError) -> schemas.Problem:
+        """A value that the tracker does not take."""
+        return self._problem("invalid_value", frame_id, error.path, error.expected, error.received)
+
+    def late(self, frame_id: FrameId, jump_ns: int) -> schemas.Problem:
+        """A frame that can no longer be put in its place."""
+        return self._problem("late", frame_id, "stamp_ns", "a frame inside the window", f"{jump_ns / SECOND:+.3f} s")
+
+    def retired(self, frame_id: FrameId) -> schemas.Problem:
+        """A publisher that was succeeded and still sends."""
+        expected = "the newest publisher of the stream; an earlier one still sends"
+        return self._problem("duplicate_epoch", frame_id, "epoch", expected, frame_id.epoch.hex())
+
+    def astray(self, entry: Entry, policy: Policy) -> schemas.Problem:
+        """A pose where the sensor cannot be."""
+        pose = entry.message.pose
+        received = "nothing" if pose is None else ", ".join(f"{value:.1f}" for value in pose.translation)
+        expected = f"a position within reach of the last one at {policy.max_speed:g} m/s"
+        return self._problem("astray", entry.frame_id, "pose.translation", expected, received)
+
+    def failed(self, frame_id: FrameId, error: str) -> schemas.Problem:
+        """A step that raised."""
+        return self._problem("internal", frame_id, "", "a step of the tracker without an error", error)
+
+    def quarantined(self, frame_id: FrameId, error: str) -> schemas.Problem:
+        """A frame of a session that takes none."""
+        expected = "a reset or a restarted publisher: the session is quarantined"
+        return self._problem("quarantined", frame_id, "", expected, error)
+
+    def unknown(
+        self, frame_id: FrameId, found: dict[str, int], parameters: optipmb.Parameters
+    ) -> list[schemas.Problem]:
+        """Classes that the profile lacks, with the number of objects of each."""
+        expected = f"one of {', '.join(parameters.classes)} (profile {parameters.name})"
+        return [
+            self._problem("unknown_class", frame_id, "labels", expected, repr(label)).model_copy(
+                update={"count": count}
+            )
+            for label, count in found.items()
+        ]
+
+    def _problem(self, code: str, frame_id: FrameId, path: str, expected: str, received: str) -> schemas.Problem:
+        return problem_of(
+            code,
+            stream=self._stream,
+            instance=self._instance,
+            path=path,
+            expected=expected,
+            received=received,
+            message=f"Frame {frame_id.seq}: {path or 'tracker'}: expected {expected}, received {received}.",
+            seq=frame_id.seq,
+            stamp_ns=frame_id.stamp_ns,
+        )

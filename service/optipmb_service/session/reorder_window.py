@@ -1,0 +1,157 @@
+"""The window of a session that can be gone back over: a moment, the frames since, and the state after each of them.
+
+A frame that comes late is put between those that it belongs between, and those behind it are gone through once more,
+as is done for a cloud that comes late. What then stands at the end is what would stand there had everything come in
+order, to the last byte, because a step is a pure function and nothing else leads from one state to the next. That
+holds across the cuts between lives of the density too, and for the first frame of one.
+
+The window is the longest row of newest frames that lies within a span of sensor time, a number of frames and a number
+of bytes: again a function of the frames alone, so that sessions that took the same frames have the same window.
+States take memory and are easily computed again, so they are not written into checkpoints; after a restore they are
+made up for when they are needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    import optipmb_schemas as schemas
+
+    from optipmb_service.session.state import Entry, FilterState
+    from optipmb_service.session.timeline import FrameId, Placement
+    from optipmb_service.session.transition import Outcome
+    from optipmb_service.session.values import Policy
+
+    Step = Callable[[FilterState, Entry], tuple[FilterState, Outcome]]
+
+
+class ReorderWindow:
+    """Where a session is and how it came there.
+
+    Args:
+        base: the state before the window.
+        step: goes from one state to the next by a frame; may raise, then nothing has changed here.
+        entries: the frames of the window in the order of processing.
+        head: the state after them.
+    """
+
+    def __init__(
+        self, base: FilterState, step: Step, entries: Sequence[Entry] = (), head: FilterState | None = None
+    ) -> None:
+        self.base = base
+        self._step = step
+        self._entries = list(entries)
+        self._after: list[FilterState | None] = [None] * len(self._entries)
+        if self._entries:
+            self._after[-1] = head
+
+    @property
+    def head(self) -> FilterState:
+        """The present state."""
+        return self.state(len(self._entries))
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """The frames of the window in the order of processing."""
+        return tuple(self._entries)
+
+    def state(self, number: int) -> FilterState:
+        """Return the state after so many frames of the window; it is computed when it is not there."""
+        known = number
+        while known and self._after[known - 1] is None:
+            known -= 1
+        state = self._after[known - 1] if known else self.base
+        assert state is not None  # noqa: S101 - the search ended at one that is there; said for the type checker
+        for at in range(known, number):
+            state, _ = self._step(state, self._entries[at])
+            self._after[at] = state
+        return state
+
+    def append(self, entry: Entry) -> list[Outcome]:
+        """Go on by a frame that belongs behind all others and moves none."""
+        state, outcome = self._step(self.head, entry)
+        self._entries.append(entry)
+        self._after.append(state)
+        return [outcome]
+
+    def inserted(self, entry: Entry, places: Mapping[FrameId, Placement]) -> list[Entry]:
+        """Return the frames of the window with one more among them, all where they belong then."""
+        placed = [
+            old if old.place == (place := places[old.frame_id]) else replace(old, place=place) for old in self._entries
+        ]
+        return sorted([*placed, entry], key=lambda one: one.order)
+
+    def amended(self, points: schemas.Points, publishers: Callable[[bytes], bool]) -> list[Entry]:
+        """Return the frames of the window, a late cloud given to those of its stamp that lack one.
+
+        Args:
+            points: the cloud.
+            publishers: whether detections came in an epoch; see `CloudBuffer.get`.
+        """
+        return [
+            replace(one, points=points, missed=False, weight=one.weight + points.xyz.nbytes, packed={})
+            if one.frame_id.stamp_ns == points.stamp_ns
+            and one.points is None
+            and one.message.has_points is not False
+            and (one.frame_id.epoch == points.epoch or not publishers(points.epoch))
+            else one
+            for one in self._entries
+        ]
+
+    def redo(self, placed: Sequence[Entry]) -> list[Outcome]:
+        """Take over other frames, and go through them again from the first that differs.
+
+        Returns:
+            What became of each of them in order; those that were there before get a higher revision.
+        """
+        old = self._entries
+        same = (new is one for new, one in zip(placed, old, strict=False))
+        first = next((i for i, one in enumerate(same) if not one), min(len(placed), len(old)))
+        known = {entry.frame_id for entry in old}
+        entries = list(placed)
+        state = self.state(first)
+        after: list[FilterState] = []
+        outcomes: list[Outcome] = []
+        for i in range(first, len(entries)):
+            if entries[i].frame_id in known:
+                entries[i] = replace(entries[i], revision=entries[i].revision + 1)
+            state, outcome = self._step(state, entries[i])
+            after.append(state)
+            outcomes.append(outcome)
+        self._entries = entries
+        self._after = [*self._after[:first], *after]
+        return outcomes
+
+    def trim(self, policy: Policy) -> frozenset[FrameId]:
+        """Let what no longer belongs to the window go; returns which frames that were."""
+        keep = self._fitting(policy.rewind_ns, policy.rewind_frames, policy.rewind_bytes)
+        cut = len(self._entries) - keep
+        if not cut:
+            return frozenset()
+        self.base = self.state(cut)
+        gone = frozenset(entry.frame_id for entry in self._entries[:cut])
+        del self._entries[:cut], self._after[:cut]
+        return gone
+
+    def portable(self, most_bytes: int) -> tuple[FilterState, tuple[Entry, ...]]:
+        """Return the beginning and the frames of the longest part of the window that takes at most so many bytes."""
+        cut = len(self._entries) - self._fitting(None, len(self._entries), most_bytes)
+        return self.state(cut), tuple(self._entries[cut:])
+
+    def _fitting(self, span_ns: int | None, most: int, most_bytes: int) -> int:
+        """Return how many of the newest frames fit."""
+        elapsed, weight, number = 0, 0, 0
+        later: Entry | None = None
+        for entry in reversed(self._entries):
+            if later is not None and later.place.generation == entry.place.generation:
+                elapsed += later.frame_id.stamp_ns - entry.frame_id.stamp_ns
+            weight += entry.weight
+            if number >= most or weight > most_bytes or (span_ns is not None and elapsed > span_ns) or span_ns == 0:
+                break
+            number += 1
+            later = entry
+        return number

@@ -1,0 +1,131 @@
+"""The state of a session between two frames, and the frames themselves, as values that never change.
+
+A `FilterState` holds all that a frame's tracks follow from, and nothing that depends on how messages were delivered. So
+two sessions that took the same frames have equal states, whatever came twice, late or before a crash.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from optipmb_service.session.timeline import Cursor, FrameId, Placement
+
+if TYPE_CHECKING:
+    import optipmb_schemas as schemas
+
+    import optipmb
+
+
+@dataclass(frozen=True, slots=True)
+class FrameCounts:
+    """What became of the frames that were processed.
+
+    Attributes:
+        frames: tracked.
+        gaps: missing between those tracked.
+        new_epochs: how often the publisher started anew or its stamps jumped.
+        clouds_used: tracked with their cloud.
+        clouds_missed: that waited for a cloud in vain.
+        astray: refused because the sensor cannot have been there.
+        repaired: covariances that had lost rank in rounding and were repaired.
+    """
+
+    frames: int = 0
+    gaps: int = 0
+    new_epochs: int = 0
+    clouds_used: int = 0
+    clouds_missed: int = 0
+    astray: int = 0
+    repaired: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class PoseHistory:
+    """Where the sensor was, for judging where it can be.
+
+    Attributes:
+        stamp_ns: when; None before the first frame with a pose.
+        position: x, y, z in the world, m.
+        astray: frames in a row that were refused because they were too far from there.
+        astray_ns: when the newest of these was.
+        astray_position: and where.
+    """
+
+    stamp_ns: int | None = None
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    astray: int = 0
+    astray_ns: int = 0
+    astray_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FilterState:
+    """A session between two frames.
+
+    Attributes:
+        density: after the last frame.
+        session: id of the present life of the density.
+        starts: lives so far.
+        generation: see `timeline`; of the last frame tracked.
+        course: what the frames so far mean for the next.
+        last: the last frame processed, tracked or not.
+        tracked: epoch and highest sequence number of the frames tracked, for counting gaps.
+        tracks: number of tracks at the last frame tracked.
+        counts: what became of the frames.
+        reported: unknown classes that were reported in this life.
+        whereabouts: of the sensor.
+    """
+
+    density: optipmb.Density
+    session: str
+    starts: int = 0
+    generation: int = 0
+    cursor: Cursor = field(default_factory=Cursor)
+    last: FrameId | None = None
+    tracked: tuple[bytes, int] | None = None
+    tracks: int = 0
+    counts: FrameCounts = FrameCounts()
+    reported: frozenset[str] = frozenset()
+    pose_history: PoseHistory = PoseHistory()
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A frame that is or was processed.
+
+    Attributes:
+        mark: which.
+        place: where it belongs.
+        message: its detections.
+        points: its cloud.
+        missed: whether it waited for a cloud in vain.
+        revision: of the tracks that were published last for it.
+        frame: the detections as the tracker reads them, without the cloud.
+        ignored: how many were left out because the profile lacks their class.
+        weight: bytes that its inputs take, nearly.
+        packed: its messages as bytes, once a checkpoint has made them: they are in one checkpoint after the other.
+    """
+
+    frame_id: FrameId
+    place: Placement
+    message: schemas.Detections
+    points: schemas.Points | None
+    missed: bool
+    revision: int
+    frame: optipmb.Frame
+    ignored: int
+    weight: int
+    packed: dict[str, bytes] = field(default_factory=dict, compare=False)
+
+    @property
+    def order(self) -> tuple[int, int, int]:
+        """The key by which frames are processed."""
+        return self.place.order(self.frame_id)
+
+
+def weigh(message: schemas.Detections, points: schemas.Points | None) -> int:
+    """Return the bytes that the inputs of a frame take, nearly."""
+    arrays = (message.label, message.center, message.size, message.yaw, message.score, message.velocity)
+    size = 256 + sum(array.nbytes for array in arrays if array is not None)
+    return size + (points.xyz.nbytes if points is not None else 0)

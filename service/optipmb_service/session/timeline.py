@@ -1,0 +1,354 @@
+"""All decisions about time, as pure functions of the frames seen so far; no clock is read here.
+
+Conventions. A frame is known by its `FrameId`: the epoch of its publisher (new at every start of it), the sequence
+number in that epoch, and the sensor's stamp in nanoseconds. Two clocks occur and are never mixed: sensor stamps, and
+the local monotonic clock (`now_ns`), which serves only for waiting.
+
+A stream is cut into *eras*: a new one begins with every publisher epoch and with every jump of the stamps. A
+*generation* is what one density lives through: eras that only continue another share it, a restart begins the next
+one. Where the cuts lie follows from the frames in their publisher's order, epoch by epoch and number by number
+(`Cursor.follow`); within an era frames are processed by stamp, equal stamps by sequence number.
+
+Both are functions of which frames there are, not of when each came. So a frame that comes late is put where it belongs,
+also before a cut, and the cuts move as they must: `Timeline.places` says where every frame of the window belongs now.
+Behind the window nothing moves any more. What is later than that is `Verdict.LATE`.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect
+from dataclasses import dataclass, replace
+from enum import StrEnum, unique
+from typing import Final
+
+WINDOW: Final = 1024
+"""How many sequence numbers back a frame of an epoch is remembered; older unseen ones count as late."""
+
+EPOCHS: Final = 32
+"""How many publisher epochs are remembered."""
+
+
+@unique
+class Verdict(StrEnum):
+    """What becomes of a frame."""
+
+    FIRST = "first"
+    """The first frame of the stream: a session begins."""
+    NEXT = "next"
+    """In order: it continues the density."""
+    NEW_EPOCH = "new_epoch"
+    """The publisher was restarted and its stamps go on: the density is kept, sequence numbers begin anew."""
+    RESTART = "restart"
+    """The stamps jumped, ahead or back: this session begins anew with this frame."""
+    INSERTED = "inserted"
+    """Frames behind it came before it, and it is inside the window: it is put in its place."""
+    DUPLICATE = "duplicate"
+    """The same epoch and sequence number came before: dropped."""
+    LATE = "late"
+    """Frames behind it can no longer be taken back: refused."""
+    RETIRED = "retired"
+    """From a publisher epoch that another one has succeeded: refused."""
+
+    @property
+    def admitted(self) -> bool:
+        """Whether the frame is to be processed."""
+        return self not in _REFUSED
+
+
+_REFUSED: Final = frozenset({Verdict.DUPLICATE, Verdict.LATE, Verdict.RETIRED})
+
+
+@dataclass(frozen=True, slots=True)
+class FrameId:
+    """What identifies and orders a frame.
+
+    Attributes:
+        epoch: 16 bytes, new at every start of the publisher.
+        seq: counts the publisher's frames in the epoch.
+        stamp_ns: sensor time, nanoseconds.
+    """
+
+    epoch: bytes
+    seq: int
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where a frame belongs among the others.
+
+    Attributes:
+        era: the era that it belongs to.
+        generation: counts restarts; a frame of a higher generation than the one before it starts the session anew.
+        floor_ns: in an era that continues another, the stamp that the other one reached; None elsewhere.
+        opens: whether it begins its era, and how: first, new_epoch, restart; next where it does not.
+        jump_ns: how far its stamp lies from the newest one before it in its publisher's order.
+    """
+
+    era: int
+    generation: int
+    floor_ns: int | None
+    opens: Verdict
+    jump_ns: int
+
+    def order(self, frame_id: FrameId) -> tuple[int, int, int]:
+        """Return the key by which frames are processed."""
+        return self.era, frame_id.stamp_ns, frame_id.seq
+
+
+@dataclass(frozen=True, slots=True)
+class Cursor:
+    """What frames up to some point mean for the one that follows them.
+
+    Attributes:
+        epoch: publisher epoch of the last one, None before the first.
+        seq: highest sequence number in it.
+        era: number of its era.
+        generation: number of restarts.
+        newest_ns: highest stamp of the era.
+        floor_ns: see `Placement`.
+    """
+
+    epoch: bytes | None = None
+    seq: int = 0
+    era: int = 0
+    generation: int = 0
+    newest_ns: int = 0
+    floor_ns: int | None = None
+
+    def follow(self, frame_id: FrameId, gap_limit_ns: int) -> Placement:
+        """Return the place of the frame that comes next in its publisher's order."""
+        if self.epoch is None:
+            return Placement(self.era + 1, self.generation, None, Verdict.FIRST, 0)
+        jump_ns = frame_id.stamp_ns - self.newest_ns
+        if frame_id.epoch != self.epoch and 0 < jump_ns <= gap_limit_ns:
+            return Placement(self.era + 1, self.generation, self.newest_ns, Verdict.NEW_EPOCH, jump_ns)
+        if frame_id.epoch != self.epoch or abs(jump_ns) > gap_limit_ns:
+            return Placement(self.era + 1, self.generation + 1, None, Verdict.RESTART, jump_ns)
+        return Placement(self.era, self.generation, self.floor_ns, Verdict.NEXT, jump_ns)
+
+    def after(self, frame_id: FrameId, place: Placement) -> Cursor:
+        """Return the course after a frame at its place."""
+        newest_ns = max(self.newest_ns, frame_id.stamp_ns) if place.era == self.era else frame_id.stamp_ns
+        seq = max(self.seq, frame_id.seq) if frame_id.epoch == self.epoch else frame_id.seq
+        return Cursor(frame_id.epoch, seq, place.era, place.generation, newest_ns, place.floor_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class SeenNumbers:
+    """Which frames of an epoch came.
+
+    Attributes:
+        epoch: whose.
+        highest: highest sequence number.
+        mask: bit i says whether `highest - i` came, for i below `WINDOW`.
+    """
+
+    epoch: bytes
+    highest: int
+    mask: int
+
+    def has(self, seq: int) -> bool:
+        """Whether a sequence number came, as far as that is remembered."""
+        return 0 <= self.highest - seq < WINDOW and bool(self.mask >> (self.highest - seq) & 1)
+
+    def add(self, seq: int) -> SeenNumbers:
+        """Return it with one more sequence number."""
+        ahead = seq - self.highest
+        if ahead <= 0:
+            return SeenNumbers(self.epoch, self.highest, self.mask | 1 << -ahead)
+        # A sequence number may leap by 2^60: never shift further than the window is wide.
+        shifted = self.mask << ahead if ahead < WINDOW else 0
+        return SeenNumbers(self.epoch, seq, (shifted | 1) & ((1 << WINDOW) - 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """The verdict on one frame.
+
+    Attributes:
+        verdict: what becomes of it.
+        place: where it belongs when it is admitted; for the others only how far it lay from the newest means something.
+        last: whether it is admitted behind all others and moves none of them.
+    """
+
+    verdict: Verdict
+    place: Placement
+    last: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """What is remembered of the frames of a stream.
+
+    Attributes:
+        gap_limit_ns: a step of the stamps beyond this, ahead or back, is a jump.
+        epochs: what came of each epoch, in the order of their appearance; the last one is in force.
+        base: the course up to the window.
+        floor: the last frame before the window in the order of processing; nothing goes before it.
+        marks: the frames of the window in their publisher's order.
+        tip: the course after all of them.
+    """
+
+    gap_limit_ns: int
+    epochs: tuple[SeenNumbers, ...] = ()
+    base: Cursor = Cursor()
+    floor: FrameId | None = None
+    frame_ids: tuple[FrameId, ...] = ()
+    tip: Cursor = Cursor()
+
+    def judge(self, frame_id: FrameId) -> tuple[Decision, Timeline]:
+        """Decide on a frame that arrived; the second result replaces this timeline."""
+        number = self._number(frame_id.epoch)
+        if number < 0:
+            return self._append(frame_id, number)
+        seen = self.epochs[number]
+        if seen.has(frame_id.seq):
+            return self._refuse(frame_id, Verdict.DUPLICATE)
+        if seen.highest - frame_id.seq >= WINDOW:
+            return self._refuse(frame_id, Verdict.LATE)
+        newest = number == len(self.epochs) - 1 and frame_id.seq > seen.highest
+        return self._append(frame_id, number) if newest else self._insert(frame_id, number)
+
+    def places(self) -> dict[FrameId, Placement]:
+        """Return where each frame of the window belongs."""
+        return dict(zip(self.frame_ids, self._arrange(self.frame_ids)[0], strict=True))
+
+    @classmethod
+    def resume(
+        cls,
+        gap_limit_ns: int,
+        epochs: tuple[SeenNumbers, ...],
+        base: Cursor,
+        floor: FrameId | None,
+        frame_ids: frozenset[FrameId],
+    ) -> Timeline:
+        """Return the timeline that had these parts."""
+        timeline = cls(gap_limit_ns, epochs, base, floor)
+        ordered = tuple(sorted(frame_ids, key=lambda one: (timeline._number(one.epoch), one.seq)))
+        return replace(timeline, frame_ids=ordered, tip=timeline._arrange(ordered)[1])
+
+    def knows(self, epoch: bytes) -> bool:
+        """Whether frames came in an epoch."""
+        return self._number(epoch) >= 0
+
+    def note(self, frame_id: FrameId) -> Timeline:
+        """Remember that a frame came which is not to be processed, so that it is not looked at again."""
+        return replace(self, epochs=self._remember(frame_id, self._number(frame_id.epoch)))
+
+    def settle(self, base: Cursor, floor: FrameId | None, gone: frozenset[FrameId]) -> Timeline:
+        """Return it with a later beginning of the window: `gone` are the frames that fell out of it."""
+        frame_ids = self.frame_ids[len(gone) :]  # mostly it was the oldest that went
+        if gone != frozenset(self.frame_ids[: len(gone)]):
+            frame_ids = tuple(frame_id for frame_id in self.frame_ids if frame_id not in gone)
+        return Timeline(self.gap_limit_ns, self.epochs, base, floor, frame_ids, self.tip)
+
+    def complete_until(self, frame_id: FrameId, processed: tuple[bytes, int] | None) -> bool:
+        """Whether no frame is missing between the last one processed of its epoch and this one."""
+        number = self._number(frame_id.epoch)
+        first = processed[1] + 1 if processed is not None and processed[0] == frame_id.epoch else 0
+        if frame_id.seq - first > WINDOW or (number < 0 and frame_id.seq > first):
+            return False
+        return all(self.epochs[number].has(seq) for seq in range(first, frame_id.seq))
+
+    # How
+
+    def _append(self, frame_id: FrameId, number: int) -> tuple[Decision, Timeline]:
+        """Take a frame that is the last one in its publisher's order."""
+        place = self.tip.follow(frame_id, self.gap_limit_ns)
+        if not self._free(frame_id, place):
+            return self._refuse(frame_id, Verdict.LATE)
+        behind = place.era == self.tip.era and frame_id.stamp_ns < self.tip.newest_ns
+        epochs, frame_ids, tip = (
+            self._remember(frame_id, number),
+            (*self.frame_ids, frame_id),
+            self.tip.after(frame_id, place),
+        )
+        timeline = Timeline(self.gap_limit_ns, epochs, self.base, self.floor, frame_ids, tip)
+        return Decision(Verdict.INSERTED if behind else place.opens, place, last=not behind), timeline
+
+    def _insert(self, frame_id: FrameId, number: int) -> tuple[Decision, Timeline]:
+        """Take a frame that others came before which its publisher sent after it."""
+        seen = self.epochs[number]
+        succeeded = number < len(self.epochs) - 1 and frame_id.seq > seen.highest
+        refusal = Verdict.RETIRED if succeeded else Verdict.LATE
+        if number < self._number(self.base.epoch):
+            return self._refuse(frame_id, refusal)
+        at = bisect(self.frame_ids, (number, frame_id.seq), key=lambda one: (self._number(one.epoch), one.seq))
+        frame_ids = (*self.frame_ids[:at], frame_id, *self.frame_ids[at:])
+        places, tip = self._arrange(frame_ids)
+        place = places[at]
+        if not all(map(self._free, frame_ids, places)):
+            return self._refuse(frame_id, refusal)
+        if frame_id.epoch == self.base.epoch and frame_id.seq < self.base.seq and place.opens is not Verdict.NEXT:
+            # What was sent before the window cannot be what opens an era behind it: it merely took long.
+            return self._refuse(frame_id, refusal)
+        if succeeded and not self._before_successor(at, places):
+            return self._refuse(frame_id, refusal)
+        order = place.order(frame_id)
+        behind = any(other.order(one) > order for one, other in zip(frame_ids, places, strict=True))
+        last = not behind and at == len(self.frame_ids)
+        timeline = replace(self, epochs=self._remember(frame_id, number), frame_ids=frame_ids, tip=tip)
+        return Decision(place.opens if last else Verdict.INSERTED, place, last=last), timeline
+
+    def _before_successor(self, at: int, places: tuple[Placement, ...]) -> bool:
+        """Whether the last frame of a stopped publisher was only overtaken by its successor's first, and fits."""
+        follows = at + 1 < len(places) and places[at + 1].opens is Verdict.NEW_EPOCH
+        before = self._arrange(self.frame_ids)[0]
+        others = (*places[:at], *places[at + 1 :])
+        return follows and [place.generation for place in others] == [place.generation for place in before]
+
+    def _arrange(self, frame_ids: tuple[FrameId, ...]) -> tuple[tuple[Placement, ...], Cursor]:
+        cursor, places = self.base, []
+        for frame_id in frame_ids:
+            place = cursor.follow(frame_id, self.gap_limit_ns)
+            cursor = cursor.after(frame_id, place)
+            places.append(place)
+        return tuple(places), cursor
+
+    def _free(self, frame_id: FrameId, place: Placement) -> bool:
+        """Whether a place lies behind the window's beginning and behind what its era continues."""
+        if place.floor_ns is not None and frame_id.stamp_ns <= place.floor_ns:
+            return False
+        if self.floor is None:
+            return True
+        return place.order(frame_id) > (self.base.era, self.floor.stamp_ns, self.floor.seq)
+
+    def _refuse(self, frame_id: FrameId, verdict: Verdict) -> tuple[Decision, Timeline]:
+        jump_ns = 0 if self.tip.epoch is None else frame_id.stamp_ns - self.tip.newest_ns
+        return Decision(verdict, Placement(self.tip.era, self.tip.generation, None, verdict, jump_ns)), self
+
+    def _number(self, epoch: bytes | None) -> int:
+        for number in range(len(self.epochs) - 1, -1, -1):
+            if self.epochs[number].epoch == epoch:
+                return number
+        return -1
+
+    def _remember(self, frame_id: FrameId, number: int) -> tuple[SeenNumbers, ...]:
+        if number < 0:
+            return (*self.epochs, SeenNumbers(frame_id.epoch, frame_id.seq, 1))[-EPOCHS:]
+        return (*self.epochs[:number], self.epochs[number].add(frame_id.seq), *self.epochs[number + 1 :])
+
+
+def hold_until(
+    *,
+    has_points: bool | None,
+    stamp_ns: int,
+    arrived_ns: int,
+    newest_cloud_ns: int | None,
+    cloud_wait_ns: int,
+    cloud_memory_ns: int,
+) -> int | None:
+    """Until when (monotonic, ns) a frame without its point cloud waits for it; None: not at all.
+
+    Args:
+        has_points: what the frame says: a cloud comes, none comes, or nothing (None).
+        stamp_ns: the frame's sensor stamp.
+        arrived_ns: monotonic time of the frame's arrival.
+        newest_cloud_ns: highest stamp of the clouds that the stream has sent so far.
+        cloud_wait_ns: the longest wait.
+        cloud_memory_ns: when the frame says nothing, it waits only if its stamp is this close to a cloud's.
+    """
+    if has_points is None:
+        has_points = newest_cloud_ns is not None and abs(stamp_ns - newest_cloud_ns) <= cloud_memory_ns
+    return arrived_ns + cloud_wait_ns if has_points and cloud_wait_ns > 0 else None

@@ -1,0 +1,205 @@
+"""One frame through the tracker: from one state of a session to the next, and the tracks in between.
+
+A pure function of state, frame and parameters, so that frames can be gone through once more whenever one is put
+between them. Whatever it raises, nothing has changed.
+
+A session id names one life of the density. It is derived from the stream, the frame at which that life began and the
+parameters, so that a repeated run gives it again, and a service that was restarted without its checkpoints and went on
+with another frame does not. When a late frame turns out to be the first of a life, the life gets the id that it would
+have had in order; the tracks that were published under the other are corrected like all others behind that frame.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, Literal
+
+import optipmb
+from optipmb_service.session import convert
+from optipmb_service.session.pose_check import judge, position_of
+from optipmb_service.session.state import Entry, FilterState, FrameCounts, PoseHistory
+from optipmb_service.session.timeline import FrameId, Verdict
+
+if TYPE_CHECKING:
+    import optipmb_schemas as schemas
+
+    from optipmb_service.session.values import Policy, Steps
+
+MAX_LABELS: Final = 256
+"""Unknown class names remembered as reported."""
+
+_OPENING: Final = frozenset({Verdict.NEW_EPOCH, Verdict.RESTART})
+
+
+@dataclass(frozen=True, slots=True)
+class SessionStart:
+    """Why a life of the density begins with a frame.
+
+    Attributes:
+        reason: see `values.Begun`.
+        jump_ns: how far the stamps jumped.
+    """
+
+    reason: Literal["first", "jump", "publisher", "pose"]
+    jump_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a frame.
+
+    Attributes:
+        entry: the frame.
+        tracks: its tracks, without their delivery part; None: it was refused, as astray.
+        begins: whether a life began with it.
+        unknown: the classes that the profile lacks, with the number of objects of each, when not reported before.
+    """
+
+    entry: Entry
+    tracks: schemas.Tracks | None
+    begins: SessionStart | None
+    unknown: dict[str, int]
+
+
+class Transition:
+    """Steps the sessions of one stream with one profile.
+
+    Args:
+        stream: `site/node/sensor`.
+        parameters: the profile.
+        tracker: steps the density.
+        policy: where a sensor can be.
+    """
+
+    def __init__(self, stream: str, parameters: optipmb.Parameters, tracker: Steps, policy: Policy) -> None:
+        self.stream = stream
+        self.parameters = parameters
+        self._tracker = tracker
+        self._policy = policy
+        values = json.dumps(parameters.model_dump(mode="json"))
+        self._digest = hashlib.blake2b(values.encode(), digest_size=16).digest()
+
+    def name(self, frame_id: FrameId | None, starts: int) -> str:
+        """Return the id of a life that begins with or after a frame."""
+        digest = hashlib.blake2b(self._digest, digest_size=16, person=b"optipmb-session")
+        where = (frame_id.epoch.hex(), frame_id.seq, frame_id.stamp_ns) if frame_id else ()
+        digest.update(json.dumps([self.stream, starts, *where]).encode())
+        return digest.hexdigest()
+
+    def step(self, before: FilterState, entry: Entry) -> tuple[FilterState, Outcome]:
+        """Go on by one frame.
+
+        Raises:
+            Exception: whatever the tracker raises.
+        """
+        frame_id, place = entry.frame_id, entry.place
+        begins = _begins(before, entry)
+        known = PoseHistory() if begins else before.pose_history
+        pose_history, where = judge(known, frame_id.stamp_ns, position_of(entry.message), self._policy)
+        if where == "astray":
+            counts = _counted(before.counts, entry, astray=1)
+            cursor = before.cursor.after(frame_id, place)
+            passed = replace(before, cursor=cursor, last=frame_id, counts=counts, pose_history=pose_history)
+            return passed, Outcome(entry, None, None, {})
+        if where == "moved":
+            begins = SessionStart("pose", place.jump_ns)
+        return self._track(before, entry, begins, pose_history)
+
+    def _track(
+        self, before: FilterState, entry: Entry, begins: SessionStart | None, pose_history: PoseHistory
+    ) -> tuple[FilterState, Outcome]:
+        frame_id, density, session, starts = entry.frame_id, before.density, before.session, before.starts
+        reported = before.reported
+        if begins:
+            starts += 1
+            session = self.name(frame_id, starts)
+            reported = frozenset()
+            if begins.reason != "first":
+                density = optipmb.Density.empty(density.next_id)
+        frame = entry.frame
+        if entry.points is not None:
+            frame = replace(frame, cloud=convert.cloud_of(entry.points))
+        result = self._tracker.step(density, frame)
+        used = bool(result.diagnostics.cloud_used)
+        same = before.tracked is not None and before.tracked[0] == frame_id.epoch
+        highest = before.tracked[1] if before.tracked is not None and same else frame_id.seq - 1
+        gap = max(0, frame_id.seq - highest - 1)
+        tracks = convert.tracks_of(
+            result.tracks,
+            stream=self.stream,
+            frame_id=frame_id,
+            session=session,
+            revision=entry.revision,
+            parameters=self.parameters,
+            cloud_used=used,
+            gap=gap,
+            ignored=entry.ignored,
+        )
+        unknown = self._unknown(entry, reported) if entry.ignored else {}
+        repaired = int(result.diagnostics.repaired)
+        after = FilterState(
+            density=result.density,
+            session=session,
+            starts=starts,
+            generation=entry.place.generation,
+            cursor=before.cursor.after(frame_id, entry.place),
+            last=frame_id,
+            tracked=(frame_id.epoch, max(highest, frame_id.seq)),
+            tracks=len(tracks.id),
+            counts=_counted(before.counts, entry, tracked=1, gap=gap, used=used, repaired=repaired),
+            reported=reported | unknown.keys() if unknown else reported,
+            pose_history=pose_history,
+        )
+        return after, Outcome(entry, tracks, begins, unknown)
+
+    def _unknown(self, entry: Entry, reported: frozenset[str]) -> dict[str, int]:
+        found = convert.unknown_labels(self.parameters, entry.message)
+        new = sorted(found.keys() - reported)[: max(0, MAX_LABELS - len(reported))]
+        return {label: found[label] for label in found if label in new}
+
+
+def _counted(
+    before: FrameCounts,
+    entry: Entry,
+    *,
+    astray: int = 0,
+    tracked: int = 0,
+    gap: int = 0,
+    used: bool = False,
+    repaired: int = 0,
+) -> FrameCounts:
+    """Return the counts with one more frame."""
+    return FrameCounts(
+        frames=before.frames + tracked,
+        gaps=before.gaps + gap,
+        new_epochs=before.new_epochs + (entry.place.opens in _OPENING),
+        clouds_used=before.clouds_used + used,
+        clouds_missed=before.clouds_missed + entry.missed,
+        astray=before.astray + astray,
+        repaired=before.repaired + repaired,
+    )
+
+
+def empty(
+    transition: Transition, last: FrameId | None, next_id: int, starts: int, counts: FrameCounts | None = None
+) -> FilterState:
+    """Return the moment before the first frame of a stream, or of a profile."""
+    return FilterState(
+        optipmb.Density.empty(next_id), transition.name(last, starts), starts=starts, counts=counts or FrameCounts()
+    )
+
+
+def begins_with(before: FilterState, entry: Entry) -> bool:
+    """Whether the place of a frame makes it begin with an empty density."""
+    return before.last is not None and entry.place.generation != before.generation
+
+
+def _begins(before: FilterState, entry: Entry) -> SessionStart | None:
+    if before.last is None:
+        return SessionStart("first", entry.place.jump_ns)
+    if entry.place.generation != before.generation:
+        other = entry.frame_id.epoch != before.last.epoch
+        return SessionStart("publisher" if other else "jump", entry.place.jump_ns)
+    return None

@@ -1,0 +1,193 @@
+"""What goes into a session and what comes out of it, as plain values; times in nanoseconds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import optipmb_schemas as schemas
+
+if TYPE_CHECKING:
+    import optipmb
+
+SECOND: Final = 1_000_000_000
+
+
+class Steps(Protocol):
+    """What a session needs of a tracker; `optipmb.Tracker` has it."""
+
+    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+        """Return the density after the frame, and its tracks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """The settings that a session follows; lengths in metres, speeds in metres per second.
+
+    Attributes:
+        gap_limit_ns: a larger step of the stamps starts the session anew.
+        cloud_wait_ns: longest wait of a frame for its cloud.
+        cloud_memory_ns: how lately a cloud must have come for a frame that does not say whether it has one.
+        clouds: number of clouds kept.
+        rewind_ns: sensor time within which a late frame is put in its place; 0: late frames are refused.
+        rewind_frames: most frames kept for it.
+        rewind_bytes: most bytes of messages kept for it.
+        checkpoint_bytes: most bytes of messages that a checkpoint takes along; with large clouds a restored session
+            goes back less far.
+        late_clouds: whether a cloud that comes after its frame was tracked is put in too, inside the window.
+        recovery_wait_ns: longest time after a restore that frames behind a gap are held for those missing.
+        max_speed: fastest that a sensor moves; 0: any pose is taken.
+        pose_margin: how far a pose may lie from where that speed allows.
+        astray_frames: frames in a row that agree on another place until the session begins anew there.
+    """
+
+    gap_limit_ns: int = 5 * SECOND
+    cloud_wait_ns: int = SECOND // 10
+    cloud_memory_ns: int = 2 * SECOND
+    clouds: int = 16
+    rewind_ns: int = SECOND
+    rewind_frames: int = 64
+    rewind_bytes: int = 32 * 2**20
+    checkpoint_bytes: int = 2**20
+    late_clouds: bool = False
+    recovery_wait_ns: int = 2 * SECOND
+    max_speed: float = 100.0
+    pose_margin: float = 10.0
+    astray_frames: int = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Lineage:
+    """What outlives a session, so that neither its id nor its track ids come again.
+
+    Attributes:
+        starts: how many lives the stream has had.
+        next_id: the next track id.
+    """
+
+    starts: int = 0
+    next_id: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """Tracks to be published, without their delivery part.
+
+    Attributes:
+        tracks: the message.
+        ticket: what the caller gave with the detections.
+        step_ns: time that conversion and tracking took.
+        run: how often the session had been taken up again.
+    """
+
+    tracks: schemas.Tracks
+    ticket: Any
+    step_ns: int
+    run: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """A new life of the density began: at the first frame, at a jump, by a reset.
+
+    Attributes:
+        session: its id.
+        reason: "first", "jump", "publisher", "pose", "reset", "parameters" or "quarantine".
+        jump_ns: how far the stamps jumped.
+    """
+
+    session: str
+    reason: str
+    jump_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Quarantined:
+    """A step raised: the session takes no more frames until it is reset or another publisher begins.
+
+    Attributes:
+        error: type and text of what was raised.
+        dump: what `optipmb track --dump` replays to the same error.
+    """
+
+    error: str
+    dump: bytes
+
+
+Output = Tracked | schemas.Problem | Begun | Quarantined
+
+
+@dataclass(slots=True)
+class Deliveries:
+    """What was not tracked, and what was corrected: all of it depends on how messages were delivered.
+
+    Attributes:
+        duplicates: frames that came again.
+        late: frames that came too late.
+        refused: messages that were not valid, or not wanted.
+        inserted: late frames and clouds that were put in their place.
+        corrected: tracks that were published anew because of these.
+    """
+
+    duplicates: int = 0
+    late: int = 0
+    refused: int = 0
+    inserted: int = 0
+    corrected: int = 0
+
+
+@dataclass(slots=True)
+class Counters:
+    """What happened to the messages of a session so far; see `Deliveries` and `state.FrameCounts`."""
+
+    frames: int = 0
+    duplicates: int = 0
+    late: int = 0
+    inserted: int = 0
+    corrected: int = 0
+    refused: int = 0
+    gaps: int = 0
+    new_epochs: int = 0
+    clouds_used: int = 0
+    clouds_missed: int = 0
+    repaired: int = 0
+
+
+@dataclass(slots=True)
+class MessageCounters(Counters):
+    """The same with what never came to a session, of a stream or of all.
+
+    Every frame received ends in one of frames, duplicates, late, refused and shed, or waits: received is their sum.
+    """
+
+    received: int = 0
+    shed: int = 0
+    clouds_refused: int = 0
+    clouds_shed: int = 0
+
+    def __add__(self, other: MessageCounters) -> MessageCounters:
+        """Return the sums."""
+        return MessageCounters(
+            **{one.name: getattr(self, one.name) + getattr(other, one.name) for one in fields(MessageCounters)}
+        )
+
+    def since(self, earlier: Counters, now: Counters) -> MessageCounters:
+        """Return this with what came to a session between two times."""
+        come = {one.name: getattr(now, one.name) - getattr(earlier, one.name) for one in fields(Counters)}
+        return self + MessageCounters(**come)
+
+
+class RefusedError(ValueError):
+    """A command was refused.
+
+    Attributes:
+        path: the field of the request.
+        expected: what would have been accepted.
+        received: what was asked for.
+    """
+
+    def __init__(self, path: str, expected: str, received: str) -> None:
+        super().__init__(f"{path}: expected {expected}, received {received}")
+        self.path = path
+        self.expected = expected
+        self.received = received

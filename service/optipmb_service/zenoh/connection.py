@@ -1,0 +1,122 @@
+"""How a Zenoh session comes about: the settings as Zenoh's configuration, a router, and one clear line for a failure.
+
+Two settings of Zenoh's own that are not obvious:
+
+- Implicit shared memory is off unless asked for: it loses messages when a receiver stalls, and leaves files behind.
+- Messages wait 50 ms before congestion drops them (500 ms for large ones): with the defaults, large messages are lost
+  whenever the machine is busy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from typing import TYPE_CHECKING, Final, Protocol, cast
+
+import zenoh
+
+from optipmb_service.runtime.ports import TransportError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from optipmb_service.settings import Settings
+
+WAIT_BEFORE_DROP_US: Final = 50_000
+WAIT_BEFORE_DROP_FRAGMENTS_US: Final = 500_000
+
+RETRY_MS: Final = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2}
+
+MESSAGE_HEADROOM: Final = 4
+"""A message up to this many times the limit is received and answered by a problem; a larger one is dropped by Zenoh."""
+
+
+class _Closed(Protocol):
+    """What Zenoh's stubs leave untyped of a session."""
+
+    def close(self) -> object: ...
+
+
+def opened(settings: Settings) -> zenoh.Session:
+    """Open a session; a client does not return before it has a router.
+
+    Raises:
+        TransportError: an endpoint is in use or unusable, or the file of the settings is.
+    """
+    config = _configuration(settings)
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        where = ", ".join((*settings.endpoints, *settings.connect))
+        if "Address already in use" in str(error):
+            reason = f"cannot listen on {where}: the address is in use; is another optipmb-service running?"
+        else:
+            reason = f"cannot open {where}: {line(error)}"
+        raise TransportError(reason) from error
+
+
+def close(session: zenoh.Session) -> None:
+    """Close a session, also one that is closed."""
+    with contextlib.suppress(zenoh.ZError):
+        cast("_Closed", session).close()
+
+
+def line(error: zenoh.ZError) -> str:
+    """Return Zenoh's words without the places in its sources."""
+    text = re.sub(r" at /\S+?:\d+\.?", "", str(error))
+    return " ".join(text.split()).rstrip(".")[:300]
+
+
+class Router:
+    """A Zenoh router and nothing else.
+
+    Args:
+        settings: endpoints, and the file with everything else.
+
+    Raises:
+        TransportError: an endpoint is in use or unusable, or the file is.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._session = opened(settings)
+
+    def close(self) -> None:
+        """Close the router; who is linked to it looks for another one."""
+        close(self._session)
+
+
+def _configuration(settings: Settings) -> zenoh.Config:
+    values: dict[str, object] = {
+        "mode": "router" if settings.is_router else "client",
+        "listen/endpoints": list(settings.endpoints),
+        "connect/endpoints": list(settings.connect),
+        "connect/timeout_ms": -1,
+        "connect/retry": RETRY_MS,
+        "scouting/multicast/enabled": False,
+        "scouting/delay": 0,
+        "timestamping/enabled": True,
+        "transport/shared_memory/enabled": settings.shared_memory,
+        "transport/link/tx/lease": round(settings.lease_s * 1e3),
+        "transport/link/rx/max_message_size": MESSAGE_HEADROOM * settings.limits.max_bytes,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
+        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": WAIT_BEFORE_DROP_FRAGMENTS_US,
+    }
+    if settings.is_router:
+        values["connect/exit_on_failure"] = False  # a router starts without the routers that it looks for
+    config = _base(settings.zenoh_config)
+    for key, value in values.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise TransportError(f"setting {key}: {line(error)}") from error
+    return config
+
+
+def _base(file: Path | None) -> zenoh.Config:
+    """Return what the settings are laid over."""
+    try:
+        return zenoh.Config() if file is None else zenoh.Config.from_file(file)
+    except (zenoh.ZError, OSError) as error:
+        reason = line(error) if isinstance(error, zenoh.ZError) else str(error)
+        raise TransportError(f"Zenoh configuration {file}: {reason}") from error

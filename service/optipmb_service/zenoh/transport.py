@@ -1,0 +1,310 @@
+"""A Zenoh session with what the service declares on it: what it reads, what it sends, who it is; and their end."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+
+import optipmb_schemas as schemas
+import structlog
+import zenoh
+import zenoh.ext
+
+from optipmb_service.runtime.ports import Packet, TransportError
+from optipmb_service.zenoh.connection import close, line, opened
+from optipmb_service.zenoh.handles import Publisher, Question, Token, undeclare
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from optipmb_service.runtime.ports import Request
+    from optipmb_service.settings import Settings
+    from optipmb_service.zenoh.handles import Undeclared
+
+CHANNEL: Final = 4096
+"""Messages between Zenoh and a draining thread; more than any publisher's history."""
+
+HISTORY_S: Final = 60.0
+"""Age of what is fetched from the publishers' small caches when the service starts or a publisher appears."""
+
+TRACKS_CACHE: Final = 50
+"""Tracks kept per stream for subscribers that lost some or come late: 5 s at 10 Hz. Most of what a stream holds."""
+
+HEARTBEAT_S: Final = 0.2
+"""How long the loss of the newest tracks may stay unnoticed."""
+
+CLAIM: Final = "/claim"
+"""Ending of the liveliness keys by which instances settle who may have a stream, before one says that it has."""
+
+TOKENS: Final = 2**20
+"""More tokens than there are."""
+
+OWNERS_S: Final = 1.0
+"""How long the network may take to say who owns a stream; it takes less than a millisecond."""
+
+log = structlog.get_logger("optipmb_service")
+
+_T = TypeVar("_T")
+
+
+class Transport:
+    """A Zenoh session with what the service declares on it.
+
+    Args:
+        settings: endpoints, prefix, instance.
+
+    Raises:
+        TransportError: an endpoint is in use or unusable. As a client it does not raise but wait for a router.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._keys = schemas.Keys(settings.prefix)
+        self._prefix = settings.prefix
+        self._instance = settings.instance
+        self._max_bytes = settings.limits.max_bytes
+        self._is_router = settings.is_router
+        self._session = opened(settings)
+        self._readers: list[tuple[Undeclared, threading.Thread]] = []
+        self._claims: set[Publisher] = set()
+        self._lock = threading.Lock()
+        self._alive: Undeclared | None = None
+
+    # Receiving
+
+    def subscribe(
+        self, on_frame: Callable[[Packet], None], on_cloud: Callable[[Packet], None], wanted: Callable[[str], bool]
+    ) -> None:
+        """Hand over the detections and point clouds on all keys that are wanted, each on a thread of its own."""
+        detections = self._subscriber("detections", CHANNEL)
+        self._read("detections", detections, detections.handler, lambda sample: self._receive(sample, on_frame, wanted))
+        points = self._subscriber("points", CHANNEL // 16)
+        self._read("points", points, points.handler, lambda sample: self._receive(sample, on_cloud, wanted))
+
+    def _subscriber(self, topic: schemas.Topic, channel: int) -> zenoh.ext.AdvancedSubscriber[Any]:
+        """Subscribe to a topic of all streams, with what the publishers' caches hold: also of clouds, if they do."""
+        return zenoh.ext.declare_advanced_subscriber(
+            self._session,
+            self._keys.all(topic),
+            zenoh.handlers.FifoChannel(channel),
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_age=HISTORY_S),
+            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+        )
+
+    def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
+        """Hand over the queries about streams and those about this instance, each on a thread of its own."""
+        self._serve(f"{self._prefix}/*/*/*/q/*", about_streams)
+        self.serve_service(about_service)
+
+    def serve_service(self, about_service: Callable[[Request], None]) -> None:
+        """Hand over the queries about this instance alone, on a thread of its own."""
+        self._serve(f"{self._prefix}/service/{self._instance}/q/*", about_service)
+
+    def ask(self, key: str, timeout: float) -> bytes | None:
+        """Ask at a key and return the first answer; None when none comes in time (s)."""
+        with contextlib.suppress(zenoh.ZError):  # the session is closed
+            for reply in self._session.get(key, timeout=timeout):
+                if (sample := reply.ok) is not None:
+                    return bytes(sample.payload.to_bytes())
+        return None
+
+    def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
+        queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(CHANNEL // 16))
+        self._read("queries", queryable, queryable.handler, _answering(answer))
+
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
+        """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
+
+        Each topic has a thread of its own, until the result is called.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        taps: list[Undeclared] = []
+
+        def follow(topic: Literal["tracks", "detections"]) -> None:
+            def hand_over(samples: Iterable[zenoh.Sample]) -> None:
+                with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
+                    for sample in samples:
+                        receive(topic, sample.payload.to_bytes(), str(sample.encoding))
+
+            key = f"{self._prefix}/{stream}/{topic}"
+            subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
+            taps.append(subscriber)
+            threading.Thread(target=hand_over, args=(subscriber.handler,), name=f"viewer-{topic}", daemon=True).start()
+
+        def release() -> None:
+            for subscriber in taps:
+                undeclare(subscriber)
+
+        try:
+            follow("tracks")
+            follow("detections")
+        except zenoh.ZError as error:
+            release()
+            raise TransportError(line(error)) from error
+        return release
+
+    def watch(self) -> None:
+        """Log the nodes and routers that this session is linked to, as they come and go."""
+        listener = self._session.info.declare_transport_events_listener(
+            zenoh.handlers.FifoChannel(CHANNEL // 16), history=True
+        )
+        self._read("links", listener, listener.handler, _log_link)
+
+    def _read(self, name: str, declared: Undeclared, handler: Iterable[_T], receive: Callable[[_T], None]) -> None:
+        def drain() -> None:
+            with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
+                for item in handler:
+                    try:
+                        receive(item)
+                    except Exception:
+                        log.exception("internal_error", reader=name)  # one message must not end the reading
+
+        thread = threading.Thread(target=drain, name=f"reader-{name}", daemon=True)
+        thread.start()
+        self._readers.append((declared, thread))
+
+    def _receive(self, sample: zenoh.Sample, receive: Callable[[Packet], None], wanted: Callable[[str], bool]) -> None:
+        key = str(sample.key_expr)
+        if sample.kind != zenoh.SampleKind.PUT or not wanted(key):
+            return
+        wall_ns, now_ns = time.time_ns(), time.monotonic_ns()
+        size = len(sample.payload)
+        payload = sample.payload.to_bytes() if size <= self._max_bytes else None
+        receive(Packet(key, payload, size, str(sample.encoding), wall_ns, now_ns))
+
+    # Sending
+
+    def announce(self) -> None:
+        """Say that this instance is alive; to be called when it is ready."""
+        self._alive = self._session.liveliness().declare_token(self._keys.alive(self._instance))
+
+    def claim(self, stream: str) -> Publisher:
+        """Open the publisher of a stream's tracks; to be called by the owner of the stream.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        try:
+            publisher = zenoh.ext.declare_advanced_publisher(
+                self._session,
+                self._keys.tracks(stream),
+                encoding=schemas.encoding_of(schemas.Tracks),
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.DATA_HIGH,
+                express=True,
+                cache=zenoh.ext.CacheConfig(TRACKS_CACHE),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
+                publisher_detection=True,
+            )
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
+        claim = Publisher(publisher, self._forget)
+        with self._lock:
+            self._claims.add(claim)
+        return claim
+
+    def publish_problem(self, problem: schemas.Problem) -> None:
+        """Send a problem on its stream's key; one without a stream has no key and is not sent."""
+        if not problem.stream:
+            return
+        with contextlib.suppress(zenoh.ZError):  # at the end: the session is closed
+            self._session.put(
+                self._keys.problems(problem.stream),
+                schemas.encode(problem),
+                encoding=schemas.encoding_of(problem),
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+
+    # Owners
+
+    def linked(self) -> bool:
+        """Whether this session is part of a network: a router always is, a client while it has a router."""
+        return self._is_router or bool(self._session.info.routers_zid())
+
+    def watch_owners(self, told: Callable[[str, str, bool], None]) -> None:
+        """Tell which instance claims which stream, or does so no longer (False), from now on."""
+        tokens = self._session.liveliness().declare_subscriber(
+            self._keys.all_owners(), zenoh.handlers.FifoChannel(CHANNEL), history=True
+        )
+
+        def receive(sample: zenoh.Sample) -> None:
+            key = str(sample.key_expr)
+            told(self._keys.stream_of(key), self._keys.instance_of(key), sample.kind == zenoh.SampleKind.PUT)
+
+        self._read("owners", tokens, tokens.handler, receive)
+
+    def declare_claim(self, stream: str) -> Token | None:
+        """Say that this instance wants a stream; None at the end, when the session is closed."""
+        return self._declare(f"{self._keys.owner(stream, self._instance)}{CLAIM}")
+
+    def declare_owner(self, stream: str) -> Token | None:
+        """Say that this instance tracks a stream; None at the end, when the session is closed."""
+        return self._declare(self._keys.owner(stream, self._instance))
+
+    def claimants(self, streams: Iterable[str] | None) -> dict[str, set[str]] | None:
+        """Return which instances want or have some streams, or any; None when it cannot be found out.
+
+        Whoever declares a claim and then asks, and whoever does the same at the same time: at least one sees the other.
+        That holds only for tokens that this session does not watch: of those that it watches Zenoh answers at once
+        from what it has been told so far.
+        """
+        owners = [self._keys.all_owners()] if streams is None else [self._keys.owners(stream) for stream in streams]
+        claimants: dict[str, set[str]] = {}
+        try:
+            for pattern in owners:
+                # Its own tokens are put into the channel before anybody reads it: it must not fill up.
+                channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(TOKENS)
+                for reply in self._session.liveliness().get(f"{pattern}{CLAIM}", channel, timeout=OWNERS_S):
+                    if (sample := reply.ok) is None:
+                        return None  # the timeout: nobody can say who else is there
+                    key = str(sample.key_expr).removesuffix(CLAIM)
+                    claimants.setdefault(self._keys.stream_of(key), set()).add(self._keys.instance_of(key))
+        except (zenoh.ZError, schemas.MessageError):
+            return None
+        return claimants
+
+    def _declare(self, key: str) -> Token | None:
+        with contextlib.suppress(zenoh.ZError):
+            return Token(self._session.liveliness().declare_token(key))
+        return None
+
+    # The end
+
+    def stop(self, timeout: float) -> None:
+        """Receive nothing any more; what was received before is handed over within `timeout` seconds."""
+        if self._alive is not None:
+            undeclare(self._alive)
+            self._alive = None
+        for declared, _ in self._readers:
+            undeclare(declared)
+        for _, thread in self._readers:
+            thread.join(timeout)
+        self._readers.clear()
+
+    def close(self) -> None:
+        """Withdraw everything and close the session."""
+        self.stop(timeout=0.2)
+        with self._lock:
+            claims = tuple(self._claims)
+        for claim in claims:
+            claim.release()
+        close(self._session)
+
+    def _forget(self, claim: Publisher) -> None:
+        with self._lock:
+            self._claims.discard(claim)
+
+
+def _answering(answer: Callable[[Request], None]) -> Callable[[zenoh.Query], None]:
+    return lambda query: answer(Question(query))
+
+
+def _log_link(event: zenoh.TransportEvent) -> None:
+    came = event.kind == zenoh.SampleKind.PUT
+    log.info(
+        "peer_connected" if came else "peer_lost", peer=str(event.transport.zid), kind=str(event.transport.whatami)
+    )

@@ -1,0 +1,275 @@
+"""Health, readiness and metrics over HTTP, and the same metrics over Zenoh."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import pytest
+from optipmb_schemas import Keys, ServiceStatus
+from optipmb_service.app.health_command import ask
+from optipmb_service.http import Server, application
+from optipmb_service.observability.metrics import METRICS, NAMESPACE
+from optipmb_service.runtime.ports import HttpError
+from prometheus_client.parser import text_string_to_metric_families
+from router import Node, Sensor, until
+from routers import free_endpoint, open_router
+from service_process import ServiceProcess
+from starlette.responses import PlainTextResponse
+from starlette.routing import Route
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from starlette.requests import Request
+
+KEYS = Keys()
+SENSOR = Sensor()
+END_S = 2.0
+
+Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
+
+
+@dataclass
+class Said:
+    """A source that says what a test wants."""
+
+    age_s: float = 0.1
+    now: str = "ready"
+
+    def alive(self) -> bool:
+        """Turns or not."""
+        return self.age_s < 10
+
+    def beat_age_s(self) -> float:
+        """As told."""
+        return self.age_s
+
+    def ready(self) -> bool:
+        """Follows the state."""
+        return self.now == "ready"
+
+    def state(self) -> str:
+        """As told."""
+        return self.now
+
+    def status(self) -> ServiceStatus | None:
+        """Nothing."""
+        return None
+
+    def text(self) -> bytes:
+        """One figure."""
+        return b"one 1\n"
+
+
+def get(address: str, path: str) -> tuple[int, str]:
+    """Status and body of an answer."""
+    host, _, port = address.rpartition(":")
+    connection = http.client.HTTPConnection(host, int(port), timeout=10)
+    try:
+        connection.request("GET", path)
+        response = connection.getresponse()
+        assert response.getheader("cache-control") == "no-store" or response.status == http.client.NOT_FOUND
+        return response.status, response.read().decode()
+    finally:
+        connection.close()
+
+
+@contextmanager
+def served(source: Said, *routes: Route) -> Iterator[str]:
+    """The application on a free port; gives its address."""
+    server = Server(application(source, routes), "127.0.0.1:0")
+    try:
+        yield server.address
+    finally:
+        server.close()
+
+
+def address_of(service: ServiceProcess) -> str:
+    """Where a service said that it answers."""
+    service.wait_log('"event": "http"')
+    return str(re.findall(r'"address": "([^"]+)"', service.errors)[0])
+
+
+def samples(text: str) -> Samples:
+    """Every figure of a text in Prometheus' format."""
+    families = text_string_to_metric_families(text)
+    return {(one.name, tuple(sorted(one.labels.items()))): one.value for family in families for one in family.samples}
+
+
+def free_address() -> str:
+    """An address where nobody listens."""
+    return free_endpoint().removeprefix("tcp/")
+
+
+def test_health_follows_the_heartbeat() -> None:
+    """`/healthz` says 200 while the control loop turns and 503 when it has not for ten seconds."""
+    source = Said()
+    with served(source) as address:
+        assert (get(address, "/healthz")[0], ask(address, ready=False)[0]) == (200, True)
+        source.age_s = 11.0
+        assert (get(address, "/healthz")[0], ask(address, ready=False)[0]) == (503, False)
+
+
+@pytest.mark.parametrize("state", ["starting", "stopping"])
+def test_readiness_follows_the_state(state: str) -> None:
+    """`/readyz` says 200 when the service can be used, 503 with the state before and after."""
+    source = Said()
+    with served(source) as address:
+        assert get(address, "/readyz") == (200, '{"ready":true,"state":"ready"}')
+        source.now = state
+        assert get(address, "/readyz") == (503, f'{{"ready":false,"state":"{state}"}}')
+        assert get(address, "/healthz")[0] == 200
+
+
+def test_more_routes_are_served() -> None:
+    """Routes that are handed in are served beside its own; what nobody serves is 404."""
+
+    def page(_request: Request) -> PlainTextResponse:
+        return PlainTextResponse("a page", headers={"cache-control": "no-store"})
+
+    with served(Said(), Route("/", page)) as address:
+        assert get(address, "/") == (200, "a page")
+        assert get(address, "/metrics") == (200, "one 1\n")
+        assert get(address, "/nothing")[0] == 404
+
+
+def test_an_address_in_use_is_one_error() -> None:
+    """A port that somebody listens on gives one line that names the address."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(HttpError, match=f"cannot listen on {address} for HTTP: Address already in use"):
+            Server(application(Said()), address)
+        with ServiceProcess("--http", address) as service:
+            assert service.wait_end() == 1
+            assert service.errors.splitlines()[-1].startswith("optipmb-service: cannot listen on")
+
+
+def test_a_service_tells_how_it_is_from_its_start_to_its_end() -> None:
+    """Alive but not ready while it waits for a router, ready with one; a signal ends it, whoever still is connected."""
+    endpoint = free_endpoint()
+    options = ("--connect", endpoint, "--http", "127.0.0.1:0", "--log-format", "json")
+    with ServiceProcess(*options, listen=False) as service:
+        address = address_of(service)
+        service.wait_log("connecting")
+        assert get(address, "/healthz")[0] == 200
+        assert get(address, "/readyz") == (503, '{"ready":false,"state":"starting"}')
+        with open_router(endpoint):
+            service.wait_ready()
+            until(lambda: get(address, "/readyz")[0] == 200, "ready")
+            host, _, port = address.rpartition(":")
+            with socket.create_connection((host, int(port))):
+                status, seconds = service.end(signal.SIGTERM)
+        assert (status, seconds < END_S) == (0, True)
+        assert "Traceback" not in service.errors
+
+
+def test_metrics_count_what_happened(tmp_path: Path) -> None:
+    """Every metric of the list is there, in Prometheus' format, with the figures of what was sent; also over Zenoh."""
+    options = ("--http", "127.0.0.1:0", "--log-format", "json", "--instance", "one")
+    environment = {"OPTIPMB_STORE": str(tmp_path), "OPTIPMB_CHECKPOINT_S": "0.1"}
+    with ServiceProcess(*options, environment=environment) as service:
+        address = address_of(service)
+        service.wait_ready()
+        with Node(service.endpoint) as node:
+            frames = [SENSOR.detections(seq) for seq in range(6)]
+            node.send(*frames, frames[5])  # the last one twice
+            node.send_raw(KEYS.detections(SENSOR.stream), b"garbage")
+            node.tracks(SENSOR.stream, 6)
+            node.problem(SENSOR.stream, "malformed")
+            until(lambda: samples(get(address, "/metrics")[1])[f"{NAMESPACE}checkpoints_total", ()] > 0, "a checkpoint")
+            figures = samples(get(address, "/metrics")[1])
+            ((ok, key, asked),) = node.query(KEYS.metrics("one"))
+            status = node.ask(KEYS.status("one"), ServiceStatus)
+        assert {name.removesuffix("_bucket") for name, _ in figures if name.startswith(NAMESPACE)} >= {
+            NAMESPACE + name for name, metric in METRICS.items() if metric.kind != "histogram"
+        }
+        expected = {
+            ("frames_total", ()): 6,
+            ("received_total", (("topic", "detections"),)): 8,
+            ("dropped_total", (("reason", "duplicate"),)): 1,
+            ("dropped_total", (("reason", "refused"),)): 1,
+            ("dropped_total", (("reason", "late"),)): 0,
+            ("problems_total", (("code", "malformed"),)): 1,
+            ("sessions", (("state", "running"),)): 1,
+            ("streams", (("role", "owner"),)): 1,
+            ("streams", (("role", "standby"),)): 0,
+            ("sessions_restored_total", ()): 0,
+            ("tracks", ()): status.sessions[0].tracks,
+            ("latency_seconds_count", ()): 6,
+            ("step_seconds_count", ()): 6,
+            ("state", (("state", "ready"),)): 1,
+            ("state", (("state", "starting"),)): 0,
+            ("stream_frames_total", (("stream", SENSOR.stream),)): 6,
+            ("streams_unlisted", ()): 0,
+        }
+        assert {key: figures[NAMESPACE + key[0], key[1]] for key in expected} == expected
+        started, ended = (figures[f"{NAMESPACE}tracks_{what}_total", ()] for what in ("started", "ended"))
+        assert started - ended == figures[f"{NAMESPACE}tracks", ()] > 0
+        assert 0 <= figures[f"{NAMESPACE}checkpoint_age_seconds", ()] < 10
+        assert figures["process_resident_memory_bytes", ()] > 1e7
+        assert (ok, key) == (True, KEYS.metrics("one"))
+        same = samples(asked.decode())
+        assert {name for name in figures if name not in same} == set()
+        assert same[f"{NAMESPACE}frames_total", ()] == 6
+
+
+def test_figures_outlive_their_sessions() -> None:
+    """Counters never fall, also when a session ends; the series of its stream go with it."""
+    with ServiceProcess("--http", "127.0.0.1:0", "--log-format", "json") as service:
+        address = address_of(service)
+        service.wait_ready()
+        with Node(service.endpoint) as node:
+            node.send(*(SENSOR.detections(seq) for seq in range(5)))
+            node.tracks(SENSOR.stream, 5)
+            assert node.query(KEYS.query(SENSOR.stream, "reset"), json.dumps({"close": True}).encode())[0][0]
+            figures = samples(get(address, "/metrics")[1])
+        assert figures[f"{NAMESPACE}frames_total", ()] == 5
+        assert figures[f"{NAMESPACE}tracks", ()] == 0
+        assert figures[f"{NAMESPACE}tracks_started_total", ()] == figures[f"{NAMESPACE}tracks_ended_total", ()] > 0
+        assert (f"{NAMESPACE}stream_frames_total", (("stream", SENSOR.stream),)) not in figures
+
+
+def test_streams_with_series_of_their_own_are_bounded() -> None:
+    """Only so many streams have series; the others are counted."""
+    options = ("--http", "127.0.0.1:0", "--log-format", "json")
+    with ServiceProcess(*options, environment={"OPTIPMB_HTTP_STREAMS": "2"}) as service:
+        address = address_of(service)
+        service.wait_ready()
+        streams = [f"site/node/lidar-{number}" for number in range(5)]
+        with Node(service.endpoint) as node:
+            for stream in streams:
+                node.send(Sensor(stream).detections(0))
+            for stream in streams:
+                node.tracks(stream, 1)
+        figures = samples(get(address, "/metrics")[1])
+        listed = {labels for name, labels in figures if name == f"{NAMESPACE}stream_frames_total"}
+        assert listed == {(("stream", stream),) for stream in streams[:2]}
+        assert figures[f"{NAMESPACE}streams_unlisted", ()] == 3
+        assert figures[f"{NAMESPACE}frames_total", ()] == 5
+
+
+def test_the_health_command() -> None:
+    """`optipmb-service health` ends with 0 when the service is well, 1 when it is not there, 2 without an address."""
+
+    def health(*options: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "optipmb_service", "health", *options]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+    source = Said(now="starting")
+    with served(source) as address:
+        well = health("--http", address)
+        assert (well.returncode, json.loads(well.stdout)) == (0, {"alive": True, "beat_age_s": 0.1})
+        assert health("--http", address, "--ready").returncode == 1
+    gone = health("--http", address)
+    assert (gone.returncode, gone.stdout) == (1, f"no answer at {address}: [Errno 111] Connection refused\n")
+    assert health().returncode == 2

@@ -1,0 +1,79 @@
+"""What a process that tracks takes; what a session holds is free at its end, not when a garbage collection comes by."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import weakref
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from optipmb_service.session.session import Session
+from optipmb_service.zenoh.transport import TRACKS_CACHE
+from router import Node, Sensor
+from service_process import ServiceProcess
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+SENSOR = Sensor()
+STREAMS = 50
+FRAMES = TRACKS_CACHE + 10
+"""More than the window that late frames are put into holds, and than is kept for subscribers that lost some."""
+WORKER_MB = 250
+NEEDLESS = ("scipy/optimize", "scipy/linalg", "scipy/sparse", "scipy/special", "matplotlib", "pandas")
+
+
+def resident_mb(process: int) -> float:
+    """Resident memory of a process, shared libraries and all."""
+    lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1024
+
+
+@pytest.fixture(scope="module")
+def busy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
+    """A service with its own router and a store, 50 streams of 40 objects in it."""
+    optipmb.warm_up()  # a process that compiles keeps the compiler's memory
+    sensors = [replace(SENSOR, stream=f"site/node{k}/lidar", objects=40) for k in range(STREAMS)]
+    environment = {"OPTIPMB_STORE": str(tmp_path_factory.mktemp("store"))}
+    with ServiceProcess(environment=environment) as service:
+        service.wait_ready()
+        with Node(service.endpoint) as node:
+            for seq in range(FRAMES):
+                node.send(*(sensor.detections(seq) for sensor in sensors))
+                node.tracks_seen.wait(lambda seen, due=STREAMS * (seq + 1): len(seen) >= due, "the tracks of a round")
+            yield service
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_worker_with_fifty_streams_stays_below_its_memory(busy: ServiceProcess) -> None:
+    """Below 250 MB resident, with full windows, caches and checkpoints of 50 streams with 40 objects each."""
+    assert resident_mb(busy.process.pid) < WORKER_MB
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_worker_loads_no_solvers(busy: ServiceProcess) -> None:
+    """No library of scipy's solvers, or of plots and tables, is mapped into a process that tracks."""
+    mapped = Path(f"/proc/{busy.process.pid}/maps").read_text(encoding="utf-8")
+    assert "numpy/_core" in mapped
+    assert [name for name in NEEDLESS if name in mapped] == []
+
+
+def test_a_session_is_freed_at_its_end() -> None:
+    """Nothing inside a session points back at it: its clouds go with the last reference to it."""
+    session = Session(SENSOR.stream, optipmb.load_profile("nuscenes"))
+    for seq in range(5):
+        session.on_points(SENSOR.points(seq), 0)
+        assert session.on_detections(SENSOR.detections(seq, has_points=True), 0)
+    session.reset()
+    gone = weakref.ref(session)
+    gc.disable()
+    try:
+        del session
+        assert gone() is None
+    finally:
+        gc.enable()

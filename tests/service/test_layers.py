@@ -1,0 +1,73 @@
+"""What imports what: the arrows between the folders of the service, and what its pure folders leave alone."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import optipmb_service
+import pytest
+
+ROOT = Path(optipmb_service.__file__).parent
+SOURCES = sorted(ROOT.rglob("*.py"))
+
+ARROWS = {
+    "session": set(),
+    "cluster": set(),
+    "observability": {"session", "__version__"},
+    "runtime": {"session", "cluster", "observability", "settings"},
+    "zenoh": {"runtime", "settings"},
+    "http": {"runtime", "observability"},
+    "app": {"session", "cluster", "observability", "runtime", "zenoh", "http", "settings", "__version__"},
+    "settings": set(),
+    "__init__": set(),
+    "__main__": {"app"},
+}
+"""What each folder, or module beside the folders, may import of the others; also for the type checker alone."""
+
+
+def place_of(source: Path) -> str:
+    """The folder of a module, or the module itself where it lies beside the folders."""
+    first, *rest = source.relative_to(ROOT).parts
+    return first if rest else source.stem
+
+
+def imported(text: str) -> set[str]:
+    """Full names of everything that a module imports, with `package.name` for `from package import name`."""
+    names = set()
+    for part in ast.walk(ast.parse(text)):
+        if isinstance(part, ast.Import):
+            names |= {alias.name for alias in part.names}
+        elif isinstance(part, ast.ImportFrom):
+            assert part.level == 0, "imports are absolute"
+            names |= {f"{part.module}.{alias.name}" for alias in part.names}
+    return names
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_arrows_run_one_way(source: Path) -> None:
+    """App and edges import the runtime, that the session and the cluster, and these import none of the others."""
+    own = {name.split(".")[1] for name in imported(source.read_text()) if name.startswith("optipmb_service.")}
+    assert own - {place_of(source)} <= ARROWS[place_of(source)]
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_libraries_of_an_edge_stay_there(source: Path) -> None:
+    """Zenoh is imported by its folder alone, the HTTP libraries by theirs; nobody imports the client."""
+    first = {name.partition(".")[0] for name in imported(source.read_text())}
+    place = place_of(source)
+    assert "optipmb_client" not in first
+    assert place == "zenoh" or "zenoh" not in first
+    assert place == "http" or not first & {"starlette", "uvicorn"}
+
+
+@pytest.mark.parametrize("source", sorted(ROOT.glob("session/*.py")), ids=lambda path: path.stem)
+def test_the_session_is_pure(source: Path) -> None:
+    """No module of a session imports what waits, stores, sends or logs."""
+    first = {name.partition(".")[0] for name in imported(source.read_text())}
+    assert not first & {"threading", "asyncio", "socket", "queue", "sqlite3", "os", "tempfile", "structlog"}
+
+
+def test_every_folder_is_listed() -> None:
+    """The arrows name each folder and each module beside the folders."""
+    assert {place_of(source) for source in SOURCES} == set(ARROWS)
