@@ -12,6 +12,17 @@ if TYPE_CHECKING:
 
 SECOND: Final = 1_000_000_000
 
+MAX_COUNT: Final = 2**63 - 1
+"""The highest count of a message or a checkpoint; sums stay there."""
+
+
+def total(*counts: int) -> int:
+    """Return the sum of counts; one that no message could carry becomes the highest that it can.
+
+    A publisher chooses its sequence numbers, and what is missing between two of them is counted.
+    """
+    return min(sum(counts), MAX_COUNT)
+
 
 class Steps(Protocol):
     """What a session needs of a tracker; `optipmb.Tracker` has it."""
@@ -168,7 +179,7 @@ class MessageCounters(Counters):
     def __add__(self, other: MessageCounters) -> MessageCounters:
         """Return the sums."""
         return MessageCounters(
-            **{one.name: getattr(self, one.name) + getattr(other, one.name) for one in fields(MessageCounters)}
+            **{one.name: total(getattr(self, one.name), getattr(other, one.name)) for one in fields(MessageCounters)}
         )
 
     def since(self, earlier: Counters, now: Counters) -> MessageCounters:

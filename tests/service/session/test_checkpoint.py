@@ -213,7 +213,7 @@ def altered(change: Any) -> Checkpoint:
         (lambda body: body["window"][0].update(detections=b"no"), "msgpack"),
         (lambda body: body["window"].append(body["window"][0]), "window"),
         (lambda body: body["epochs"][0].pop(), "epochs"),
-        (lambda body: body["base"].update(cursor=[1] * 6), "course"),
+        (lambda body: body["base"].update(course=[1] * 6), "course"),
     ],
 )
 def test_what_does_not_fit_is_named(change: Any, path: str) -> None:
