@@ -8,7 +8,8 @@ DATA ?= data
 KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
-.PHONY: help demo test bench baseline figures load kills soak stack install lint types tests schemas wheel clean tune ablate
+FUZZ_TARGETS := fuzz-messages fuzz-checkpoints
+.PHONY: help demo test bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) stack install lint types tests schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    everything that CI runs: lint, types, tests, schemas, wheel, demo"
@@ -17,6 +18,7 @@ help:
 	@echo "make load    measure what the service carries on this machine, as docs/performance.md has it"
 	@echo "make kills   kill the service a hundred times while recorded frames stream through it, and compare (needs KITTI)"
 	@echo "make soak    load the service for an hour, and see that nothing grows and every message is counted"
+	@echo "make fuzz    search for bytes that the decoders neither read nor refuse, FUZZ_S=1800 seconds per decoder"
 	@echo "make stack   run the compose file's stack as processes and show that it works (needs Debian's prometheus)"
 	@echo "make tune    make the tuned profiles anew from DATA=... (out/tune-*/tuned.toml) and compare them with those that ship"
 	@echo "make ablate  print the tables of docs/ablation.md anew from DATA=..."
@@ -105,6 +107,12 @@ kills: install
 # An hour of load, which CI does for seconds.
 soak: install
 	OPTIPMB_TEST_SOAK_S=3600 OPTIPMB_TEST_SOAK_STREAMS=10 $(BIN)/pytest -q tests/e2e/test_soak.py --timeout 0
+
+# What is found is kept in tests/fuzz/found, where the tests take it up. `make -j2 fuzz` searches both decoders at once.
+FUZZ_S ?= 1800
+fuzz: $(FUZZ_TARGETS)
+$(FUZZ_TARGETS): fuzz-%: install
+	$(BIN)/python tests/fuzz/search.py $* $(FUZZ_S)
 
 clean:
 	rm -rf $(VENV) out build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

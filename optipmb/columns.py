@@ -46,6 +46,17 @@ def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], classes:
         label = rows.label
         if label.size and not (label.min() >= 0 and label.max() < classes):
             raise DensityError(f"{part}.label", f"indices below {classes}", f"{label.min()} to {label.max()}")
+        if label.size and not 0 <= rows.born_ns.min() <= rows.born_ns.max() <= stamp_ns:
+            raise DensityError(f"{part}.born_ns", f"stamps up to {stamp_ns}", "others")
+    if len(bernoulli) and not (bernoulli.born_ns <= bernoulli.seen_ns).all() & (bernoulli.seen_ns <= stamp_ns).all():
+        raise DensityError("bernoulli.seen_ns", f"stamps from born_ns to {stamp_ns}", "others")
+    for path, column, high in (
+        ("bernoulli.existence", bernoulli.existence, 1.0),
+        ("bernoulli.score", bernoulli.score, 1.0),
+        ("poisson.weight", poisson.weight, np.inf),
+    ):
+        if column.size and not 0.0 <= column.min() <= column.max() <= high:
+            raise DensityError(path, f"numbers from 0 to {high:g}", f"{column.min():g} to {column.max():g}")
     ids = bernoulli.id
     if ids.size and not (np.diff(ids) > 0).all():
         raise DensityError("bernoulli.id", "ascending ids", "others")

@@ -20,10 +20,11 @@ import msgpack
 import optipmb_schemas as schemas
 
 import optipmb
+from optipmb_service.session import convert
 from optipmb_service.session.document import Document
 from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory
-from optipmb_service.session.timeline import WINDOW, Cursor, FrameId, SeenNumbers
-from optipmb_service.session.values import Deliveries
+from optipmb_service.session.timeline import EPOCHS, WINDOW, Cursor, FrameId, SeenNumbers
+from optipmb_service.session.values import MAX_CLOUD_WAIT_NS, MAX_COUNT, MAX_ERROR, MAX_LABELS, Deliveries
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,6 +34,9 @@ MAGIC: Final = b"OPTIPMB\0"
 DIGEST: Final = 16
 HEAD: Final = len(MAGIC) + 2 + DIGEST
 MAX_BYTES: Final = 2**28
+MAX_SOFTWARE: Final = 100
+MAX_LABEL: Final = 64
+"""Characters of a class name, as messages take it."""
 
 _msgpack: Any = msgpack  # its type information is partial
 _SOFTWARE: Final = version("optipmb")
@@ -221,73 +225,90 @@ def _state(state: FilterState) -> dict[str, Any]:
 
 
 def _read_1(body: Document) -> Checkpoint:
+    stream = body.stream("stream")
     parameters = optipmb.parse_parameters(body.map("parameters"))
-    base = _read_state(body.document("base"), len(parameters.classes))
-    window = tuple(_read_recorded(one) for one in body.documents("window"))
+    schemas.SessionParameters(profile=parameters.name)  # as messages take it
+    base = _read_state(body.document("base"), stream, parameters)
+    window = tuple(_read_recorded(one, stream) for one in body.documents("window"))
     if len({one.frame_id for one in window}) != len(window):
         raise body.wrong("window", "every frame once", "one again")
-    head = _read_state(body.document("head"), len(parameters.classes)) if window else base
+    head = _read_state(body.document("head"), stream, parameters) if window else base
     return Checkpoint(
-        stream=body.stream("stream"),
+        stream=stream,
         parameters=parameters,
-        cloud_wait_ns=body.optional("cloud_wait_ns", body.whole),
-        quarantine=body.text("quarantine"),
-        epochs=tuple(_read_seen(one) for one in body.rows("epochs", 3)),
+        cloud_wait_ns=body.optional("cloud_wait_ns", lambda name: body.whole(name, high=MAX_CLOUD_WAIT_NS)),
+        quarantine=body.text("quarantine", MAX_ERROR),
+        epochs=_read_epochs(body),
         base=base,
         window=window,
         head=head,
-        deliveries=Deliveries(**body.document("deliveries").wholes(Deliveries.__slots__)),
+        deliveries=Deliveries(**body.document("deliveries").counts(Deliveries.__slots__)),
         newest_cloud_ns=body.optional("newest_cloud_ns", body.whole),
-        run=body.whole("run"),
-        software=body.text("software"),
+        run=body.count("run"),
+        software=body.text("software", MAX_SOFTWARE),
     )
+
+
+def _read_epochs(body: Document) -> tuple[SeenNumbers, ...]:
+    epochs = tuple(_read_seen(one) for one in body.rows("epochs", 3))
+    if len(epochs) > EPOCHS or len({one.epoch for one in epochs}) != len(epochs):
+        raise body.wrong("epochs", f"at most {EPOCHS} epochs, each once", f"{len(epochs)}")
+    return epochs
 
 
 def _read_seen(row: Document) -> SeenNumbers:
-    mask = int.from_bytes(row.binary("2"), "big")
-    if not 0 < mask.bit_length() <= WINDOW:
-        raise row.wrong("2", f"a mask of 1 to {WINDOW} bits", f"{mask.bit_length()} bits")
-    return SeenNumbers(row.epoch("0"), row.whole("1"), mask)
+    highest, mask = row.whole("1"), int.from_bytes(row.binary("2"), "big")
+    if not mask & 1 or mask.bit_length() > min(WINDOW, highest + 1):
+        raise row.wrong("2", f"which of the {WINDOW} numbers up to {highest} came, with itself", "another mask")
+    return SeenNumbers(row.epoch("0"), highest, mask)
 
 
-def _read_recorded(one: Document) -> Recorded:
+def _read_recorded(one: Document, stream: str) -> Recorded:
     points = one.optional("points", one.binary)
-    return Recorded(
-        schemas.decode(one.binary("detections"), schemas.Detections, limits=schemas.STORED),
-        None if points is None else schemas.decode(points, schemas.Points, limits=schemas.STORED),
-        one.flag("missed"),
-        one.whole("revision"),
-    )
+    message = schemas.decode(one.binary("detections"), schemas.Detections, limits=schemas.STORED)
+    cloud = None if points is None else schemas.decode(points, schemas.Points, limits=schemas.STORED)
+    if message.stream != stream:
+        raise one.wrong("detections", f"a frame of {stream}", f"one of {message.stream}")
+    if cloud is not None:
+        if (cloud.stream, cloud.stamp_ns) != (stream, message.stamp_ns):
+            raise one.wrong("points", f"the cloud of {stream} at {message.stamp_ns}", f"that of {cloud.stamp_ns}")
+        convert.cloud_of(cloud)
+    return Recorded(message, cloud, one.flag("missed"), one.count("revision"))
 
 
-def _read_state(one: Document, classes: int) -> FilterState:
+def _read_state(one: Document, stream: str, parameters: optipmb.Parameters) -> FilterState:
     columns = schemas.read_columns(one.map("density"))
+    density = optipmb.density_of(
+        one.whole("stamp_ns", low=-1), one.whole("next_id", high=MAX_COUNT), columns, len(parameters.classes)
+    )
+    session = one.identity("session")
+    convert.density_of(density, stream=stream, session=session, parameters=parameters)  # it can be asked for
     cursor = one.row("course", 6)
     last = None if one.absent("last") else one.row("last", 3)
     tracked = None if one.absent("tracked") else one.row("tracked", 2)
     where = one.document("whereabouts")
     return FilterState(
-        density=optipmb.density_of(one.whole("stamp_ns", low=-1), one.whole("next_id"), columns, classes),
-        session=one.text("session"),
-        starts=one.whole("starts"),
-        generation=one.whole("generation"),
+        density=density,
+        session=session,
+        starts=one.count("starts"),
+        generation=one.count("generation"),
         cursor=Cursor(
             cursor.optional("0", cursor.epoch),
             cursor.whole("1"),
-            cursor.whole("2"),
-            cursor.whole("3"),
+            cursor.count("2"),
+            cursor.count("3"),
             cursor.whole("4"),
             cursor.optional("5", cursor.whole),
         ),
         last=None if last is None else FrameId(last.epoch("0"), last.whole("1"), last.whole("2")),
         tracked=None if tracked is None else (tracked.epoch("0"), tracked.whole("1")),
         tracks=one.whole("tracks"),
-        counts=FrameCounts(**one.document("counts").wholes(FrameCounts.__slots__)),
-        reported=frozenset(one.texts("reported")),
+        counts=FrameCounts(**one.document("counts").counts(FrameCounts.__slots__)),
+        reported=frozenset(one.texts("reported", MAX_LABELS, MAX_LABEL)),
         pose_history=PoseHistory(
             stamp_ns=where.optional("stamp_ns", where.whole),
             position=where.position("position"),
-            astray=where.whole("astray"),
+            astray=where.count("astray"),
             astray_ns=where.whole("astray_ns"),
             astray_position=where.position("astray_position"),
         ),

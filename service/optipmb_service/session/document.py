@@ -8,6 +8,7 @@ them is read, so that it may count more.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -16,11 +17,15 @@ import optipmb_schemas as schemas
 from optipmb_schemas.errors import show
 from optipmb_schemas.structure import check_msgpack
 
+from optipmb_service.session.values import MAX_COUNT
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
 _T = TypeVar("_T")
 _msgpack: Any = msgpack  # its type information is partial
+
+_IDENTITY = re.compile("[0-9a-f]{32}")
 
 MOST = 2**63 - 1
 
@@ -56,31 +61,45 @@ class Document:
         """Read a value that may be absent."""
         return None if self.absent(name) else read(name)
 
-    def whole(self, name: str, low: int = 0) -> int:
-        """Return a whole number from `low` to the largest of 64 bits."""
+    def whole(self, name: str, low: int = 0, high: int = MOST) -> int:
+        """Return a whole number from `low` to `high`, without one to the largest of 64 bits."""
         value = self.fields.get(name)
-        if type(value) is not int or not low <= value <= MOST:
-            raise self.wrong(name, f"a whole number from {low} on", show(value))
+        if type(value) is not int or not low <= value <= high:
+            raise self.wrong(name, f"a whole number from {low} to {high}", show(value))
         return value
 
-    def wholes(self, names: Iterable[str]) -> dict[str, int]:
-        """Return a table of whole numbers; those that are absent are zero."""
-        return {name: 0 if self.absent(name) else self.whole(name) for name in names}
+    def count(self, name: str) -> int:
+        """Return a number of things, to which others will be added."""
+        return self.whole(name, high=MAX_COUNT)
+
+    def counts(self, names: Iterable[str]) -> dict[str, int]:
+        """Return a table of counts; those that are absent are zero."""
+        return {name: 0 if self.absent(name) else self.count(name) for name in names}
 
     def flag(self, name: str) -> bool:
         """Return true or false."""
         return self._kind(name, bool)
 
-    def text(self, name: str) -> str:
-        """Return a text."""
-        return self._kind(name, str)
+    def text(self, name: str, most: int) -> str:
+        """Return a text of at most so many characters."""
+        value = self._kind(name, str)
+        if len(value) > most:
+            raise self.wrong(name, f"at most {most} characters", f"{len(value)}")
+        return value
 
-    def texts(self, name: str) -> list[str]:
-        """Return a list of texts."""
+    def texts(self, name: str, number: int, most: int) -> list[str]:
+        """Return a list of at most so many texts of at most so many characters."""
         found = self._kind(name, list)
-        if not all(isinstance(one, str) for one in found):
-            raise self.wrong(name, "texts", "others")
+        if len(found) > number or not all(isinstance(one, str) and len(one) <= most for one in found):
+            raise self.wrong(name, f"at most {number} texts of at most {most} characters", "others")
         return found
+
+    def identity(self, name: str) -> str:
+        """Return the id of a session."""
+        value = self._kind(name, str)
+        if not _IDENTITY.fullmatch(value):
+            raise self.wrong(name, "32 hexadecimal digits", show(value))
+        return value
 
     def binary(self, name: str) -> bytes:
         """Return bytes."""
@@ -95,7 +114,7 @@ class Document:
 
     def stream(self, name: str) -> str:
         """Return the name of a stream."""
-        value = self.text(name)
+        value = self._kind(name, str)
         schemas.Keys().tracks(value)
         return value
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import optipmb
 from optipmb_service.session import convert
@@ -25,6 +25,8 @@ from optipmb_service.session.state import Entry, FilterState, PoseHistory
 from optipmb_service.session.timeline import FrameId, Timeline
 from optipmb_service.session.transition import Transition
 from optipmb_service.session.values import (
+    MAX_CLOUD_WAIT_NS,
+    MAX_ERROR,
     SECOND,
     Begun,
     Counters,
@@ -43,9 +45,6 @@ if TYPE_CHECKING:
     from optipmb_service.session.pending import Ready
     from optipmb_service.session.reporting import Condition
     from optipmb_service.session.values import Steps
-
-MAX_ERROR: Final = 400
-"""Characters kept of an error."""
 
 
 class Session:
@@ -177,8 +176,11 @@ class Session:
         """Change what a session runs with; another profile only before the first frame or with `restart`.
 
         Raises:
-            RefusedError: another profile, frames were processed, and no restart was asked for.
+            RefusedError: another profile, frames were processed, and no restart was asked for; or too long a wait.
         """
+        if cloud_wait_s is not None and cloud_wait_s * SECOND > MAX_CLOUD_WAIT_NS:
+            longest = f"at most {MAX_CLOUD_WAIT_NS / SECOND:g} seconds"
+            raise RefusedError("cloud_wait_s", longest, f"{cloud_wait_s:g}")
         changes = parameters is not None and parameters != self.parameters
         if changes and not restart and self.counters.frames:
             raise RefusedError(

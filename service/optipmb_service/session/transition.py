@@ -21,15 +21,12 @@ from optipmb_service.session import convert
 from optipmb_service.session.pose_check import judge, position_of
 from optipmb_service.session.state import Entry, FilterState, FrameCounts, PoseHistory
 from optipmb_service.session.timeline import FrameId, Verdict
-from optipmb_service.session.values import total
+from optipmb_service.session.values import MAX_COUNT, MAX_LABELS
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     from optipmb_service.session.values import Policy, Steps
-
-MAX_LABELS: Final = 256
-"""Unknown class names remembered as reported."""
 
 _OPENING: Final = frozenset({Verdict.NEW_EPOCH, Verdict.RESTART})
 
@@ -174,7 +171,7 @@ def _counted(
     """Return the counts with one more frame."""
     return FrameCounts(
         frames=before.frames + tracked,
-        gaps=total(before.gaps, gap),
+        gaps=min(before.gaps + gap, MAX_COUNT),  # sequence numbers may leap by 2^63
         new_epochs=before.new_epochs + (entry.place.opens in _OPENING),
         clouds_used=before.clouds_used + used,
         clouds_missed=before.clouds_missed + entry.missed,

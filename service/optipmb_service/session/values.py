@@ -12,16 +12,17 @@ if TYPE_CHECKING:
 
 SECOND: Final = 1_000_000_000
 
-MAX_COUNT: Final = 2**63 - 1
-"""The highest count of a message or a checkpoint; sums stay there."""
+MAX_COUNT: Final = 2**61
+"""Where counters end, so that neither one more nor the sum of two leaves the 64 bits of a message."""
 
+MAX_CLOUD_WAIT_NS: Final = 60 * SECOND
+"""The longest wait for a cloud that can be asked for."""
 
-def total(*counts: int) -> int:
-    """Return the sum of counts; one that no message could carry becomes the highest that it can.
+MAX_ERROR: Final = 400
+"""Characters kept of an error."""
 
-    A publisher chooses its sequence numbers, and what is missing between two of them is counted.
-    """
-    return min(sum(counts), MAX_COUNT)
+MAX_LABELS: Final = 256
+"""Unknown class names remembered as reported."""
 
 
 class Steps(Protocol):
@@ -179,7 +180,7 @@ class MessageCounters(Counters):
     def __add__(self, other: MessageCounters) -> MessageCounters:
         """Return the sums."""
         return MessageCounters(
-            **{one.name: total(getattr(self, one.name), getattr(other, one.name)) for one in fields(MessageCounters)}
+            **{one.name: getattr(self, one.name) + getattr(other, one.name) for one in fields(MessageCounters)}
         )
 
     def since(self, earlier: Counters, now: Counters) -> MessageCounters:

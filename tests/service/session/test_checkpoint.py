@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -201,6 +202,12 @@ def altered(change: Any) -> Checkpoint:
     return decode_checkpoint(seal(msgpack.packb(body)))
 
 
+def _set(body: Any, column: str, value: float) -> None:
+    block = body["head"]["density"][column]
+    assert block["data"]
+    block["data"] = struct.pack("<d", value) + block["data"][8:]
+
+
 @pytest.mark.parametrize(
     ("change", "path"),
     [
@@ -214,6 +221,19 @@ def altered(change: Any) -> Checkpoint:
         (lambda body: body["window"].append(body["window"][0]), "window"),
         (lambda body: body["epochs"][0].pop(), "epochs"),
         (lambda body: body["base"].update(course=[1] * 6), "course"),
+        (lambda body: body["head"].update(session="\x01" * 32), "head.session: expected 32 hexadecimal digits"),
+        (lambda body: body["head"]["counts"].update(frames=2**62), "head.counts.frames"),
+        (lambda body: body.update(run=2**63 - 1), "run"),
+        (lambda body: body.update(quarantine="x" * 401), "quarantine"),
+        (lambda body: body.update(cloud_wait_ns=2**62), "cloud_wait_ns"),
+        (lambda body: body["parameters"].update(name="a b"), "profile"),
+        (lambda body: body["epochs"].append(body["epochs"][0]), "epochs"),
+        (lambda body: body["epochs"][0].__setitem__(2, b"\2"), "epochs"),
+        (lambda body: body["head"].update(reported=["x" * 65]), "reported"),
+        (lambda body: body["head"].update(stamp_ns=0), "born_ns"),
+        (lambda body: _set(body, "bernoulli.existence", -0.5), "bernoulli.existence"),
+        (lambda body: _set(body, "bernoulli.score", 1.5), "bernoulli.score"),
+        (lambda body: body.update(stream="another/node/lidar"), "a frame of another/node/lidar"),
     ],
 )
 def test_what_does_not_fit_is_named(change: Any, path: str) -> None:

@@ -1,0 +1,63 @@
+"""What bytes from anywhere must never do: one function per decoder, which raises when it finds that they do.
+
+Each takes what the search or a kept file gives, and returns nothing whether the bytes were read or refused.
+"""
+
+from __future__ import annotations
+
+import contextlib
+
+import optipmb_schemas as schemas
+from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
+from optipmb_service.session.convert import density_of
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Policy
+from router import Sensor
+
+LIMITS = schemas.Limits(max_bytes=2**16, max_json_bytes=2**16, max_values=2**12)
+POLICY = Policy(checkpoint_bytes=2000)
+"""So little that a restored session must go over its first frames again before it can be written down."""
+
+
+def messages(data: bytes) -> None:
+    """A payload is read or refused; what is read is written and read again, and is equal.
+
+    The first byte chooses the type of the message.
+    """
+    if not data:
+        return
+    kind = schemas.MESSAGES[data[0] % len(schemas.MESSAGES)]
+    try:
+        message = schemas.decode(data[1:], kind, limits=LIMITS)
+    except schemas.MessageError:
+        return
+    assert schemas.decode(schemas.encode(message), kind) == message
+
+
+def checkpoints(data: bytes) -> None:
+    """A checkpoint is refused, or becomes a session that answers, tracks the next frame, and can be written down again.
+
+    The bytes are taken as they are, and once more as a body under a good seal, which is how a decoder is reached.
+    """
+    with contextlib.suppress(CheckpointError):
+        decode_checkpoint(data)
+    try:
+        session = Session.restore(decode_checkpoint(seal(data)), 0, POLICY)
+    except CheckpointError:
+        return
+    _answer(session)
+    session.on_detections(Sensor(stream=session.stream).detections(3, objects=1), 0)
+    session.flush()
+    written = _answer(session)
+    assert encode_checkpoint(decode_checkpoint(written)) == written
+
+
+def _answer(session: Session) -> bytes:
+    session.state()
+    density_of(session.density, stream=session.stream, session=session.session, parameters=session.parameters)
+    return encode_checkpoint(session.snapshot())
+
+
+TARGETS = {"messages": messages, "checkpoints": checkpoints}
+HEADS = {"messages": 1, "checkpoints": 0}
+"""How many bytes stand before the map."""
