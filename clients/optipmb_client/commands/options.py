@@ -60,7 +60,7 @@ Classes = Annotated[
 ]
 Options = Annotated[
     list[str] | None,
-    typer.Option("--option", metavar="NAME=NUMBER", help="Option of the dataset, such as frames=50 of a scene."),
+    typer.Option("--option", metavar="NAME=VALUE", help="Option of the dataset, such as frames=50 of a scene."),
 ]
 Tracks = Annotated[Path, typer.Option("--tracks", help="Folder with the result files of track or replay.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results; made if needed.")]
@@ -95,18 +95,20 @@ def open_sequences(
 
     Raises:
         DatasetError: Any of it is not there; says what.
-        UsageError: An option is not `NAME=NUMBER`.
+        UsageError: An option is not `NAME=VALUE`.
     """
     opened = open_dataset(dataset, root, detections, **dict(_option(text) for text in options or ()))
     return opened, list(opened.sequences(sequences or ["all"]))
 
 
-def _option(text: str) -> tuple[str, float]:
-    name, _, value = text.partition("=")
+def _option(text: str) -> tuple[str, float | str]:
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise UsageError(f"--option: expected NAME=VALUE, received {text!r}")
     try:
         number = float(value)
     except ValueError:
-        raise UsageError(f"--option: expected NAME=NUMBER, received {text!r}") from None
+        return name, value
     return name, int(number) if number.is_integer() else number
 
 

@@ -1,0 +1,192 @@
+"""Bags of ROS 2 as a dataset: each topic of detections is a sequence, `/lidar/boxes` is called `lidar.boxes`.
+
+Stamps are those of the headers. Tracks are in the fixed frame of tf. There is no truth. What a bag leaves open is
+chosen by options: `points`, `odometry`, `fixed_frame`, and `class.NAME=OTHER` for names of classes.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property, partial
+from pathlib import Path
+
+from optipmb_client.camera import synthetic_camera
+from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFrame, Points, Truth
+from optipmb_client.errors import ClientError
+from optipmb_client.files import DatasetError
+from optipmb_client.geometry import Pose
+from optipmb_client.results import KittiResultWriter, ResultWriter
+
+try:
+    from optipmb_schemas import MessageError
+    from optipmb_schemas.ros2.arrays import Boxes, boxes_of, points_of
+
+    from optipmb_client.rosbag.plan import Choice, Plan, detection_topics, plan, read_transforms
+    from optipmb_client.rosbag.reading import Bag, Raw
+    from optipmb_client.rosbag.writing import BagResultWriter
+except ImportError as error:
+    raise ClientError("bags need rosbags, which is not installed: pip install 'optipmb[ros2]'") from error
+
+_PROFILES = (
+    ("kitti", frozenset({"Car", "Pedestrian", "Cyclist"})),
+    ("nuscenes", frozenset({"bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck"})),
+)
+_CLASS = "class."
+
+
+class RosbagSequence:
+    """One topic of detections."""
+
+    def __init__(self, bag: Bag, plan_: Plan, classes: Mapping[str, str]) -> None:
+        self.name = plan_.topic.strip("/").replace("/", ".")
+        self.plan = plan_
+        self.bag = bag
+        self._classes = classes
+
+    def __len__(self) -> int:
+        return len(self.plan.frames)
+
+    @property
+    def has_clouds(self) -> bool:
+        """Whether any frame has a cloud."""
+        return bool(self.plan.clouds)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was left out, and why."""
+        return tuple(self.plan.notes)
+
+    @property
+    def poses(self) -> Sequence[Pose]:
+        """World from sensor of each frame."""
+        return [frame.pose for frame in self.plan.frames]
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """Class names of all frames."""
+        messages = self.bag.messages((self.plan.topic,))
+        return tuple(dict.fromkeys(name for raw in messages for name in self._boxes(raw).labels))
+
+    def frames(self) -> Iterator[DetectionFrame]:
+        """Yield every frame in the order of the stamps. What is received between a frame and its cloud is kept."""
+        topics = {self.plan.topic, *([self.plan.cloud_topic] if self.plan.cloud_topic else [])}
+        due = [(frame.stamp_ns, frame.received_ns) for frame in self.plan.frames]
+        known = set(due)
+        boxes: dict[tuple[int, int], Boxes] = {}
+        clouds: dict[int, Raw] = {}
+        index = 0
+        for raw in self.bag.messages(topics):
+            stamp_ns = self.bag.header(raw).stamp_ns
+            if raw.topic == self.plan.topic:
+                if (stamp_ns, raw.received_ns) in known:
+                    boxes[stamp_ns, raw.received_ns] = self._boxes(raw)
+            elif stamp_ns in self.plan.clouds:
+                clouds[stamp_ns] = raw
+            while index < len(due) and due[index] in boxes and self._complete(due[index][0], clouds):
+                yield self._frame(index, boxes.pop(due[index]), clouds.get(due[index][0]))
+                index += 1
+                if index == len(due) or due[index][0] != due[index - 1][0]:
+                    clouds.pop(due[index - 1][0], None)
+
+    def truth(self) -> Truth | None:
+        """Return None: nobody annotated it."""
+        return None
+
+    def _complete(self, stamp_ns: int, clouds: Mapping[int, Raw]) -> bool:
+        return stamp_ns not in self.plan.clouds or stamp_ns in clouds
+
+    def _frame(self, index: int, boxes: Boxes, cloud: Raw | None) -> DetectionFrame:
+        planned = self.plan.frames[index]
+        row_of = [self.labels.index(name) for name in boxes.labels]
+        label = boxes.label.copy()
+        for row, there in enumerate(row_of):
+            label[boxes.label == row] = there
+        pose = self.plan.clouds.get(planned.stamp_ns)
+        return DetectionFrame(
+            index=index,
+            stamp_ns=planned.stamp_ns,
+            pose=planned.pose,
+            labels=self.labels,
+            label=label,
+            center=boxes.center,
+            size=boxes.size,
+            yaw=boxes.yaw,
+            score=boxes.score,
+            velocity=boxes.velocity,
+            cloud=None if cloud is None or pose is None else Cloud(partial(self._points, cloud), *pose),
+        )
+
+    def _boxes(self, raw: Raw) -> Boxes:
+        try:
+            return boxes_of(self.bag.read(raw), self._classes)
+        except MessageError as error:
+            raise self.bag.wrong(raw, error) from error
+
+    def _points(self, raw: Raw) -> Points:
+        try:
+            return points_of(self.bag.read(raw))
+        except MessageError as error:
+            raise self.bag.wrong(raw, error) from error
+
+
+class RosbagDataset:
+    """The topics of detections of one bag.
+
+    Args:
+        path: the folder or file.
+        options: `points`, `odometry`, `fixed_frame`, `class.NAME`, and `keep_input`.
+
+    Raises:
+        DatasetError: it cannot be read, has no detections, or an option is not known.
+    """
+
+    name = "rosbag"
+
+    def __init__(self, path: Path, options: Mapping[str, float | str]) -> None:
+        texts = {name: str(value) for name, value in options.items()}
+        self._classes = {name.removeprefix(_CLASS): texts.pop(name) for name in list(texts) if name.startswith(_CLASS)}
+        self._keep_input = texts.pop("keep_input", "0") not in {"0", "False"}
+        known = set(Choice.__dataclass_fields__)
+        for name in texts:
+            if name not in known:
+                allowed = f"one of {', '.join(sorted(known))}, keep_input, class.NAME"
+                raise DatasetError(f"option {name}", allowed, "an unknown option")
+        self._bag = Bag(path)
+        self._choice = Choice(**texts)
+        self._topics = {topic.strip("/").replace("/", "."): topic for topic in detection_topics(self._bag)}
+
+    @property
+    def profile(self) -> str:
+        """The profile whose classes the detections have."""
+        labels = dict.fromkeys(name for sequence in self.sequences(["all"]) for name in sequence.labels)
+        for profile, classes in _PROFILES:
+            if classes & set(labels):
+                return profile
+        known = "; ".join(f"{name} ({', '.join(sorted(classes))})" for name, classes in _PROFILES)
+        expected = f"--profile, or names of classes by --option class.NAME=OTHER that fit one of {known}"
+        raise DatasetError(self._bag.path, expected, f"the classes {', '.join(labels) or 'none'}")
+
+    @cached_property
+    def _sequences(self) -> dict[str, RosbagSequence]:
+        return {}
+
+    def sequences(self, names: Sequence[str]) -> Sequence[RosbagSequence]:
+        """Return the topics of these names, with dots or slashes, or `all`."""
+        wanted: dict[str, None] = {}
+        for name in names:
+            for dotted in self._topics if name == "all" else (name.strip("/").replace("/", "."),):
+                if dotted not in self._topics:
+                    raise DatasetError("--sequences", f"topics of detections: {', '.join(self._topics.values())}", name)
+                wanted[dotted] = None
+        new = [name for name in wanted if name not in self._sequences]
+        if new:
+            transforms = read_transforms(self._bag, self._choice)
+            for name in new:
+                made = plan(self._bag, self._topics[name], transforms, self._choice)
+                self._sequences[name] = RosbagSequence(self._bag, made, self._classes)
+        return [self._sequences[name] for name in wanted]
+
+    def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
+        """Return a writer of the bag `out` if that is an .mcap file, else of `out/NAME.txt` in the format of KITTI."""
+        if out.suffix == ".mcap":
+            (chosen,) = self.sequences([sequence.name])
+            return BagResultWriter(out, chosen.bag, chosen.plan, keep_input=self._keep_input)
+        return KittiResultWriter(out / f"{sequence.name}.txt", synthetic_camera())

@@ -1,0 +1,220 @@
+"""What ROS 2 messages mean: transforms over time, clouds, shapes, types."""
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from optipmb_schemas import MessageError
+from optipmb_schemas.ros2.arrays import boxes_of, points_of
+from optipmb_schemas.ros2.transforms import TransformError, Transforms
+from optipmb_schemas.ros2.types import own_types
+
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def turned(yaw: float) -> np.ndarray:
+    """Give the quaternion of a turn about z."""
+    return np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)])
+
+
+def test_hashes_of_types_are_those_of_ros() -> None:
+    """The hash of std_msgs/String is the one that ROS 2 prints for it."""
+    assert own_types().hash_of("std_msgs/msg/String") == (
+        "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+    )
+
+
+def test_bytes_that_are_no_message_are_refused() -> None:
+    """Cut, too long, empty, of another encapsulation: one error for all."""
+    types = own_types()
+    whole = types.write(types.new("std_msgs/msg/String", data="here"))
+    assert types.read("std_msgs/msg/String", whole).data == "here"
+    for data in (
+        b"",
+        whole[:3],
+        whole[:-3],
+        whole + bytes(9),
+        b"\x00\x03" + whole[2:],
+        b"\x00\x01\x00\x00\xff\xff\xff\xff",
+    ):
+        with pytest.raises(MessageError, match="CDR of std_msgs/msg/String"):
+            types.read("std_msgs/msg/String", data)
+    with pytest.raises(MessageError, match="wrong_type"):
+        types.read("nobody_msgs/msg/Thing", whole)
+
+
+def test_a_stamp_that_was_given_is_answered_as_it_was() -> None:
+    """At a given stamp there is no rounding, between two stamps both parts are interpolated."""
+    transforms = Transforms()
+    for second in range(3):
+        transforms.add("map", "base", second * 10**9, np.array([0.1 * second, 1.0, 0.0]), turned(0.3 * second))
+    exact = transforms.lookup("map", "base", 10**9)
+    assert exact.translation.tolist() == [0.1, 1.0, 0.0]
+    half = transforms.lookup("map", "base", 15 * 10**8)
+    np.testing.assert_allclose(half.translation, [0.15, 1.0, 0.0])
+    np.testing.assert_allclose(half.quaternion, turned(0.45))
+
+
+def test_the_shorter_way_round_is_taken() -> None:
+    """A quaternion and its negative are one rotation: interpolation does not go the long way."""
+    transforms = Transforms()
+    transforms.add("map", "base", 0, np.zeros(3), turned(0.2))
+    transforms.add("map", "base", 2, np.zeros(3), -turned(0.4))
+    np.testing.assert_allclose(np.abs(transforms.lookup("map", "base", 1).quaternion), np.abs(turned(0.3)))
+
+
+def test_a_chain_goes_up_and_down_the_tree() -> None:
+    """A point of one sensor is found in the frame of another one, over the common frame and over static frames."""
+    transforms = Transforms()
+    transforms.add("map", "base", 0, np.array([10.0, 0.0, 0.0]), turned(math.pi / 2))
+    transforms.add("/base", "front", 0, np.array([1.0, 0.0, 0.0]), UPRIGHT, static=True)
+    transforms.add("base", "rear", 0, np.array([-1.0, 0.0, 0.0]), turned(math.pi), static=True)
+    np.testing.assert_allclose(transforms.lookup("map", "front", 0).translation, [10.0, 1.0, 0.0], atol=1e-12)
+    across = transforms.lookup("rear", "front", 0)
+    np.testing.assert_allclose(across.translation, [-2.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(np.abs(across.quaternion), [0, 0, 0, 1], atol=1e-12)
+    assert transforms.root("front") == "map"
+
+
+def test_what_is_not_known_is_told_and_whether_it_can_come() -> None:
+    """Unknown frames and later stamps may still come; earlier stamps and circles cannot be mended."""
+    transforms = Transforms()
+    transforms.add("map", "base", 5, np.zeros(3), UPRIGHT)
+    transforms.add("other", "lidar", 5, np.zeros(3), UPRIGHT)
+    for target, source, stamp, text, later in (
+        ("map", "radar", 5, "frame 'radar'", True),
+        ("map", "lidar", 5, "roots are map and other", True),
+        ("map", "base", 9, "after the last", True),
+        ("map", "base", 1, "before the first", False),
+    ):
+        with pytest.raises(TransformError, match=text) as caught:
+            transforms.lookup(target, source, stamp)
+        assert caught.value.later is later
+    transforms.add("base", "map", 5, np.zeros(3), UPRIGHT)
+    with pytest.raises(TransformError, match="circle"):
+        transforms.root("base")
+
+
+def test_transforms_are_bounded() -> None:
+    """The oldest stamps go first, frames beyond the limit are refused, and so is what is no pose."""
+    transforms = Transforms(kept=3, frames=2)
+    for stamp in range(10):
+        transforms.add("map", "base", stamp, np.zeros(3), UPRIGHT)
+    with pytest.raises(TransformError, match="before the first"):
+        transforms.lookup("map", "base", 6)
+    assert transforms.lookup("map", "base", 7)
+    transforms.add("map", "b", 0, np.zeros(3), UPRIGHT)
+    with pytest.raises(MessageError, match="at most 2 frames"):
+        transforms.add("map", "c", 0, np.zeros(3), UPRIGHT)
+    for wrong in ((np.array([np.nan, 0, 0]), UPRIGHT), (np.zeros(3), np.zeros(4)), (np.zeros(3), UPRIGHT * np.nan)):
+        with pytest.raises(MessageError, match="unit quaternion"):
+            transforms.add("map", "base", 11, *wrong)
+    with pytest.raises(MessageError, match="two different frames"):
+        transforms.add("map", "/map", 0, np.zeros(3), UPRIGHT)
+
+
+def cloud(**changes: Any) -> Any:
+    """Give a cloud of 2 rows with 3 points, big endian, 64-bit z ahead of x and y, rows padded by 5 bytes."""
+    point = np.dtype(
+        {"names": ["z", "x", "y"], "formats": [">f8", ">f4", ">f4"], "offsets": [0, 10, 14], "itemsize": 20}
+    )
+    values = np.zeros((2, 3), point)
+    values["x"], values["y"], values["z"] = np.arange(6).reshape(2, 3), 1, -2
+    values["x"][1, 1] = np.nan
+    data = np.zeros((2, 65), np.uint8)
+    data[:, :60] = values.view(np.uint8).reshape(2, 60)
+    fields = [
+        SimpleNamespace(name=name, offset=offset, datatype=kind, count=1)
+        for name, offset, kind in (("z", 0, 8), ("x", 10, 7), ("y", 14, 7))
+    ]
+    given = {"height": 2, "width": 3, "fields": fields, "is_bigendian": True, "point_step": 20, "row_step": 65}
+    return SimpleNamespace(**(given | {"data": data.ravel()} | changes))
+
+
+def test_clouds_of_any_layout_are_read() -> None:
+    """Order of fields and bytes, 64 bits, padding and rows do not matter; points without a return are left out."""
+    assert points_of(cloud()).tolist() == [[x, 1.0, -2.0] for x in (0.0, 1.0, 2.0, 3.0, 5.0)]
+    assert points_of(cloud(height=0, width=0, data=np.empty(0, np.uint8))).shape == (0, 3)
+
+
+def test_clouds_that_contradict_themselves_are_refused() -> None:
+    """No read goes beyond the data, whatever the sizes say."""
+    fields = cloud().fields
+    for changes, path in (
+        ({"height": 3}, "data"),
+        ({"row_step": 50}, "data"),
+        ({"width": 2**31, "height": 2**31}, "data"),
+        ({"point_step": 15}, "point_step"),
+        ({"fields": fields[:2]}, "fields"),
+        ({"fields": [SimpleNamespace(name="x", offset=0, datatype=2, count=1)]}, "fields"),
+    ):
+        with pytest.raises(MessageError) as caught:
+            points_of(cloud(**changes))
+        assert caught.value.path == path
+
+
+def autoware(**changes: Any) -> Any:
+    """Give one object of Autoware at (1, 2, 3) that looks along y."""
+    types = own_types()
+    package = "autoware_perception_msgs/msg"
+    zero = np.zeros(36)
+
+    def vector(x: float, y: float, z: float, kind: str = "Vector3") -> Any:
+        return types.new(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+
+    turn = types.new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sqrt(0.5), w=math.sqrt(0.5))
+    pose = types.new("geometry_msgs/msg/Pose", position=vector(1.0, 2.0, 3.0, "Point"), orientation=turn)
+    twist = types.new("geometry_msgs/msg/Twist", linear=vector(4.0, 0.0, 0.0), angular=vector(0.0, 0.0, 0.0))
+    shape = {
+        "type": 0,
+        "footprint": types.new("geometry_msgs/msg/Polygon", points=[]),
+        "dimensions": vector(4.0, 2.0, 1.5),
+    }
+    given: dict[str, Any] = {
+        "existence_probability": 0.75,
+        "classification": [
+            types.new(f"{package}/ObjectClassification", label=label, probability=probability)
+            for label, probability in ((1, 0.25), (2, 0.5))
+        ],
+        "kinematics": types.new(
+            f"{package}/DetectedObjectKinematics",
+            pose_with_covariance=types.new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=zero),
+            has_position_covariance=False,
+            orientation_availability=2,
+            twist_with_covariance=types.new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=zero),
+            has_twist=True,
+            has_twist_covariance=False,
+        ),
+    }
+    shape |= {name: changes.pop(name) for name in list(changes) if name in shape}
+    given["shape"] = types.new(f"{package}/Shape", **shape)
+    one = types.new(f"{package}/DetectedObject", **(given | changes))
+    stamp = types.new("builtin_interfaces/msg/Time", sec=1, nanosec=2)
+    header = types.new("std_msgs/msg/Header", stamp=stamp, frame_id="/lidar")
+    return types.new(f"{package}/DetectedObjects", header=header, objects=[one])
+
+
+def test_an_object_of_autoware_is_read_whole() -> None:
+    """The likeliest class, the existence probability, and the twist turned out of the frame of the object."""
+    boxes = boxes_of(autoware())
+    assert (boxes.labels, boxes.score.tolist(), boxes.size.tolist()) == (("truck",), [0.75], [[4.0, 2.0, 1.5]])
+    assert boxes.yaw[0] == pytest.approx(math.pi / 2)
+    assert boxes.velocity is not None
+    np.testing.assert_allclose(boxes.velocity, [[0.0, 4.0]], atol=1e-12)
+    assert boxes_of(autoware(existence_probability=0.0)).score.tolist() == [0.5]
+    assert boxes_of(autoware(), {"truck": "Lorry"}).labels == ("Lorry",)
+
+
+def test_other_shapes_become_boxes() -> None:
+    """A cylinder is as long as wide; the box around a polygon is where the polygon is."""
+    types = own_types()
+    assert boxes_of(autoware(type=1)).size.tolist() == [[4.0, 4.0, 1.5]]
+    corners = [types.new("geometry_msgs/msg/Point32", x=x, y=y, z=0.0) for x, y in ((0, 0), (4, 0), (4, 1), (0, 1))]
+    boxes = boxes_of(autoware(type=2, footprint=types.new("geometry_msgs/msg/Polygon", points=corners)))
+    assert boxes.size.tolist() == [[4.0, 1.0, 1.5]]
+    np.testing.assert_allclose(boxes.center, [[0.5, 4.0, 3.0]])
+    for changes in ({"type": 2}, {"type": 7}):
+        with pytest.raises(MessageError, match=r"objects\[0\].shape"):
+            boxes_of(autoware(**changes))
