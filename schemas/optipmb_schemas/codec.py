@@ -101,6 +101,15 @@ def decode(payload: bytes, expected: type[T], *, encoding: str = "", limits: Lim
     fields = _parse_json(payload, limits) if form == "json" else _parse_msgpack(payload, limits)
     if not isinstance(fields, dict):
         raise MessageError("malformed", "", f"one map with the fields of {expected.__name__}", show(fields))
+    return build(fields, expected, limits)
+
+
+def build(fields: dict[str, Any], expected: type[T], limits: Limits) -> T:
+    """Return the message of fields as they were received, arrays as blocks or nested lists.
+
+    Raises:
+        MessageError: whenever they are not those of a valid message of this type within the limits.
+    """
     labels = fields.get("labels")
     if isinstance(labels, list) and len(labels) > limits.max_labels:
         raise MessageError("too_large", "labels", f"at most {limits.max_labels} labels", f"{len(labels)} labels")

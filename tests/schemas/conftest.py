@@ -1,5 +1,7 @@
 """One valid message of every type, small and complete: every field is present."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from optipmb_schemas import (
@@ -135,6 +137,17 @@ def _examples() -> list[Message]:
 def examples() -> dict[str, Message]:
     """A valid message of every type, by the name of the type."""
     return {type(message).__name__: message for message in _examples()}
+
+
+@pytest.fixture(scope="session")
+def example_of(examples: dict[str, Message]) -> Callable[[type[Message]], Message]:
+    """Gives the valid message of a type, also of those that messages hold."""
+    tracks, status = examples["Tracks"], examples["ServiceStatus"]
+    assert isinstance(tracks, Tracks)
+    assert isinstance(status, ServiceStatus)
+    assert tracks.delivery is not None
+    held = {"Pose": POSE, "Delivery": tracks.delivery, "SessionSummary": status.sessions[0]}
+    return lambda kind: {**examples, **held}[kind.__name__]
 
 
 @pytest.fixture(scope="session")

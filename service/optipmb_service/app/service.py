@@ -36,6 +36,7 @@ from optipmb_service.runtime.ports import HttpError, TransportError
 from optipmb_service.runtime.queries import Queries
 from optipmb_service.runtime.registry import Registry
 from optipmb_service.runtime.scheduler import Scheduler
+from optipmb_service.session.problems import problem_of
 from optipmb_service.zenoh import Transport
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ class Service:
         self._reporter = ProblemReporter(self._transport.publish_problem, _log_problem)
         self._scheduler = Scheduler(settings.threads)
         self._coordinator = Coordinator(settings.instance, self._transport, settings.lease_s)
-        self._persistence = open_persistence(settings, self._coordinator.may_write)
+        self._persistence = open_persistence(settings, self._coordinator.may_write, self._unkept)
         self._registry = Registry(
             settings,
             profiles,
@@ -180,8 +181,32 @@ class Service:
         return self._transport.tap(stream, receive)
 
     def _summaries(self, now_ns: int) -> tuple[schemas.SessionSummary, ...]:
-        summaries = (actor.summary(now_ns) for actor in self._registry.actors())
-        return tuple(summary for summary in summaries if summary is not None)
+        """Return a line for each session; one that cannot be made is a problem of its stream alone."""
+        summaries = []
+        for actor in self._registry.actors():
+            try:
+                summary = actor.summary(now_ns)
+            except Exception as error:
+                log.exception("internal_error", stream=actor.stream)
+                self._report(actor.stream, "the line of a session in the status", f"{type(error).__name__}: {error}")
+            else:
+                summaries += [summary] if summary is not None else []
+        return tuple(summaries)
+
+    def _unkept(self, stream: str, why: str) -> None:
+        """Report that the state of a stream cannot be kept."""
+        self._report(stream, "a state that can be written down", why)
+
+    def _report(self, stream: str, expected: str, received: str) -> None:
+        problem = problem_of(
+            "internal",
+            stream=stream,
+            instance=self._settings.instance,
+            expected=expected,
+            received=received,
+            message=f"Stream: expected {expected}, received {received}.",
+        )
+        self._reporter.report(problem, time.monotonic_ns())
 
     def _figures(self) -> Iterator[Value]:
         """Read what `metrics` does not count itself."""

@@ -34,6 +34,8 @@ EVENTS: Final = {
     "by another instance.",
     "checkpoint_torn": "A checkpoint cannot be read; it is set aside and the one before it is used.",
     "checkpoint_refused": "Another instance has taken the stream over; this one's checkpoint was not written.",
+    "checkpoint_failed": "The checkpoint of one stream cannot be made: a fault of the service, report it."
+    " The stream goes on, others are kept; the state is `degraded`.",
     "store_failed": "Checkpoints cannot be written (disk full, read-only?): tracking goes on, the state is `degraded`.",
     "store_back": "Checkpoints are written again.",
     "write_lease_lapsed": "This process was frozen, starved or cut off: nothing is published until it has looked"

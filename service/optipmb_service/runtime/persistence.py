@@ -32,6 +32,15 @@ _T = TypeVar("_T")
 
 STORE_FILE: Final = "sessions.db"
 
+FAILED_NS: Final = 60 * 1_000_000_000
+"""How long after the last failure a stream's checkpoint is called failing; it is tried every second while it sends."""
+
+MAX_FAILED: Final = 1024
+"""Streams whose failure is remembered."""
+
+SHOWN: Final = 3
+"""Of these, how many are named at once."""
+
 SETTLE_S: Final = 0.25
 """Between a checkpoint and its writing, time for the tracks to leave."""
 
@@ -110,11 +119,19 @@ class CheckpointWriter:
         store: where they go.
         interval_s: time between two rounds.
         may_write: whether this process owns a stream.
+        report: called with a stream whose checkpoint cannot be made, and why.
     """
 
     durable = True
 
-    def __init__(self, store: Store, interval_s: float, may_write: Callable[[str], bool]) -> None:
+    def __init__(
+        self,
+        store: Store,
+        interval_s: float,
+        may_write: Callable[[str], bool],
+        report: Callable[[str, str], None] = lambda *_: None,
+    ) -> None:
+        self._report = report
         self._store = store
         self._interval_s = interval_s
         self._gather: Callable[[], None] = lambda: None
@@ -125,8 +142,8 @@ class CheckpointWriter:
         self._hurry = threading.Event()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="checkpoints", daemon=True)
-        self.failure = ""
-        """Why the store fails at present; empty while it does not."""
+        self._store_failure = ""
+        self._failed_streams: dict[str, tuple[int, str]] = {}
         self.written = 0
         """Checkpoints written since the start."""
         self.complete_ns = time.monotonic_ns()
@@ -136,6 +153,19 @@ class CheckpointWriter:
         """Begin the rounds."""
         self._gather = gather
         self._thread.start()
+
+    @property
+    def failure(self) -> str:
+        """Why the store, or the checkpoint of a stream, fails at present; empty while nothing does."""
+        if self._store_failure:
+            return self._store_failure
+        lately_ns = time.monotonic_ns() - FAILED_NS
+        failed = sorted(
+            f"checkpoint of {stream}: {why}"
+            for stream, (at_ns, why) in tuple(self._failed_streams.items())
+            if at_ns >= lately_ns
+        )
+        return "; ".join(failed[:SHOWN])
 
     def put(self, checkpoint: Checkpoint, then: Callable[[], None] | None = None) -> None:
         """Have a checkpoint written in this round; with `then`, soon, and `then` called when that was tried."""
@@ -192,7 +222,8 @@ class CheckpointWriter:
             thens, self._thens = self._thens, []
         mine = {stream: checkpoint for stream, checkpoint in taken.items() if self._may_write(stream)}
         try:
-            lost = self._store.save(self._encoded(mine)) if mine else ()
+            encoded = self._encoded(mine) if mine else {}
+            lost = self._store.save(encoded) if encoded else ()
         except StoreError as error:
             self._failed(error)
             with self._lock:
@@ -200,12 +231,14 @@ class CheckpointWriter:
         except Exception:
             log.exception("internal_error", thread="checkpoints")
         else:
-            self.written += len(mine) - len(lost)
-            if mine or not self.failure:
-                self.complete_ns = time.monotonic_ns()
-            if mine and self.failure:
-                self.failure = ""
+            self.written += len(encoded) - len(lost)
+            for stream in encoded:
+                self._failed_streams.pop(stream, None)
+            if encoded and self._store_failure:
+                self._store_failure = ""
                 log.info("store_back")
+            if not self.failure:
+                self.complete_ns = time.monotonic_ns()
             for stream in lost:
                 log.warning("checkpoint_refused", stream=stream)
         for then in thens:
@@ -220,18 +253,32 @@ class CheckpointWriter:
         pause_s = 0.0 if self._ended.is_set() else min(PAUSE_S, self._interval_s / 2 / len(checkpoints))
         encoded = {}
         for stream, one in checkpoints.items():
-            encoded[stream] = encode_checkpoint(one)
+            try:
+                encoded[stream] = encode_checkpoint(one)
+            except Exception as error:  # noqa: BLE001 - whatever is wrong with one stream, the others are written
+                self._fail(stream, f"{type(error).__name__}: {error}")
             if pause_s:
                 self._ended.wait(pause_s)
         return encoded
 
+    def _fail(self, stream: str, why: str) -> None:
+        """Note that the checkpoint of one stream cannot be made."""
+        if stream not in self._failed_streams:
+            log.error("checkpoint_failed", stream=stream, error=why)
+        while len(self._failed_streams) >= MAX_FAILED:
+            self._failed_streams.pop(next(iter(self._failed_streams)))
+        self._failed_streams[stream] = time.monotonic_ns(), why
+        self._report(stream, why)
+
     def _failed(self, error: StoreError) -> None:
-        if not self.failure:
+        if not self._store_failure:
             log.error("store_failed", error=str(error))
-        self.failure = str(error)
+        self._store_failure = str(error)
 
 
-def open_persistence(settings: Settings, may_write: Callable[[str], bool]) -> Persistence:
+def open_persistence(
+    settings: Settings, may_write: Callable[[str], bool], report: Callable[[str, str], None]
+) -> Persistence:
     """Return the checkpoint writer; where its store cannot be opened, one that keeps nothing and says why."""
     folder = settings.folder
     if folder is None:
@@ -243,4 +290,4 @@ def open_persistence(settings: Settings, may_write: Callable[[str], bool]) -> Pe
         # Tracking without memory is better than none; the status says that it is so.
         log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
         return NoPersistence(str(error))
-    return CheckpointWriter(store, settings.checkpoint_s, may_write)
+    return CheckpointWriter(store, settings.checkpoint_s, may_write, report)

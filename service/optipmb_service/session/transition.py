@@ -21,7 +21,7 @@ from optipmb_service.session import convert
 from optipmb_service.session.pose_check import judge, position_of
 from optipmb_service.session.state import Entry, FilterState, FrameCounts, PoseHistory
 from optipmb_service.session.timeline import FrameId, Verdict
-from optipmb_service.session.values import MAX_COUNT, MAX_LABELS
+from optipmb_service.session.values import MAX_LABELS, total
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas
@@ -171,7 +171,7 @@ def _counted(
     """Return the counts with one more frame."""
     return FrameCounts(
         frames=before.frames + tracked,
-        gaps=min(before.gaps + gap, MAX_COUNT),  # sequence numbers may leap by 2^63
+        gaps=total(before.gaps, gap),
         new_epochs=before.new_epochs + (entry.place.opens in _OPENING),
         clouds_used=before.clouds_used + used,
         clouds_missed=before.clouds_missed + entry.missed,

@@ -25,6 +25,14 @@ MAX_LABELS: Final = 256
 """Unknown class names remembered as reported."""
 
 
+def total(*counts: int) -> int:
+    """Return the sum of counts; beyond the highest it stays there.
+
+    A publisher chooses its sequence numbers, and what is missing between two of them is counted.
+    """
+    return min(sum(counts), MAX_COUNT)
+
+
 class Steps(Protocol):
     """What a session needs of a tracker; `optipmb.Tracker` has it."""
 
@@ -180,7 +188,7 @@ class MessageCounters(Counters):
     def __add__(self, other: MessageCounters) -> MessageCounters:
         """Return the sums."""
         return MessageCounters(
-            **{one.name: getattr(self, one.name) + getattr(other, one.name) for one in fields(MessageCounters)}
+            **{one.name: total(getattr(self, one.name), getattr(other, one.name)) for one in fields(MessageCounters)}
         )
 
     def since(self, earlier: Counters, now: Counters) -> MessageCounters:

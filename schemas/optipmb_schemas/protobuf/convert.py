@@ -1,0 +1,143 @@
+"""From models to protobuf messages and back. Columns are carried as bytes: neither way looks at their values.
+
+`from_proto` builds what `decode` builds of msgpack and checks it in the same way, so that both forms have the same
+limits and the same errors. It is total: it returns a model or raises `MessageError`.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from google.protobuf import struct_pb2
+from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.json_format import MessageToDict
+from google.protobuf.message import DecodeError
+from google.protobuf.message import Message as ProtoMessage
+from numpy.typing import NDArray
+
+from optipmb_schemas.blocks import DTYPES
+from optipmb_schemas.codec import build
+from optipmb_schemas.errors import MessageError, invalid
+from optipmb_schemas.limits import DEFAULT, Limits
+from optipmb_schemas.model import Message
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+
+T = TypeVar("T", bound=Message)
+P = TypeVar("P", bound=ProtoMessage)
+
+_DTYPE_NAMES: Final[dict[int, str]] = {
+    code: name.rpartition("_")[2].lower() for name, code in pb.DataType.items() if code
+}
+_DTYPE_CODES: Final[dict[np.dtype[Any], Any]] = {DTYPES[name]: code for code, name in _DTYPE_NAMES.items()}
+_FRAMES: Final[dict[int, str]] = {pb.FRAME_WORLD: "world", pb.FRAME_SENSOR: "sensor"}
+_FRAME_CODES: Final = {name: code for code, name in _FRAMES.items()}
+
+
+def parse(payload: bytes, kind: type[P]) -> P:
+    """Return the protobuf message of the bytes.
+
+    Raises:
+        MessageError: they are none.
+    """
+    try:
+        return kind.FromString(payload)
+    except DecodeError:
+        name = kind.DESCRIPTOR.full_name
+        raise MessageError("malformed", "", f"a message {name}", f"{len(payload)} bytes that are none") from None
+
+
+def to_proto(message: Message, columns: Mapping[str, NDArray[Any]] | None = None) -> Any:
+    """Return the protobuf message of a model, which must have one: `export.MODELS`.
+
+    Args:
+        message: the model.
+        columns: arrays in the place of its own, for some rows or columns alone; default: its own.
+    """
+    kind = type(message)
+    fields: dict[str, Any] = {}
+    for name, own in message.present():
+        value = own if columns is None or name not in kind.arrays else columns.get(name)
+        if value is None:
+            continue
+        if isinstance(value, np.ndarray):
+            fields[name] = value.tolist() if name in _repeated(kind) else _array(value)
+        elif isinstance(value, Message):
+            fields[name] = to_proto(value)
+        elif name == "frame":
+            fields[name] = _FRAME_CODES[value]
+        else:
+            fields[name] = _struct(value) if isinstance(value, dict) else value
+    return getattr(pb, kind.__name__)(**fields)
+
+
+def from_proto(proto: ProtoMessage, kind: type[T], limits: Limits = DEFAULT) -> T:
+    """Return the model of a protobuf message.
+
+    Raises:
+        MessageError: whenever it is not a valid message within the limits.
+    """
+    return build(_fields(proto), kind, limits)
+
+
+def _array(array: NDArray[Any]) -> pb.Array:
+    little = array.dtype.newbyteorder("<")
+    return pb.Array(dtype=_DTYPE_CODES[little], shape=array.shape, data=np.ascontiguousarray(array, little).tobytes())
+
+
+def _fields(proto: ProtoMessage) -> dict[str, Any]:
+    """Return the fields as `build` takes them. An absent one that can tell so is left out."""
+    return {
+        name: read(value)
+        for name, presence, read in _readers(proto.DESCRIPTOR.full_name)
+        if (not presence or proto.HasField(name)) and (value := getattr(proto, name)) is not None
+    }
+
+
+@cache
+def _readers(name: str) -> tuple[tuple[str, bool, Callable[[Any], Any]], ...]:
+    """Return name, whether it can be absent, and how to read it, of every field of a message type."""
+    descriptor = pb.DESCRIPTOR.message_types_by_name[name.rpartition(".")[2]]
+    return tuple((field.name, field.has_presence, _reader(field)) for field in descriptor.fields)
+
+
+def _reader(field: FieldDescriptor) -> Callable[[Any], Any]:
+    if field.is_repeated:
+        return list
+    if field.enum_type is not None:
+        return _frame
+    if field.message_type is None:
+        return _same
+    if field.message_type.full_name == pb.Array.DESCRIPTOR.full_name:
+        return _block
+    if field.message_type.full_name == struct_pb2.Struct.DESCRIPTOR.full_name:
+        return MessageToDict
+    return _fields
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def _frame(code: int) -> str:
+    frame = _FRAMES.get(code)
+    if frame is None:
+        raise invalid("frame", "FRAME_WORLD or FRAME_SENSOR", code)
+    return frame
+
+
+def _block(array: pb.Array) -> dict[str, Any]:
+    """Return an array as the block that msgpack has."""
+    return {"dtype": _DTYPE_NAMES.get(array.dtype, array.dtype), "shape": list(array.shape), "data": array.data}
+
+
+@cache
+def _repeated(kind: type[Message]) -> frozenset[str]:
+    """Return the names of the arrays that are lists of numbers in protobuf: those of a fixed small size."""
+    return frozenset(name for name, array in kind.arrays.items() if array.rows is None)
+
+
+def _struct(values: dict[str, Any]) -> struct_pb2.Struct:
+    struct = struct_pb2.Struct()
+    struct.update(values)
+    return struct

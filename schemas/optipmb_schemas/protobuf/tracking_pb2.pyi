@@ -1,0 +1,496 @@
+# Generated from tracking.proto by `python -m optipmb_schemas.protobuf.export`. Not to be edited.
+from google.protobuf import struct_pb2 as _struct_pb2
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class DataType(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    DATA_TYPE_UNSPECIFIED: _ClassVar[DataType]
+    DATA_TYPE_F4: _ClassVar[DataType]
+    DATA_TYPE_F8: _ClassVar[DataType]
+    DATA_TYPE_I1: _ClassVar[DataType]
+    DATA_TYPE_I2: _ClassVar[DataType]
+    DATA_TYPE_I4: _ClassVar[DataType]
+    DATA_TYPE_I8: _ClassVar[DataType]
+    DATA_TYPE_U1: _ClassVar[DataType]
+    DATA_TYPE_U2: _ClassVar[DataType]
+    DATA_TYPE_U4: _ClassVar[DataType]
+    DATA_TYPE_U8: _ClassVar[DataType]
+
+class Frame(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    FRAME_UNSPECIFIED: _ClassVar[Frame]
+    FRAME_WORLD: _ClassVar[Frame]
+    FRAME_SENSOR: _ClassVar[Frame]
+DATA_TYPE_UNSPECIFIED: DataType
+DATA_TYPE_F4: DataType
+DATA_TYPE_F8: DataType
+DATA_TYPE_I1: DataType
+DATA_TYPE_I2: DataType
+DATA_TYPE_I4: DataType
+DATA_TYPE_I8: DataType
+DATA_TYPE_U1: DataType
+DATA_TYPE_U2: DataType
+DATA_TYPE_U4: DataType
+DATA_TYPE_U8: DataType
+FRAME_UNSPECIFIED: Frame
+FRAME_WORLD: Frame
+FRAME_SENSOR: Frame
+
+class Array(_message.Message):
+    __slots__ = ("dtype", "shape", "data")
+    DTYPE_FIELD_NUMBER: _ClassVar[int]
+    SHAPE_FIELD_NUMBER: _ClassVar[int]
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    dtype: DataType
+    shape: _containers.RepeatedScalarFieldContainer[int]
+    data: bytes
+    def __init__(self, dtype: _Optional[_Union[DataType, str]] = ..., shape: _Optional[_Iterable[int]] = ..., data: _Optional[bytes] = ...) -> None: ...
+
+class Pose(_message.Message):
+    __slots__ = ("translation", "quaternion")
+    TRANSLATION_FIELD_NUMBER: _ClassVar[int]
+    QUATERNION_FIELD_NUMBER: _ClassVar[int]
+    translation: _containers.RepeatedScalarFieldContainer[float]
+    quaternion: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, translation: _Optional[_Iterable[float]] = ..., quaternion: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Detections(_message.Message):
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "labels", "label", "center", "size", "yaw", "score", "velocity", "has_points")
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    POSE_FIELD_NUMBER: _ClassVar[int]
+    LABELS_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    CENTER_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    YAW_FIELD_NUMBER: _ClassVar[int]
+    SCORE_FIELD_NUMBER: _ClassVar[int]
+    VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    HAS_POINTS_FIELD_NUMBER: _ClassVar[int]
+    stream: str
+    epoch: bytes
+    seq: int
+    stamp_ns: int
+    frame: Frame
+    pose: Pose
+    labels: _containers.RepeatedScalarFieldContainer[str]
+    label: Array
+    center: Array
+    size: Array
+    yaw: Array
+    score: Array
+    velocity: Array
+    has_points: bool
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame: _Optional[_Union[Frame, str]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., labels: _Optional[_Iterable[str]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., has_points: _Optional[bool] = ...) -> None: ...
+
+class Points(_message.Message):
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "xyz")
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    POSE_FIELD_NUMBER: _ClassVar[int]
+    XYZ_FIELD_NUMBER: _ClassVar[int]
+    stream: str
+    epoch: bytes
+    seq: int
+    stamp_ns: int
+    frame: Frame
+    pose: Pose
+    xyz: Array
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame: _Optional[_Union[Frame, str]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., xyz: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
+
+class Delivery(_message.Message):
+    __slots__ = ("instance", "received_ns", "published_ns", "queue_ms", "decode_ms", "step_ms", "run")
+    INSTANCE_FIELD_NUMBER: _ClassVar[int]
+    RECEIVED_NS_FIELD_NUMBER: _ClassVar[int]
+    PUBLISHED_NS_FIELD_NUMBER: _ClassVar[int]
+    QUEUE_MS_FIELD_NUMBER: _ClassVar[int]
+    DECODE_MS_FIELD_NUMBER: _ClassVar[int]
+    STEP_MS_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    instance: str
+    received_ns: int
+    published_ns: int
+    queue_ms: float
+    decode_ms: float
+    step_ms: float
+    run: int
+    def __init__(self, instance: _Optional[str] = ..., received_ns: _Optional[int] = ..., published_ns: _Optional[int] = ..., queue_ms: _Optional[float] = ..., decode_ms: _Optional[float] = ..., step_ms: _Optional[float] = ..., run: _Optional[int] = ...) -> None: ...
+
+class Tracks(_message.Message):
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "session", "revision", "profile", "cloud_used", "gap", "ignored", "labels", "id", "label", "center", "size", "yaw", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "delivery")
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    SESSION_FIELD_NUMBER: _ClassVar[int]
+    REVISION_FIELD_NUMBER: _ClassVar[int]
+    PROFILE_FIELD_NUMBER: _ClassVar[int]
+    CLOUD_USED_FIELD_NUMBER: _ClassVar[int]
+    GAP_FIELD_NUMBER: _ClassVar[int]
+    IGNORED_FIELD_NUMBER: _ClassVar[int]
+    LABELS_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    CENTER_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    YAW_FIELD_NUMBER: _ClassVar[int]
+    VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    YAW_RATE_FIELD_NUMBER: _ClassVar[int]
+    ACCELERATION_FIELD_NUMBER: _ClassVar[int]
+    EXISTENCE_FIELD_NUMBER: _ClassVar[int]
+    SCORE_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    AGE_FIELD_NUMBER: _ClassVar[int]
+    TIME_SINCE_DETECTION_FIELD_NUMBER: _ClassVar[int]
+    DETECTION_FIELD_NUMBER: _ClassVar[int]
+    DELIVERY_FIELD_NUMBER: _ClassVar[int]
+    stream: str
+    epoch: bytes
+    seq: int
+    stamp_ns: int
+    session: str
+    revision: int
+    profile: str
+    cloud_used: bool
+    gap: int
+    ignored: int
+    labels: _containers.RepeatedScalarFieldContainer[str]
+    id: Array
+    label: Array
+    center: Array
+    size: Array
+    yaw: Array
+    velocity: Array
+    yaw_rate: Array
+    acceleration: Array
+    existence: Array
+    score: Array
+    covariance: Array
+    age: Array
+    time_since_detection: Array
+    detection: Array
+    delivery: Delivery
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
+
+class Problem(_message.Message):
+    __slots__ = ("stream", "instance", "code", "path", "expected", "received", "message", "seq", "stamp_ns", "count")
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    INSTANCE_FIELD_NUMBER: _ClassVar[int]
+    CODE_FIELD_NUMBER: _ClassVar[int]
+    PATH_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_FIELD_NUMBER: _ClassVar[int]
+    RECEIVED_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    stream: str
+    instance: str
+    code: str
+    path: str
+    expected: str
+    received: str
+    message: str
+    seq: int
+    stamp_ns: int
+    count: int
+    def __init__(self, stream: _Optional[str] = ..., instance: _Optional[str] = ..., code: _Optional[str] = ..., path: _Optional[str] = ..., expected: _Optional[str] = ..., received: _Optional[str] = ..., message: _Optional[str] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., count: _Optional[int] = ...) -> None: ...
+
+class SessionState(_message.Message):
+    __slots__ = ("stream", "session", "state", "profile", "epoch", "seq", "stamp_ns", "received", "frames", "duplicates", "late", "inserted", "corrected", "refused", "shed", "gaps", "new_epochs", "clouds_used", "clouds_missed", "repaired", "clouds_refused", "tracks", "bernoullis", "poissons", "next_id", "queue", "digest")
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    SESSION_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    PROFILE_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    SEQ_FIELD_NUMBER: _ClassVar[int]
+    STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    RECEIVED_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    DUPLICATES_FIELD_NUMBER: _ClassVar[int]
+    LATE_FIELD_NUMBER: _ClassVar[int]
+    INSERTED_FIELD_NUMBER: _ClassVar[int]
+    CORRECTED_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    SHED_FIELD_NUMBER: _ClassVar[int]
+    GAPS_FIELD_NUMBER: _ClassVar[int]
+    NEW_EPOCHS_FIELD_NUMBER: _ClassVar[int]
+    CLOUDS_USED_FIELD_NUMBER: _ClassVar[int]
+    CLOUDS_MISSED_FIELD_NUMBER: _ClassVar[int]
+    REPAIRED_FIELD_NUMBER: _ClassVar[int]
+    CLOUDS_REFUSED_FIELD_NUMBER: _ClassVar[int]
+    TRACKS_FIELD_NUMBER: _ClassVar[int]
+    BERNOULLIS_FIELD_NUMBER: _ClassVar[int]
+    POISSONS_FIELD_NUMBER: _ClassVar[int]
+    NEXT_ID_FIELD_NUMBER: _ClassVar[int]
+    QUEUE_FIELD_NUMBER: _ClassVar[int]
+    DIGEST_FIELD_NUMBER: _ClassVar[int]
+    stream: str
+    session: str
+    state: str
+    profile: str
+    epoch: bytes
+    seq: int
+    stamp_ns: int
+    received: int
+    frames: int
+    duplicates: int
+    late: int
+    inserted: int
+    corrected: int
+    refused: int
+    shed: int
+    gaps: int
+    new_epochs: int
+    clouds_used: int
+    clouds_missed: int
+    repaired: int
+    clouds_refused: int
+    tracks: int
+    bernoullis: int
+    poissons: int
+    next_id: int
+    queue: int
+    digest: str
+    def __init__(self, stream: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., profile: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., received: _Optional[int] = ..., frames: _Optional[int] = ..., duplicates: _Optional[int] = ..., late: _Optional[int] = ..., inserted: _Optional[int] = ..., corrected: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., new_epochs: _Optional[int] = ..., clouds_used: _Optional[int] = ..., clouds_missed: _Optional[int] = ..., repaired: _Optional[int] = ..., clouds_refused: _Optional[int] = ..., tracks: _Optional[int] = ..., bernoullis: _Optional[int] = ..., poissons: _Optional[int] = ..., next_id: _Optional[int] = ..., queue: _Optional[int] = ..., digest: _Optional[str] = ...) -> None: ...
+
+class SessionParameters(_message.Message):
+    __slots__ = ("profile", "cloud_wait_s", "restart", "values")
+    PROFILE_FIELD_NUMBER: _ClassVar[int]
+    CLOUD_WAIT_S_FIELD_NUMBER: _ClassVar[int]
+    RESTART_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    profile: str
+    cloud_wait_s: float
+    restart: bool
+    values: _struct_pb2.Struct
+    def __init__(self, profile: _Optional[str] = ..., cloud_wait_s: _Optional[float] = ..., restart: _Optional[bool] = ..., values: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ...) -> None: ...
+
+class SessionSummary(_message.Message):
+    __slots__ = ("stream", "profile", "state", "rate_hz", "latency_p50_ms", "latency_p99_ms", "frames", "refused", "shed", "gaps", "tracks", "queue", "age_s", "worker")
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    PROFILE_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    LATENCY_P50_MS_FIELD_NUMBER: _ClassVar[int]
+    LATENCY_P99_MS_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
+    SHED_FIELD_NUMBER: _ClassVar[int]
+    GAPS_FIELD_NUMBER: _ClassVar[int]
+    TRACKS_FIELD_NUMBER: _ClassVar[int]
+    QUEUE_FIELD_NUMBER: _ClassVar[int]
+    AGE_S_FIELD_NUMBER: _ClassVar[int]
+    WORKER_FIELD_NUMBER: _ClassVar[int]
+    stream: str
+    profile: str
+    state: str
+    rate_hz: float
+    latency_p50_ms: float
+    latency_p99_ms: float
+    frames: int
+    refused: int
+    shed: int
+    gaps: int
+    tracks: int
+    queue: int
+    age_s: float
+    worker: int
+    def __init__(self, stream: _Optional[str] = ..., profile: _Optional[str] = ..., state: _Optional[str] = ..., rate_hz: _Optional[float] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., frames: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., tracks: _Optional[int] = ..., queue: _Optional[int] = ..., age_s: _Optional[float] = ..., worker: _Optional[int] = ...) -> None: ...
+
+class TrackRequest(_message.Message):
+    __slots__ = ("detections", "points")
+    DETECTIONS_FIELD_NUMBER: _ClassVar[int]
+    POINTS_FIELD_NUMBER: _ClassVar[int]
+    detections: Detections
+    points: Points
+    def __init__(self, detections: _Optional[_Union[Detections, _Mapping]] = ..., points: _Optional[_Union[Points, _Mapping]] = ...) -> None: ...
+
+class TrackResponse(_message.Message):
+    __slots__ = ("tracks", "problem", "skipped")
+    TRACKS_FIELD_NUMBER: _ClassVar[int]
+    PROBLEM_FIELD_NUMBER: _ClassVar[int]
+    SKIPPED_FIELD_NUMBER: _ClassVar[int]
+    tracks: Tracks
+    problem: Problem
+    skipped: int
+    def __init__(self, tracks: _Optional[_Union[Tracks, _Mapping]] = ..., problem: _Optional[_Union[Problem, _Mapping]] = ..., skipped: _Optional[int] = ...) -> None: ...
+
+class PublishOptions(_message.Message):
+    __slots__ = ("stream", "cache", "cache_clouds")
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    CACHE_FIELD_NUMBER: _ClassVar[int]
+    CACHE_CLOUDS_FIELD_NUMBER: _ClassVar[int]
+    stream: str
+    cache: int
+    cache_clouds: int
+    def __init__(self, stream: _Optional[str] = ..., cache: _Optional[int] = ..., cache_clouds: _Optional[int] = ...) -> None: ...
+
+class PublishRequest(_message.Message):
+    __slots__ = ("options", "detections", "points")
+    OPTIONS_FIELD_NUMBER: _ClassVar[int]
+    DETECTIONS_FIELD_NUMBER: _ClassVar[int]
+    POINTS_FIELD_NUMBER: _ClassVar[int]
+    options: PublishOptions
+    detections: Detections
+    points: Points
+    def __init__(self, options: _Optional[_Union[PublishOptions, _Mapping]] = ..., detections: _Optional[_Union[Detections, _Mapping]] = ..., points: _Optional[_Union[Points, _Mapping]] = ...) -> None: ...
+
+class Acknowledgement(_message.Message):
+    __slots__ = ("detections", "points", "points_wanted")
+    DETECTIONS_FIELD_NUMBER: _ClassVar[int]
+    POINTS_FIELD_NUMBER: _ClassVar[int]
+    POINTS_WANTED_FIELD_NUMBER: _ClassVar[int]
+    detections: int
+    points: int
+    points_wanted: bool
+    def __init__(self, detections: _Optional[int] = ..., points: _Optional[int] = ..., points_wanted: _Optional[bool] = ...) -> None: ...
+
+class PublishResponse(_message.Message):
+    __slots__ = ("acknowledgement", "problem", "skipped")
+    ACKNOWLEDGEMENT_FIELD_NUMBER: _ClassVar[int]
+    PROBLEM_FIELD_NUMBER: _ClassVar[int]
+    SKIPPED_FIELD_NUMBER: _ClassVar[int]
+    acknowledgement: Acknowledgement
+    problem: Problem
+    skipped: int
+    def __init__(self, acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., problem: _Optional[_Union[Problem, _Mapping]] = ..., skipped: _Optional[int] = ...) -> None: ...
+
+class Polygon(_message.Message):
+    __slots__ = ("x", "y")
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    x: _containers.RepeatedScalarFieldContainer[float]
+    y: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, x: _Optional[_Iterable[float]] = ..., y: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class TrackFilter(_message.Message):
+    __slots__ = ("classes", "confirmed_only", "min_existence", "area", "fields")
+    CLASSES_FIELD_NUMBER: _ClassVar[int]
+    CONFIRMED_ONLY_FIELD_NUMBER: _ClassVar[int]
+    MIN_EXISTENCE_FIELD_NUMBER: _ClassVar[int]
+    AREA_FIELD_NUMBER: _ClassVar[int]
+    FIELDS_FIELD_NUMBER: _ClassVar[int]
+    classes: _containers.RepeatedScalarFieldContainer[str]
+    confirmed_only: bool
+    min_existence: float
+    area: Polygon
+    fields: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, classes: _Optional[_Iterable[str]] = ..., confirmed_only: _Optional[bool] = ..., min_existence: _Optional[float] = ..., area: _Optional[_Union[Polygon, _Mapping]] = ..., fields: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class SubscribeRequest(_message.Message):
+    __slots__ = ("pattern", "filter", "max_rate_hz", "queue", "history", "problems")
+    PATTERN_FIELD_NUMBER: _ClassVar[int]
+    FILTER_FIELD_NUMBER: _ClassVar[int]
+    MAX_RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    QUEUE_FIELD_NUMBER: _ClassVar[int]
+    HISTORY_FIELD_NUMBER: _ClassVar[int]
+    PROBLEMS_FIELD_NUMBER: _ClassVar[int]
+    pattern: str
+    filter: TrackFilter
+    max_rate_hz: float
+    queue: int
+    history: bool
+    problems: bool
+    def __init__(self, pattern: _Optional[str] = ..., filter: _Optional[_Union[TrackFilter, _Mapping]] = ..., max_rate_hz: _Optional[float] = ..., queue: _Optional[int] = ..., history: _Optional[bool] = ..., problems: _Optional[bool] = ...) -> None: ...
+
+class SubscribeResponse(_message.Message):
+    __slots__ = ("tracks", "problem", "skipped")
+    TRACKS_FIELD_NUMBER: _ClassVar[int]
+    PROBLEM_FIELD_NUMBER: _ClassVar[int]
+    SKIPPED_FIELD_NUMBER: _ClassVar[int]
+    tracks: Tracks
+    problem: Problem
+    skipped: int
+    def __init__(self, tracks: _Optional[_Union[Tracks, _Mapping]] = ..., problem: _Optional[_Union[Problem, _Mapping]] = ..., skipped: _Optional[int] = ...) -> None: ...
+
+class GetStateRequest(_message.Message):
+    __slots__ = ("stream",)
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    stream: str
+    def __init__(self, stream: _Optional[str] = ...) -> None: ...
+
+class GetStateResponse(_message.Message):
+    __slots__ = ("state",)
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    state: SessionState
+    def __init__(self, state: _Optional[_Union[SessionState, _Mapping]] = ...) -> None: ...
+
+class ResetRequest(_message.Message):
+    __slots__ = ("stream", "close")
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    CLOSE_FIELD_NUMBER: _ClassVar[int]
+    stream: str
+    close: bool
+    def __init__(self, stream: _Optional[str] = ..., close: _Optional[bool] = ...) -> None: ...
+
+class ResetResponse(_message.Message):
+    __slots__ = ("state",)
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    state: SessionState
+    def __init__(self, state: _Optional[_Union[SessionState, _Mapping]] = ...) -> None: ...
+
+class SetParametersRequest(_message.Message):
+    __slots__ = ("stream", "parameters")
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    PARAMETERS_FIELD_NUMBER: _ClassVar[int]
+    stream: str
+    parameters: SessionParameters
+    def __init__(self, stream: _Optional[str] = ..., parameters: _Optional[_Union[SessionParameters, _Mapping]] = ...) -> None: ...
+
+class SetParametersResponse(_message.Message):
+    __slots__ = ("parameters",)
+    PARAMETERS_FIELD_NUMBER: _ClassVar[int]
+    parameters: SessionParameters
+    def __init__(self, parameters: _Optional[_Union[SessionParameters, _Mapping]] = ...) -> None: ...
+
+class ListStreamsRequest(_message.Message):
+    __slots__ = ("pattern",)
+    PATTERN_FIELD_NUMBER: _ClassVar[int]
+    pattern: str
+    def __init__(self, pattern: _Optional[str] = ...) -> None: ...
+
+class ListedStream(_message.Message):
+    __slots__ = ("instance", "session")
+    INSTANCE_FIELD_NUMBER: _ClassVar[int]
+    SESSION_FIELD_NUMBER: _ClassVar[int]
+    instance: str
+    session: SessionSummary
+    def __init__(self, instance: _Optional[str] = ..., session: _Optional[_Union[SessionSummary, _Mapping]] = ...) -> None: ...
+
+class ListStreamsResponse(_message.Message):
+    __slots__ = ("streams",)
+    STREAMS_FIELD_NUMBER: _ClassVar[int]
+    streams: _containers.RepeatedCompositeFieldContainer[ListedStream]
+    def __init__(self, streams: _Optional[_Iterable[_Union[ListedStream, _Mapping]]] = ...) -> None: ...
+
+class QueryTracksRequest(_message.Message):
+    __slots__ = ("pattern", "from_ns", "to_ns", "filter")
+    PATTERN_FIELD_NUMBER: _ClassVar[int]
+    FROM_NS_FIELD_NUMBER: _ClassVar[int]
+    TO_NS_FIELD_NUMBER: _ClassVar[int]
+    FILTER_FIELD_NUMBER: _ClassVar[int]
+    pattern: str
+    from_ns: int
+    to_ns: int
+    filter: TrackFilter
+    def __init__(self, pattern: _Optional[str] = ..., from_ns: _Optional[int] = ..., to_ns: _Optional[int] = ..., filter: _Optional[_Union[TrackFilter, _Mapping]] = ...) -> None: ...
+
+class QueryTracksResponse(_message.Message):
+    __slots__ = ("tracks",)
+    TRACKS_FIELD_NUMBER: _ClassVar[int]
+    tracks: Tracks
+    def __init__(self, tracks: _Optional[_Union[Tracks, _Mapping]] = ...) -> None: ...

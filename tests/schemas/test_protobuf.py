@@ -1,0 +1,139 @@
+"""Protobuf says the same as msgpack: the same messages, the same bytes on Zenoh afterwards, the same errors."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from optipmb_schemas import MessageError, SessionParameters, decode, encode
+from optipmb_schemas.messages import Detections, Message, Points
+from optipmb_schemas.protobuf import convert, export
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+
+SCHEMAS = Path(__file__).parents[2] / "schemas"
+BUF = Path(sys.executable).parent / "buf"
+
+
+def proto_of(message: Message) -> Any:
+    """The message after a way over the wire."""
+    proto = convert.to_proto(message)
+    return convert.parse(proto.SerializeToString(), type(proto))
+
+
+def buf(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run buf in the folder of the schemas."""
+    return subprocess.run([BUF, *arguments], cwd=SCHEMAS / "proto", capture_output=True, text=True, check=False)
+
+
+def test_what_is_generated_is_current(capsys: pytest.CaptureFixture[str]) -> None:
+    """Comments of the schema are those of the models, and the Python modules are those of the schema."""
+    assert export.main(["--check", str(SCHEMAS)]) == 0, capsys.readouterr()
+
+
+def test_a_stale_schema_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A field that the model lacks is named, and nothing is written."""
+    shutil.copytree(SCHEMAS / "proto", tmp_path / "proto")
+    source = tmp_path / "proto" / export.SOURCE
+    text = source.read_text().replace("  int64 gap = 9;", "  int64 gaps = 9;")
+    source.write_text(text)
+    assert export.main(["--check", str(tmp_path)]) == 2
+    assert "Tracks differ from its model: ['gap', 'gaps']" in capsys.readouterr().err
+    assert source.read_text() == text
+
+
+def test_the_schema_is_well_formed() -> None:
+    """`buf lint` and `buf format` find nothing."""
+    assert buf("lint").stdout == ""
+    assert buf("format", "--diff").stdout == ""
+
+
+def test_clients_of_an_earlier_version_go_on() -> None:
+    """The schema breaks nothing that the released one promised (`released.json`, made by `buf build -o`)."""
+    checked = buf("breaking", "--against", "released.json")
+    assert (checked.returncode, checked.stdout) == (0, "")
+
+
+def test_a_breaking_change_is_found(tmp_path: Path) -> None:
+    """A field that changes its number is refused by the check above."""
+    shutil.copytree(SCHEMAS / "proto", tmp_path / "proto")
+    source = tmp_path / "proto" / export.SOURCE
+    source.write_text(source.read_text().replace("int64 gap = 9;", "int64 gap = 90;"))
+    checked = buf("breaking", str(tmp_path / "proto"), "--against", "released.json")
+    assert checked.returncode != 0
+    assert "gap" in checked.stdout
+
+
+@pytest.mark.parametrize("kind", export.MODELS, ids=lambda kind: kind.__name__)
+def test_messages_survive(kind: type[Message], example_of: Any) -> None:
+    """Every message comes back from protobuf equal, and its msgpack is byte-equal (but `Struct` has no integers)."""
+    message = example_of(kind)
+    back = convert.from_proto(proto_of(message), kind)
+    assert back == message
+    assert encode(back) == encode(message) or kind is SessionParameters
+
+
+@pytest.mark.parametrize("rows", [0, 1, 5000])
+def test_columns_of_any_length_survive(rows: int) -> None:
+    """A frame without objects and the largest one are no exceptions."""
+    points = Points(
+        stream="a/b/c", epoch=bytes(16), seq=0, stamp_ns=0, frame="world", xyz=np.ones((rows, 3), dtype="f4")
+    )
+    assert encode(convert.from_proto(proto_of(points), Points)) == encode(points)
+
+
+@pytest.mark.parametrize(
+    ("change", "path"),
+    [
+        ({"center": pb.Array(dtype=pb.DATA_TYPE_F8, shape=[3, 2], data=bytes(48))}, "center"),
+        ({"center": pb.Array(dtype=pb.DATA_TYPE_F8, shape=[3, 3], data=bytes(71))}, "center.data"),
+        ({"center": pb.Array(shape=[3, 3], data=bytes(72))}, "center.dtype"),
+        ({"center": pb.Array(dtype=99, shape=[3, 3], data=bytes(72))}, "center.dtype"),  # type: ignore[arg-type]
+        ({"center": pb.Array(dtype=pb.DATA_TYPE_F8, shape=[2**32 - 1] * 9)}, "center.shape"),
+        ({"score": pb.Array(dtype=pb.DATA_TYPE_F8, shape=[3], data=np.array([0.5, 2.0, 0.5]).tobytes())}, "score[1]"),
+        ({"yaw": pb.Array(dtype=pb.DATA_TYPE_F8, shape=[2], data=bytes(16))}, "yaw"),
+        ({"label": pb.Array(dtype=pb.DATA_TYPE_F4, shape=[3], data=bytes(12))}, "label"),
+        ({"pose": pb.Pose(translation=[0, 0], quaternion=[1, 0, 0, 0])}, "pose.translation"),
+        ({"pose": pb.Pose(translation=[0.0] * 100_000, quaternion=[1, 0, 0, 0])}, "pose.translation"),
+        ({"epoch": b"short"}, "epoch"),
+        ({"stream": "a/b"}, "stream"),
+        ({"frame": pb.FRAME_UNSPECIFIED}, "frame"),
+        ({"seq": -1}, "seq"),
+        ({"labels": ["car"] * 300}, "labels"),
+    ],
+)
+def test_errors_name_the_field(change: dict[str, Any], path: str, example_of: Any) -> None:
+    """What is not valid is refused with the path of the field, as in msgpack."""
+    proto = proto_of(example_of(Detections))
+    for name in change:
+        proto.ClearField(name)
+    proto.MergeFrom(pb.Detections(**change))
+    with pytest.raises(MessageError) as raised:
+        convert.from_proto(proto, Detections)
+    assert raised.value.path == path
+
+
+@pytest.mark.parametrize("name", ["seq", "stamp_ns", "center", "pose"])
+def test_missing_fields_are_named(name: str, example_of: Any) -> None:
+    """A required field that is absent is no zero: it is missing, as in msgpack."""
+    proto = proto_of(example_of(Detections))
+    proto.ClearField(name)
+    with pytest.raises(MessageError) as raised:
+        convert.from_proto(proto, Detections)
+    assert (raised.value.code, raised.value.path) == ("missing_field", name)
+
+
+def test_bytes_that_are_no_message() -> None:
+    """They are malformed, and the error says of which type they should be."""
+    with pytest.raises(MessageError, match=r"optipmb\.v1\.TrackRequest.*malformed"):
+        convert.parse(b"\xff\xff\xff", pb.TrackRequest)
+
+
+def test_unknown_fields_are_ignored(example_of: Any) -> None:
+    """A field of a later version changes nothing."""
+    message = example_of(Detections)
+    payload = convert.to_proto(message).SerializeToString() + b"\xa2\x06\x03new"
+    assert convert.from_proto(convert.parse(payload, pb.Detections), Detections) == message
+    assert decode(encode(message), Detections) == message
