@@ -27,7 +27,7 @@ def judge_all(marks: list[FrameId], *, window: bool = False) -> tuple[list[Decis
         decisions.append(decision)
         if decision.verdict.admitted and not window:
             cursor, floor = cursor.after(one, decision.place), one
-            timeline = timeline.settle(cursor, floor, frozenset(timeline.marks))
+            timeline = timeline.settle(cursor, floor, frozenset(timeline.frame_ids))
     return decisions, timeline
 
 
@@ -104,7 +104,7 @@ def test_memory_is_bounded(arrived: list[FrameId], window: bool) -> None:  # noq
     """Sequence numbers may leap by 2^62 without the memory of them growing beyond its window."""
     _, timeline = judge_all(arrived, window=window)
     assert all(0 < seen.mask.bit_length() <= WINDOW for seen in timeline.epochs)
-    assert window or not timeline.marks
+    assert window or not timeline.frame_ids
 
 
 @settings(deadline=None)
