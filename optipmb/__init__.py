@@ -15,7 +15,7 @@ Pure computation: no files but the profiles, no network, no state outside the de
 
 from optipmb.columns import columns_of, density_of
 from optipmb.density import Bernoullis, Density, Poissons
-from optipmb.errors import DensityError, FrameError, OptipmbError, ParameterError
+from optipmb.errors import DensityError, EffortError, FrameError, OptipmbError, ParameterError
 from optipmb.extract import Tracks
 from optipmb.frame import Frame, PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
@@ -32,6 +32,7 @@ __all__ = [
     "Density",
     "DensityError",
     "Diagnostics",
+    "EffortError",
     "Frame",
     "FrameError",
     "Modules",

@@ -2,6 +2,7 @@
 
 OptipmbError
 ├── FrameError       a frame's arrays have a wrong shape, dtype or value, or its stamp goes back
+│   └── EffortError  a frame needs more pairs looked at than the tracker was made for
 ├── ParameterError   a profile cannot be found or read, or a value in it is not allowed
 └── DensityError     a stored density is none: a column is missing, or has a shape, type or value that none has
 """
@@ -27,6 +28,10 @@ class OptipmbError(ValueError):
 
 class FrameError(OptipmbError):
     """A frame was refused before it reached the filter."""
+
+
+class EffortError(FrameError):
+    """A frame was refused because a step with it would look at too many pairs."""
 
 
 class ParameterError(OptipmbError):

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optipmb.compiled import kernel
+from optipmb.effort import UNLIMITED
+from optipmb.errors import EffortError
 from optipmb.geometry import iou_exceeds
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
 from optipmb.records import record
@@ -52,11 +54,14 @@ class Measurements:
         return len(self.score)
 
 
-def preprocess(frame: Frame, table: ClassTable) -> tuple[Measurements, int, int]:
+def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[Measurements, int, int]:
     """Remove detections scored below eta_sf, then those that overlap a better one of their class by more than eta_iou.
 
     Returns:
         The measurements, the number below the score filter and the number suppressed.
+
+    Raises:
+        EffortError: more than `most` pairs of detections may overlap.
     """
     count = frame.score.shape[0]
     chosen = np.empty(count, np.int64)
@@ -70,7 +75,10 @@ def preprocess(frame: Frame, table: ClassTable) -> tuple[Measurements, int, int]
         table.score_filter,
         table.nms_iou,
         chosen,
+        most,
     )
+    if kept < 0:
+        raise EffortError("center", f"at most {most} pairs of detections that may overlap", "more")
     measurements = Measurements(
         np.empty((kept, 2)),  # position
         np.empty(kept),  # yaw
@@ -111,11 +119,13 @@ def select(
     score_filter: Array,
     nms_iou: Array,
     chosen: Index,
+    most: int = UNLIMITED,
 ) -> tuple[int, int]:
     """Write the rows of the measurements, in their order, to the front of `chosen` (M,).
 
     Returns:
-        How many rows pass the score filter, and how many of those the suppression too.
+        How many rows pass the score filter, and how many of those the suppression too; -1 when more than `most` pairs
+        of boxes had to be looked at.
     """
     above = 0
     for m in range(score.shape[0]):
@@ -131,7 +141,9 @@ def select(
         boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = center[m, 0], center[m, 1], size[m, 0], size[m, 1]
         boxes[k, 4] = yaw[m]
         ordered_label[k] = label[m]
-    keep = non_maximum_suppression(boxes, ordered_label, nms_iou)
+    keep = non_maximum_suppression(boxes, ordered_label, nms_iou, most)
+    if keep.shape[0] < above:
+        return above, -1
     kept = 0
     for k in range(above):
         if keep[k]:
@@ -180,18 +192,19 @@ def sort_canonically(order: Index, score: Array, center: Array, size: Array, yaw
 
 
 @kernel
-def non_maximum_suppression(boxes: Array, label: Index, threshold: Array) -> NDArray[np.bool_]:
+def non_maximum_suppression(boxes: Array, label: Index, threshold: Array, most: int = UNLIMITED) -> NDArray[np.bool_]:
     """Keep each box unless a kept box of its class before it overlaps it by more than the threshold of the class.
 
     Args:
         boxes: (M, 5) bird's-eye boxes, best first.
         label: (M,) class of each.
         threshold: (C,) eta_iou of each class.
+        most: pairs of boxes whose overlap is computed before it gives up.
 
     Returns:
-        (M,) whether the box is kept.
+        (M,) whether the box is kept; empty after giving up.
     """
-    count = boxes.shape[0]
+    count, left = boxes.shape[0], most
     keep = np.ones(count, np.bool_)
     radius = np.empty(count)
     widest = np.zeros(threshold.shape[0])
@@ -209,8 +222,11 @@ def non_maximum_suppression(boxes: Array, label: Index, threshold: Array) -> NDA
                 while k != NOBODY and keep[m]:
                     if label[k] == label[m]:
                         dx, dy, reach = boxes[k, 0] - boxes[m, 0], boxes[k, 1] - boxes[m, 1], radius[k] + radius[m]
-                        if dx * dx + dy * dy < reach * reach and iou_exceeds(boxes[k], boxes[m], threshold[label[m]]):
-                            keep[m] = False
+                        if dx * dx + dy * dy < reach * reach:
+                            left -= 1
+                            if left < 0:
+                                return keep[:0]
+                            keep[m] = not iou_exceeds(boxes[k], boxes[m], threshold[label[m]])
                     k = following[k]
         if keep[m]:
             insert(head, following, side, m, boxes[m, 0], boxes[m, 1], cell_size)

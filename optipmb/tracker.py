@@ -12,6 +12,7 @@ from optipmb.association import associate
 from optipmb.birth import first_detected_states
 from optipmb.density import NO_FRAME, STATE, Density, Poissons
 from optipmb.detection_probability import detection_probability
+from optipmb.effort import UNLIMITED, check_effort
 from optipmb.errors import FrameError
 from optipmb.extract import extract
 from optipmb.hypotheses import enumerate_hypotheses
@@ -126,13 +127,22 @@ class Tracker:
         parameters: the profile.
         modules: which modules of the paper are on.
 
+    `max_pairs` bounds the pairs of a step that are near each other: detections that may overlap, and detections in the
+    gates of objects. What a step costs is nearly proportional to them, about a microsecond each.
+
     `clock` returns nanoseconds and is read between the stages of a step for `Diagnostics.stage_ns`, as
     `time.perf_counter_ns`; nothing else depends on it.
     """
 
     def __init__(
-        self, parameters: Parameters, modules: Modules | None = None, *, clock: Callable[[], int] = _no_clock
+        self,
+        parameters: Parameters,
+        modules: Modules | None = None,
+        *,
+        max_pairs: int = UNLIMITED,
+        clock: Callable[[], int] = _no_clock,
     ) -> None:
+        self._max_pairs = max_pairs
         self.parameters = parameters
         self.modules = modules if modules is not None else Modules()
         self._clock = clock
@@ -155,6 +165,7 @@ class Tracker:
 
         Raises:
             FrameError: the stamp of the frame is before that of the density.
+            EffortError: the frame needs more than `max_pairs` pairs looked at; nothing costly was done yet.
         """
         if density.stamp_ns != NO_FRAME and frame.stamp_ns < density.stamp_ns:
             raise FrameError("stamp_ns", f"a stamp from {density.stamp_ns} on", str(frame.stamp_ns))
@@ -167,7 +178,8 @@ class Tracker:
         times.append(clock())
 
         # PMB update: measurements, detection probabilities, local hypotheses
-        measurements, below_score, suppressed = preprocess(frame, table)
+        measurements, below_score, suppressed = preprocess(frame, table, self._max_pairs)
+        check_effort(bernoulli, poisson, measurements, table, self._max_pairs)
         n_predicted = len(poisson)
         if not modules.habm:
             poisson = with_measurement_births(poisson, measurements, now, table)

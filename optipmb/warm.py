@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
+from optipmb.errors import EffortError
 from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
 from optipmb.parameters import load_profile, parse_parameters
@@ -77,3 +79,5 @@ def _run() -> None:
         result = tracker.step(posterior, given)
         posterior = result.density
         sound(result.tracks)
+    with suppress(EffortError):
+        Tracker(parameters, max_pairs=8).step(posterior, given)

@@ -177,6 +177,20 @@ class Settings(BaseSettings):
     threads: int = Field(
         default=1, ge=1, le=256, description="threads that track, per worker; more than one make the tail longer"
     )
+    max_pairs: int = Field(
+        default=20_000,
+        ge=100,
+        le=10_000_000,
+        description="pairs of objects near each other that a frame may have; about a microsecond each; a frame with"
+        " more is refused",
+    )
+    step_limit_s: float = Field(
+        default=0.5,
+        gt=0,
+        le=60,
+        description="processor time that one message may take; a stream that takes more is degraded: its messages are"
+        " refused for nine times as long",
+    )
     max_sessions: int = Field(
         default=1000, ge=1, le=100_000, description="streams tracked at once; further ones are refused"
     )

@@ -35,9 +35,7 @@ def start(_compiled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
     """Start services; each is stopped at the end. Options are settings; `tracker` and `share` are the service's own."""
     with contextlib.ExitStack() as stack:
 
-        def begin(
-            *, tracker: Any = optipmb.Tracker, share: Assignment | None = None, **options: Any
-        ) -> tuple[Service, str]:
+        def begin(*, tracker: Any = None, share: Assignment | None = None, **options: Any) -> tuple[Service, str]:
             endpoint = free_endpoint()
             given = {"listen": [endpoint], "instance": "test", "threads": 2, "grace_s": 0.2, "store": "none"} | options
             settings = load(None, given).settings

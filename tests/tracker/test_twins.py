@@ -37,6 +37,7 @@ TWINS = {
     "geometry.corners": "test_geometry.test_iou_is_that_of_clipped_polygons",
     "geometry.intersection_area": "test_geometry.test_iou_is_that_of_clipped_polygons",
     "geometry.iou_exceeds": "test_kernels.test_cheap_rejections_change_no_decision",
+    "effort.count_pairs": "test_effort.test_pairs_are_counted_up_to_a_limit",
     "hypotheses._grown": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.detection_costs": "test_hypotheses.test_costs_and_association_probabilities_are_the_formulas",
     "hypotheses.first_detections": "test_hypotheses.test_each_kind_of_first_detection_has_its_formula",

@@ -15,6 +15,7 @@ import asyncio
 import gc
 import sys
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import optipmb_schemas as schemas
@@ -64,7 +65,7 @@ class Service:
         settings: what is in force.
         profiles: the parameters that can be had.
         arm: has `StreamActor.wake` called at a monotonic time (ns).
-        tracker: makes the trackers of sessions.
+        tracker: makes the trackers of sessions; default: trackers bounded as the settings say.
         share: the streams of this process; all of them where it is the only one.
         metrics: what counts; its own by default.
 
@@ -77,7 +78,7 @@ class Service:
         settings: Settings,
         profiles: Profiles,
         arm: Callable[[Actor, int], None],
-        tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
+        tracker: Callable[[optipmb.Parameters], Any] | None = None,
         share: Assignment | None = None,
         metrics: Metrics | None = None,
     ) -> None:
@@ -101,7 +102,7 @@ class Service:
             persistence=self._persistence,
             arm=arm,
             metrics=self._metrics,
-            tracker=tracker,
+            tracker=tracker or partial(optipmb.Tracker, max_pairs=settings.max_pairs),
             share=share,
         )
         self._metrics.add(self._figures)

@@ -27,9 +27,11 @@ EVENTS: Final = {
     "session_opened": "A stream sent its first valid message, or parameters were set for it.",
     "session_restored": "A stream's session goes on from its checkpoint; what it missed is asked of the publishers.",
     "session_begun": "A density began: `first` frame, `publisher` restarted with a jump, a `jump` of stamps, `reset`, "
-    "`parameters`, a `pose` far off, the end of a `quarantine`. Repeated jumps: check the sensor's clock.",
+    "`parameters`, a `pose` far off, a density of too much `effort`, the end of a `quarantine`. Repeated jumps: check"
+    " the sensor's clock.",
     "session_quarantined": "Tracking a stream raised `error`: its frames are refused until a reset or another start of "
     "the publisher. Its last frames are saved; report them.",
+    "stream_degraded": "A message took `took_s` of processor time; the stream's messages are refused for `refused_s`.",
     "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` to another worker, or `superseded` "
     "by another instance.",
     "checkpoint_torn": "A checkpoint cannot be read; it is set aside and the one before it is used.",

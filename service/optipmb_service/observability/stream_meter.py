@@ -59,13 +59,15 @@ class StreamMeter:
         """Return the seconds since the last frame; None before the first."""
         return None if self.frame_ns is None else max(0.0, (now_ns - self.frame_ns) / 1e9)
 
-    def summary(self, state: schemas.SessionState, now_ns: int, *, stale: bool) -> schemas.SessionSummary:
+    def summary(
+        self, state: schemas.SessionState, now_ns: int, *, stale: bool, degraded: bool
+    ) -> schemas.SessionSummary:
         """Return the line of the service's status for a stream in a state; may be called by any thread."""
         p50, p99 = self.latency_ms()
         return schemas.SessionSummary(
             stream=state.stream,
             profile=state.profile,
-            state="stale" if stale else state.state,
+            state="stale" if stale else "degraded" if degraded else state.state,
             rate_hz=self.rate_hz(now_ns),
             latency_p50_ms=p50,
             latency_p99_ms=p99,

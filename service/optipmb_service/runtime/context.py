@@ -64,6 +64,7 @@ class ActorContext:
         policy: waiting and restarting of sessions.
         queue_frames: most frames waiting per stream.
         queue_clouds: most clouds waiting per stream.
+        step_limit_ns: processor time that one message may take.
         outlet: where results go.
         problem reporter: where problems go.
         parameters_of: profile of a stream.
@@ -87,6 +88,7 @@ class ActorContext:
     policy: Policy
     queue_frames: int
     queue_clouds: int
+    step_limit_ns: int
     sink: MessageSink
     reporter: ProblemReporter
     parameters_of: Callable[[str], optipmb.Parameters]

@@ -117,6 +117,7 @@ class Registry:
             ),
             queue_frames=settings.queue_frames,
             queue_clouds=settings.queue_clouds,
+            step_limit_ns=round(settings.step_limit_s * SECOND),
             sink=sink,
             reporter=reporter,
             parameters_of=profiles.of,

@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
+REST: Final = 9
+"""How many times as long as a message took beyond its limit a stream rests: it has a tenth of the time at most."""
+
 BATCH: Final = 8
 """Items that a worker takes before the other streams have their turn."""
 
@@ -62,6 +65,7 @@ class StreamActor:
         self._asking: list[Callable[[StreamActor], None]] = []
         self._changed = False
         self._armed_ns: int | None = None
+        self._degraded_ns = 0
 
     def wake(self) -> None:
         """Send a worker though nothing came: frames have waited long enough."""
@@ -157,6 +161,28 @@ class StreamActor:
         if session is None:
             self._buffer(packet, frame=frame)
             return
+        if time.monotonic_ns() < self._degraded_ns:
+            self._accounts.receive(frame=frame)
+            self._accounts.refuse(session, frame=frame)
+            expected = f"at most {self._context.step_limit_ns / 1e9:g} s of processor time for a message"
+            self._report("overload", "", expected, "a stream that took more just before")
+            return
+        began_ns = time.thread_time_ns()
+        try:
+            self._track(session, packet, frame=frame)
+        finally:
+            self._charge(time.thread_time_ns() - began_ns)
+
+    def _charge(self, took_ns: int) -> None:
+        """Degrade the stream when a message took too long: the others of the process waited for it."""
+        if took_ns <= self._context.step_limit_ns:
+            return
+        self._degraded_ns = time.monotonic_ns() + REST * took_ns
+        log.warning("stream_degraded", stream=self.stream, took_s=took_ns / 1e9, refused_s=REST * took_ns / 1e9)
+        expected = f"at most {self._context.step_limit_ns / 1e9:g} s of processor time for a message"
+        self._report("overload", "", expected, f"{took_ns / 1e9:.3f} s")
+
+    def _track(self, session: Session, packet: Packet, *, frame: bool) -> None:
         began_ns = time.perf_counter_ns()
         self._changed = True
         self._accounts.receive(frame=frame)
@@ -389,4 +415,6 @@ class StreamActor:
         session = self.session
         if session is None:
             return None
-        return self.meter.summary(self._accounts.state(session), now_ns, stale=self.stale)
+        return self.meter.summary(
+            self._accounts.state(session), now_ns, stale=self.stale, degraded=now_ns < self._degraded_ns
+        )

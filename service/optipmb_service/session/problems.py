@@ -28,6 +28,10 @@ CODES: Final = {
         "The sensor cannot have got there since its last frame; the frame is refused.",
         "Check the localisation; if it is right, raise `max_speed`.",
     ),
+    "overload": (
+        "The frame needs more computing than one may, or the frames of the stream did; it is refused.",
+        "Suppress overlapping boxes in the detector, send less, or raise `max_pairs`, `step_limit_s`.",
+    ),
     "internal": (
         "A fault of the service; the session is quarantined, its last frames are saved.",
         "Report it with the saved file; `optipmb track --dump` replays it.",

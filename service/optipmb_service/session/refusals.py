@@ -48,6 +48,10 @@ class Refusals:
         expected = f"a position within reach of the last one at {policy.max_speed:g} m/s"
         return self._problem("astray", entry.frame_id, "pose.translation", expected, received)
 
+    def effort(self, frame_id: FrameId, error: optipmb.EffortError) -> schemas.Problem:
+        """A frame that needs too much computing."""
+        return self._problem("overload", frame_id, error.path, error.expected, error.received)
+
     def failed(self, frame_id: FrameId, error: str) -> schemas.Problem:
         """A step that raised."""
         return self._problem("internal", frame_id, "", "a step of the tracker without an error", error)

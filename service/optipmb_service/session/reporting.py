@@ -80,8 +80,11 @@ class SessionReporting:
         if outcome.entry.revision > 0:
             return []
         unknown = self.complain.unknown(outcome.entry.frame_id, outcome.unknown, parameters)
-        astray = [self.complain.astray(outcome.entry, self._policy)] if outcome.tracks is None else []
-        return [*unknown, *astray]
+        if outcome.tracks is not None:
+            return list(unknown)
+        if outcome.effort is not None:
+            return [*unknown, self.complain.effort(outcome.entry.frame_id, outcome.effort)]
+        return [*unknown, self.complain.astray(outcome.entry, self._policy)]
 
     def counters(self, head: FilterState) -> Counters:
         """Return what happened to the messages: what depends on delivery, and what follows from the frames alone."""
@@ -92,7 +95,7 @@ class SessionReporting:
             late=deliveries.late,
             inserted=deliveries.inserted,
             corrected=deliveries.corrected,
-            refused=deliveries.refused + counts.astray,
+            refused=deliveries.refused + counts.astray + counts.effort,
             gaps=counts.gaps,
             new_epochs=counts.new_epochs,
             clouds_used=counts.clouds_used,

@@ -28,6 +28,7 @@ class FrameCounts:
         clouds_used: tracked with their cloud.
         clouds_missed: that waited for a cloud in vain.
         astray: refused because the sensor cannot have been there.
+        effort: refused because they need too much computing.
         repaired: covariances that had lost rank in rounding and were repaired.
     """
 
@@ -37,6 +38,7 @@ class FrameCounts:
     clouds_used: int = 0
     clouds_missed: int = 0
     astray: int = 0
+    effort: int = 0
     repaired: int = 0
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -21,12 +22,15 @@ from optipmb_service.session import convert
 from optipmb_service.session.pose_check import judge, position_of
 from optipmb_service.session.state import Entry, FilterState, FrameCounts, PoseHistory
 from optipmb_service.session.timeline import FrameId, Verdict
-from optipmb_service.session.values import MAX_LABELS, total
+from optipmb_service.session.values import MAX_LABELS, SECOND, total
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     from optipmb_service.session.values import Policy, Steps
+
+GIVE_UP_NS: Final = SECOND
+"""Sensor time after which a density that makes every frame too much is given up."""
 
 _OPENING: Final = frozenset({Verdict.NEW_EPOCH, Verdict.RESTART})
 
@@ -40,7 +44,7 @@ class SessionStart:
         jump_ns: how far the stamps jumped.
     """
 
-    reason: Literal["first", "jump", "publisher", "pose"]
+    reason: Literal["first", "jump", "publisher", "pose", "effort"]
     jump_ns: int
 
 
@@ -50,15 +54,17 @@ class Outcome:
 
     Attributes:
         entry: the frame.
-        tracks: its tracks, without their delivery part; None: it was refused, as astray.
+        tracks: its tracks, without their delivery part; None: it was refused, as astray or for its effort.
         begins: whether a life began with it.
         unknown: the classes that the profile lacks, with the number of objects of each, when not reported before.
+        effort: why the frame was refused, when it needs more computing than a frame may.
     """
 
     entry: Entry
     tracks: schemas.Tracks | None
     begins: SessionStart | None
     unknown: dict[str, int]
+    effort: optipmb.EffortError | None = None
 
 
 class Transition:
@@ -97,13 +103,19 @@ class Transition:
         known = PoseHistory() if begins else before.pose_history
         pose_history, where = judge(known, frame_id.stamp_ns, position_of(entry.message), self._policy)
         if where == "astray":
-            counts = _counted(before.counts, entry, astray=1)
-            cursor = before.cursor.after(frame_id, place)
-            passed = replace(before, cursor=cursor, last=frame_id, counts=counts, pose_history=pose_history)
-            return passed, Outcome(entry, None, None, {})
+            return _passed(before, entry, pose_history, astray=1), Outcome(entry, None, None, {})
         if where == "moved":
             begins = SessionStart("pose", place.jump_ns)
-        return self._track(before, entry, begins, pose_history)
+        try:
+            return self._track(before, entry, begins, pose_history)
+        except optipmb.EffortError as error:
+            # What the frame cannot be tracked with may be a density of too many objects: they are given up when they
+            # have not been updated for so long, and the frame alone is not too much.
+            silent_ns = frame_id.stamp_ns - before.density.stamp_ns
+            if begins is None and before.density.stamp_ns >= 0 and silent_ns > GIVE_UP_NS:
+                with suppress(optipmb.EffortError):
+                    return self._track(before, entry, SessionStart("effort", place.jump_ns), pose_history)
+            return _passed(before, entry, before.pose_history, effort=1), Outcome(entry, None, None, {}, error)
 
     def _track(
         self, before: FilterState, entry: Entry, begins: SessionStart | None, pose_history: PoseHistory
@@ -158,11 +170,21 @@ class Transition:
         return {label: found[label] for label in found if label in new}
 
 
+def _passed(
+    before: FilterState, entry: Entry, pose_history: PoseHistory, *, astray: int = 0, effort: int = 0
+) -> FilterState:
+    """Return the state after a frame that is refused."""
+    counts = _counted(before.counts, entry, astray=astray, effort=effort)
+    cursor = before.cursor.after(entry.frame_id, entry.place)
+    return replace(before, cursor=cursor, last=entry.frame_id, counts=counts, pose_history=pose_history)
+
+
 def _counted(
     before: FrameCounts,
     entry: Entry,
     *,
     astray: int = 0,
+    effort: int = 0,
     tracked: int = 0,
     gap: int = 0,
     used: bool = False,
@@ -176,6 +198,7 @@ def _counted(
         clouds_used=before.clouds_used + used,
         clouds_missed=before.clouds_missed + entry.missed,
         astray=before.astray + astray,
+        effort=before.effort + effort,
         repaired=before.repaired + repaired,
     )
 

@@ -112,7 +112,7 @@ class Begun:
 
     Attributes:
         session: its id.
-        reason: "first", "jump", "publisher", "pose", "reset", "parameters" or "quarantine".
+        reason: "first", "jump", "publisher", "pose", "effort", "reset", "parameters" or "quarantine".
         jump_ns: how far the stamps jumped.
     """
 

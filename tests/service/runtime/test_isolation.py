@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from optipmb_schemas import Keys, ServiceStatus, SessionState
+import numpy as np
+from optipmb_schemas import Detections, Keys, ServiceStatus, SessionState
 from optipmb_service.cluster.store import MemoryStore, SqliteStore
 from optipmb_service.runtime import persistence
 from optipmb_service.runtime.persistence import STORE_FILE, CheckpointWriter
@@ -44,6 +46,64 @@ def test_no_sequence_number_overflows_a_counter(start: Callable[..., Any], tmp_p
     assert state.gaps == LAST
     assert {one.stream: one.gaps for one in status.sessions} == {CAREFUL.stream: 0, CARELESS.stream: LAST}
     assert (status.state, service.state) == ("ready", "ready")
+
+
+def crowd(seq: int, count: int) -> Detections:
+    """Small boxes within a metre, a second after those of the frame before."""
+    rng = np.random.default_rng(seq)
+    center = np.c_[rng.uniform(-0.5, 0.5, (count, 2)), np.ones(count)]
+    values = {"center": center, "size": np.full((count, 3), 0.05), "stamp_ns": CARELESS.stamp_ns(10 * seq)}
+    return CARELESS.detections(seq, objects=count, **values)
+
+
+def test_a_crowd_in_one_place_costs_its_stream_alone(start: Callable[..., Any]) -> None:
+    """Frames of 1,500 boxes within a metre are refused with a problem; the stream goes on, and so do the others."""
+    service, endpoint = start()
+    with Node(endpoint) as node:
+        node.send(CAREFUL.detections(0), CARELESS.detections(0))
+        node.tracks(CAREFUL.stream, 1)
+        node.tracks(CARELESS.stream, 1)
+        for seq in range(1, 6):
+            node.send(crowd(seq, 1500), CAREFUL.detections(seq))
+        problem = node.problem(CARELESS.stream, "overload")
+        tracks = node.tracks(CAREFUL.stream, 6)
+        node.send(CARELESS.detections(6, stamp_ns=CARELESS.stamp_ns(60)))
+        assert node.tracks(CARELESS.stream, 2)[-1].seq == 6
+        state = node.ask(KEYS.query(CARELESS.stream, "state"), SessionState)
+    assert (problem.path, "20000 pairs" in problem.expected) == ("center", True)
+    assert (state.frames, state.refused) == (2, 5)
+    assert [one.seq for one in tracks] == list(range(6))
+    assert service.state == "ready"
+
+
+class Slow:
+    """A tracker whose steps take a while of processor time once."""
+
+    def __init__(self, parameters: optipmb.Parameters, busy: list[float]) -> None:
+        self._tracker, self._busy = optipmb.Tracker(parameters), busy
+
+    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+        """Step, after computing for as long as is asked."""
+        ends = time.thread_time() + (self._busy.pop() if self._busy else 0.0)
+        while time.thread_time() < ends:
+            pass
+        return self._tracker.step(density, frame)
+
+
+def test_a_stream_that_takes_too_long_rests(start: Callable[..., Any]) -> None:
+    """A message takes more processor time than one may: the stream's next ones are refused, for a while."""
+    busy = [0.3]
+    service, endpoint = start(tracker=lambda parameters: Slow(parameters, busy), step_limit_s=0.2)
+    with Node(endpoint) as node:
+        node.send(CARELESS.detections(0))
+        node.tracks(CARELESS.stream, 1)
+        until(lambda: [one.state for one in service.status().sessions] == ["degraded"], "the stream rests")
+        node.send(CARELESS.detections(1), CAREFUL.detections(0))
+        assert "0.2 s of processor time" in node.problem(CARELESS.stream, "overload").expected
+        node.tracks(CAREFUL.stream, 1)
+        until(lambda: {one.state for one in service.status().sessions} == {"running"}, "the rest ends")
+        node.send(CARELESS.detections(2))
+        assert [one.seq for one in node.tracks(CARELESS.stream, 2)] == [0, 2]
 
 
 def test_a_checkpoint_that_cannot_be_made_is_its_streams_alone(monkeypatch: pytest.MonkeyPatch) -> None:

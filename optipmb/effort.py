@@ -1,0 +1,84 @@
+"""How many pairs a step would look at, counted before it does: what is near each other costs time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from optipmb.compiled import kernel
+from optipmb.errors import EffortError
+from optipmb.neighbours import NOBODY, block, empty_torus, insert
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from optipmb.density import Bernoullis, Poissons
+    from optipmb.preprocess import Measurements
+    from optipmb.table import ClassTable
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+UNLIMITED: Final = 2**62
+
+
+def check_effort(
+    bernoulli: Bernoullis, poisson: Poissons, measurements: Measurements, table: ClassTable, most: int
+) -> None:
+    """Refuse a frame with too many pairs in the gates.
+
+    Counted are the measurements in the gate of each predicted object and Poisson component, and in that of each
+    measurement, which may be an object of the next step.
+
+    Args:
+        bernoulli: predicted detected objects.
+        poisson: predicted Poisson components.
+        measurements: Z_k.
+        table: parameters as columns.
+        most: pairs that are allowed.
+
+    Raises:
+        EffortError: there are more.
+    """
+    count = len(measurements)
+    if (len(bernoulli) + len(poisson) + count) * count <= most:
+        return
+    positions = np.concatenate((bernoulli.mean[:, :2], poisson.mean[:, :2], measurements.position))
+    labels = np.concatenate((bernoulli.label, poisson.label, measurements.label))
+    if count_pairs(positions, labels, measurements.position, measurements.label, table.gate, most) > most:
+        raise EffortError("center", f"at most {most} pairs of an object and a detection in its gate", "more")
+
+
+@kernel
+def count_pairs(
+    center: Array, label: Index, position: Array, measured_label: Index, gate_distance: Array, most: int
+) -> int:
+    """Count the measurements of an object's class within its gate, over all objects; no further than `most` + 1.
+
+    Args:
+        center: (N, 2) positions of the objects, m.
+        label: (N,) their classes.
+        position: (M, 2) z_xy, m.
+        measured_label: (M,) z_c.
+        gate_distance: (C,) eta_dist, m.
+        most: where counting ends.
+    """
+    head, following, side = empty_torus(position.shape[0])
+    for m in range(position.shape[0]):
+        insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * gate_distance[measured_label[m]])
+    count = 0
+    for n in range(center.shape[0]):
+        eta = gate_distance[label[n]]
+        first_x, last_x, first_y, last_y = block(center[n, 0], center[n, 1], eta, 2.0 * eta)
+        for i in range(first_x, last_x + 1):
+            for j in range(first_y, last_y + 1):
+                m = head[(i & (side - 1)) * side + (j & (side - 1))]
+                while m != NOBODY:
+                    dx, dy = position[m, 0] - center[n, 0], position[m, 1] - center[n, 1]
+                    if dx * dx + dy * dy <= eta * eta and measured_label[m] == label[n]:
+                        count += 1
+                        if count > most:
+                            return count
+                    m = following[m]
+    return count
