@@ -126,7 +126,6 @@ def first_detected_states(
         table.noise_position,
         table.noise_velocity,
         table.noise_heading,
-        table.heading_sign_reliable,
         mean_out,
         covariance_out,
     )
@@ -152,7 +151,6 @@ def first_states(
     noise_position: Array,
     noise_velocity: Array,
     noise_heading: Array,
-    heading_sign_reliable: NDArray[np.bool_],
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
@@ -175,10 +173,9 @@ def first_states(
         heading_speed: (C,) this and the next two as in `birth_states`.
         known: (C, 6).
         unknown: (C, 6).
-        noise_position: (C,) this and the next three as in `ukf_updates`.
+        noise_position: (C,) this and the next two as in `ukf_updates`.
         noise_velocity: (C,).
         noise_heading: (C,).
-        heading_sign_reliable: (C,).
         mean_out: (K, 6) receives the means.
         covariance_out: (K, 6, 6) receives the covariances.
 
@@ -233,7 +230,6 @@ def first_states(
         noise_position,
         noise_velocity,
         noise_heading,
-        heading_sign_reliable,
         parts,
         spreads,
     )

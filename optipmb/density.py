@@ -67,6 +67,7 @@ class Bernoullis(_Rows):
         seen_ns: (N,) int64 stamp of the last detection; x_cnt and x_len are its and born_ns's distance to now.
         score: (N,) confidence score x_s.
         evidence: (N,) mean log odds of the latest detections (`optipmb.calibration`).
+        heading_odds: (N,) log odds that the object faces along phi and not the other way (`optipmb.heading`).
         extracted: (N,) bool, whether the track was ever extracted (t in T).
     """
 
@@ -80,6 +81,7 @@ class Bernoullis(_Rows):
     seen_ns: NDArray[np.int64]
     score: NDArray[np.float64]
     evidence: NDArray[np.float64]
+    heading_odds: NDArray[np.float64]
     extracted: NDArray[np.bool_]
 
     def __len__(self) -> int:
@@ -99,6 +101,7 @@ class Bernoullis(_Rows):
             seen_ns=np.zeros(0, np.int64),
             score=np.zeros(0),
             evidence=np.zeros(0),
+            heading_odds=np.zeros(0),
             extracted=np.zeros(0, np.bool_),
         )
 

@@ -10,6 +10,7 @@ import numpy as np
 from optipmb.calibration import calibrate_rows
 from optipmb.compiled import kernel
 from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, whole_periods
+from optipmb.heading import sign_probability
 from optipmb.records import record
 
 if TYPE_CHECKING:
@@ -32,12 +33,15 @@ class Tracks:
         center: (N, 3) geometric centre of the box, m.
         size: (N, 3) length, width, height, m.
         yaw: (N,) heading, rad, in (-pi, pi].
+        heading_confidence: (N,) probability that the object faces along `yaw` and not the other way; one where the
+            profile does not follow it (`optipmb.heading`).
         velocity: (N, 2) over ground, m/s.
         yaw_rate: (N,) rad/s.
         acceleration: (N,) along the heading, m/s^2.
         existence: (N,) existence probability: calibrated (`optipmb.calibration`), or r without a calibration.
         score: (N,) confidence score x_s, zero while missed; or the evidence, where the profile asks for it.
-        covariance: (N, 6, 6) of [x, y, v, phi, omega, a], with the lasting error of the detector.
+        covariance: (N, 6, 6) of [x, y, v, phi, omega, a], with the lasting error of the detector, and with the doubt
+            which way the object faces.
         age: (N,) s since the first detection.
         time_since_detection: (N,) s since the last one.
         detection: (N,) int64, index of this frame's detection in the caller's arrays, -1 while missed.
@@ -48,6 +52,7 @@ class Tracks:
     center: Array
     size: Array
     yaw: Array
+    heading_confidence: Array
     velocity: Array
     yaw_rate: Array
     acceleration: Array
@@ -104,6 +109,7 @@ def extract(
         np.empty((count, 3)),  # center
         np.empty((count, 3)),  # size
         np.empty(count),  # yaw
+        np.empty(count),  # heading_confidence
         np.empty((count, 2)),  # velocity
         np.empty(count),  # yaw_rate
         np.empty(count),  # acceleration
@@ -126,9 +132,11 @@ def extract(
         bernoulli.born_ns,
         bernoulli.seen_ns,
         bernoulli.evidence,
+        bernoulli.heading_odds,
         measurement,
         source,
         stamp_ns,
+        table.sign_known,
         table.knots,
         table.knot_evidence,
         table.knot_existence,
@@ -140,6 +148,7 @@ def extract(
         tracks.center,
         tracks.size,
         tracks.yaw,
+        tracks.heading_confidence,
         tracks.velocity,
         tracks.yaw_rate,
         tracks.acceleration,
@@ -195,9 +204,11 @@ def read_tracks(
     born_ns: Index,
     seen_ns: Index,
     evidence: Array,
+    heading_odds: Array,
     measurement: Index,
     source: Index,
     stamp_ns: int,
+    sign_known: NDArray[np.bool_],
     knots: Index,
     knot_evidence: Array,
     knot_existence: Array,
@@ -209,6 +220,7 @@ def read_tracks(
     center: Array,
     size: Array,
     yaw: Array,
+    heading_confidence: Array,
     velocity: Array,
     yaw_rate: Array,
     acceleration: Array,
@@ -232,6 +244,11 @@ def read_tracks(
             for t in range(STATE):
                 covariance_out[k, s, t] = covariance[n, s, t]
         yaw[k], yaw_rate[k], acceleration[k] = phi, mean[n, OMEGA], mean[n, A]
+        heading_confidence[k] = 1.0
+        if sign_known[label[n]]:
+            p = sign_probability(heading_odds[n])
+            heading_confidence[k] = p
+            covariance_out[k, PHI, PHI] += p * (1.0 - p) * math.pi**2
         velocity[k, 0], velocity[k, 1] = v * math.cos(phi), v * math.sin(phi)
         age[k], time_since_detection[k] = (stamp_ns - born_ns[n]) * 1e-9, (stamp_ns - seen_ns[n]) * 1e-9
         detection[k] = source[measurement[n]] if measurement[n] >= 0 else -1

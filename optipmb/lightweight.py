@@ -10,6 +10,7 @@ import numpy as np
 from optipmb.calibration import log_odds
 from optipmb.compiled import kernel
 from optipmb.density import Bernoullis
+from optipmb.heading import follow_sign
 from optipmb.prune import NEW
 
 if TYPE_CHECKING:
@@ -39,7 +40,8 @@ def light_weight_filter(
     Detected: ``x_A = (1 - z_s) x_A + z_s z_A``, ``x_cnt = 0``, ``x_s = [1 - exp(-x_len)] z_s`` (eq. Confidence
     Score). Missed: x_A stays, ``x_s = 0``. New: x_A = z_A before, ids from `next_id` on. The counters are kept as
     stamps, so that they mean the same at every frame rate: x_cnt is the number of nominal periods since `seen_ns`,
-    x_len is one more than the (real) number since `born_ns`. The evidence follows `optipmb.calibration`.
+    x_len is one more than the (real) number since `born_ns`. The evidence follows `optipmb.calibration`, the sign of
+    the heading `optipmb.heading`, which turns the states of `mean` and `covariance` where it changes.
 
     Args:
         survivors: which objects the posterior has.
@@ -65,6 +67,7 @@ def light_weight_filter(
         np.empty(count, np.int64),  # seen_ns
         np.empty(count),  # score
         np.empty(count),  # evidence
+        np.empty(count),  # heading_odds
         np.empty(count, np.bool_),  # extracted
     )
     update_light_weight(
@@ -76,16 +79,24 @@ def light_weight_filter(
         bernoulli.born_ns,
         bernoulli.seen_ns,
         bernoulli.evidence,
+        bernoulli.heading_odds,
         bernoulli.extracted,
         next_id,
         measurements.label,
         measurements.auxiliary,
         measurements.score,
+        measurements.yaw,
         stamp_ns,
         before_ns,
         table.period,
         table.memory,
         table.missed_evidence,
+        table.sign_memory,
+        table.sign_detection,
+        table.sign_motion,
+        table.sign_speed,
+        posterior.mean,
+        posterior.covariance,
         posterior.label,
         posterior.auxiliary,
         posterior.id,
@@ -93,6 +104,7 @@ def light_weight_filter(
         posterior.seen_ns,
         posterior.score,
         posterior.evidence,
+        posterior.heading_odds,
         posterior.extracted,
     )
     return posterior
@@ -108,16 +120,24 @@ def update_light_weight(
     born_ns: Index,
     seen_ns: Index,
     evidence: Array,
+    heading_odds: Array,
     extracted: NDArray[np.bool_],
     next_id: int,
     measured_label: Index,
     measured_auxiliary: Array,
     measured_score: Array,
+    measured_yaw: Array,
     stamp_ns: int,
     before_ns: int,
     period: float,
     memory: Array,
     missed_evidence: Array,
+    sign_memory: Array,
+    sign_detection: Array,
+    sign_motion: Array,
+    sign_speed: Array,
+    mean: Array,
+    covariance: Array,
     label_out: Index,
     auxiliary_out: Array,
     identity_out: Index,
@@ -125,26 +145,33 @@ def update_light_weight(
     seen_ns_out: Index,
     score_out: Array,
     evidence_out: Array,
+    heading_odds_out: Array,
     extracted_out: NDArray[np.bool_],
 ) -> None:
-    """Write the non-motion columns of the posterior (eq. Confidence Score); `extracted` stays as it was."""
+    """Write the non-motion columns of the posterior (eq. Confidence Score), and turn states whose sign has changed.
+
+    `extracted` stays as it was.
+    """
     # What the evidence keeps: over the time since the frame before, and in a first detection over one nominal period.
-    memory_of_frame = memory ** ((stamp_ns - before_ns) * 1e-9 / period)
+    periods = (stamp_ns - before_ns) * 1e-9 / period
+    memory_of_frame, sign_memory_of_frame = memory**periods, sign_memory**periods
     for k in range(row.shape[0]):
         n, m = row[k], measurement[k]
         if n == NEW:
             label_out[k], identity_out[k] = measured_label[m], next_id
-            born_ns_out[k], extracted_out[k], evidence_out[k] = stamp_ns, False, 0.0
+            born_ns_out[k], extracted_out[k] = stamp_ns, False
+            evidence_out[k] = heading_odds_out[k] = 0.0
             for s in range(4):
                 auxiliary_out[k, s] = measured_auxiliary[m, s]
             next_id += 1
         else:
             label_out[k], identity_out[k] = label[n], identity[n]
-            born_ns_out[k], extracted_out[k], evidence_out[k] = born_ns[n], extracted[n], evidence[n]
-            seen_ns_out[k] = seen_ns[n]
+            born_ns_out[k], seen_ns_out[k], extracted_out[k] = born_ns[n], seen_ns[n], extracted[n]
+            evidence_out[k], heading_odds_out[k] = evidence[n], heading_odds[n]
             for s in range(4):
                 auxiliary_out[k, s] = auxiliary[n, s]
         c = label_out[k]
+        first = born_ns_out[k] == stamp_ns
         score_out[k] = 0.0
         latest = -missed_evidence[c]
         if m >= 0:
@@ -155,5 +182,17 @@ def update_light_weight(
             score_out[k] = (1.0 - math.exp(-x_len)) * z_s
             seen_ns_out[k] = stamp_ns
             latest = log_odds(z_s)
-        kept = memory[c] if born_ns_out[k] == stamp_ns else memory_of_frame[c]
+            heading_odds_out[k] = follow_sign(
+                heading_odds_out[k],
+                sign_memory[c] if first else sign_memory_of_frame[c],
+                sign_memory[c],
+                sign_detection[c],
+                sign_motion[c],
+                sign_speed[c],
+                z_s,
+                measured_yaw[m],
+                mean[k],
+                covariance[k],
+            )
+        kept = memory[c] if first else memory_of_frame[c]
         evidence_out[k] = kept * evidence_out[k] + (1.0 - kept) * latest

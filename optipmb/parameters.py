@@ -72,6 +72,15 @@ class BirthSpread(_Table):
     acceleration: Positive = Field(description="of a, m/s^2")
 
 
+class HeadingSign(_Table):
+    """How it is found out which way an object faces, as log odds (`optipmb.heading`)."""
+
+    memory: OpenProbability = Field(description="lambda: weight that the log odds keep over one nominal period")
+    detection: NonNegative = Field(description="b_d: log odds of a detection of score 1 that faces the same way")
+    motion: NonNegative = Field(description="b_v: log odds of a nominal period of driving forwards")
+    speed: NonNegative = Field(description="v_0: speed from which an object counts as driving, m/s")
+
+
 class Calibration(_Table):
     """How the tracks of a class turned out on training data, by their evidence (`optipmb.calibration`).
 
@@ -145,12 +154,12 @@ class ClassParameters(_Table):
         description="missed nominal periods after which a Bernoulli is removed; with p_s = 1 nothing else does"
     )
     min_existence: OpenProbability = Field(description="existence probability below which a Bernoulli is removed")
-    heading_sign_reliable: bool = Field(
-        default=True, description="false: the detector may turn a box by pi, the heading innovation is taken modulo pi"
-    )
     birth_heading_speed: NonNegative = Field(
         default=0.0,
         description="measured speed, m/s, from which a birth heads along its velocity (the paper: 0), else as its box",
+    )
+    heading_sign: HeadingSign | None = Field(
+        default=None, description="how the sign of the heading is found; without it, it stays that of the birth"
     )
     process_noise: ProcessNoise = Field(description="Q")
     measurement_noise: MeasurementNoise = Field(description="R")

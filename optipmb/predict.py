@@ -57,6 +57,7 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
         bernoulli.seen_ns,
         bernoulli.score,
         bernoulli.evidence,
+        bernoulli.heading_odds,
         bernoulli.extracted,
     )
     if not len(poisson):

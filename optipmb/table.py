@@ -30,6 +30,11 @@ class ClassTable:
         noise_heading: (C,) of z_phi.
         birth_known: (C, 6) standard deviations of P^0 when the detection brings a velocity.
         birth_unknown: (C, 6) when it does not.
+        sign_known: (C,) whether the sign of the heading is followed; the next four are zero where not.
+        sign_memory: (C,) lambda of the sign.
+        sign_detection: (C,) b_d.
+        sign_motion: (C,) b_v.
+        sign_speed: (C,) v_0.
         memory: (C,) lambda; one without a calibration, and so the evidence stays zero.
         missed_evidence: (C,) l_miss.
         score_of_evidence: (C,) whether the score is the evidence.
@@ -55,7 +60,6 @@ class ClassTable:
     extract_misses: NDArray[np.int64]
     max_misses: NDArray[np.int64]
     min_existence: Array
-    heading_sign_reliable: NDArray[np.bool_]
     birth_heading_speed: Array
     process_noise: Array
     noise_position: Array
@@ -63,6 +67,11 @@ class ClassTable:
     noise_heading: Array
     birth_known: Array
     birth_unknown: Array
+    sign_known: NDArray[np.bool_]
+    sign_memory: Array
+    sign_detection: Array
+    sign_motion: Array
+    sign_speed: Array
     memory: Array
     missed_evidence: Array
     score_of_evidence: NDArray[np.bool_]
@@ -109,6 +118,7 @@ class ClassTable:
             return values
 
         noise = [p.process_noise for p in rows]
+        signs = [p.heading_sign for p in rows]
         return cls(
             period=parameters.nominal_period,
             score_filter=column(lambda p: p.score_filter),
@@ -128,7 +138,6 @@ class ClassTable:
             extract_misses=count(lambda p: p.extract_misses),
             max_misses=count(lambda p: p.max_misses),
             min_existence=column(lambda p: p.min_existence),
-            heading_sign_reliable=np.array([p.heading_sign_reliable for p in rows], dtype=np.bool_),
             birth_heading_speed=column(lambda p: p.birth_heading_speed),
             process_noise=np.array(
                 [[q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration] for q in noise]
@@ -138,6 +147,11 @@ class ClassTable:
             noise_heading=column(lambda p: p.measurement_noise.heading),
             birth_known=spread(lambda p: p.birth.speed),
             birth_unknown=spread(lambda p: p.birth.unknown_speed),
+            sign_known=np.array([one is not None for one in signs], np.bool_),
+            sign_memory=np.array([one.memory if one else 0.0 for one in signs]),
+            sign_detection=np.array([one.detection if one else 0.0 for one in signs]),
+            sign_motion=np.array([one.motion if one else 0.0 for one in signs]),
+            sign_speed=np.array([one.speed if one else 0.0 for one in signs]),
             memory=np.array([one.memory if one else 1.0 for one in calibrations]),
             missed_evidence=np.array([one.missed if one else 0.0 for one in calibrations]),
             score_of_evidence=np.array([one is not None and one.score_of_evidence for one in calibrations], np.bool_),

@@ -4,7 +4,8 @@ It runs for the pairs of the best global hypothesis only: costs need the positio
 
 z_M = [x, y, v_x, v_y, phi] = H(x_M) + w (eq. Single Object Measurement Model); a detection without velocity leaves
 the two velocity rows out, and H is then linear. Sigma points and square root are those of `optipmb.motion`. The
-innovation of phi is taken in (-pi, pi], or modulo pi in (-pi/2, pi/2] where the detector may turn boxes around.
+innovation of phi is taken modulo pi, in (-pi/2, pi/2]: detectors turn boxes around, and which way an object faces is
+followed apart (`optipmb.heading`).
 """
 
 from __future__ import annotations
@@ -67,7 +68,6 @@ def update_states(
         table.noise_position,
         table.noise_velocity,
         table.noise_heading,
-        table.heading_sign_reliable,
         mean_out,
         covariance_out,
     )
@@ -100,7 +100,6 @@ def ukf_updates(
     noise_position: Array,
     noise_velocity: Array,
     noise_heading: Array,
-    heading_sign_reliable: NDArray[np.bool_],
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
@@ -118,7 +117,6 @@ def ukf_updates(
         noise_position: (C,) standard deviations of z_x and z_y.
         noise_velocity: (C,) of z_vx and z_vy.
         noise_heading: (C,) of z_phi.
-        heading_sign_reliable: (C,) whether the sign of a measured heading can be trusted.
         mean_out: (K, 6) receives the posterior means.
         covariance_out: (K, 6, 6) receives the posterior covariances.
 
@@ -142,8 +140,7 @@ def ukf_updates(
         sigma[0] = sigma[1] = noise_position[c]
         sigma[2] = sigma[3] = noise_velocity[c]
         sigma[4] = noise_heading[c]
-        sign = heading_sign_reliable[c]
-        if ukf_update(mean[n], covariance[n], z, sigma, sign, buffers, mean_out[k], covariance_out[k]) > 0:
+        if ukf_update(mean[n], covariance[n], z, sigma, buffers, mean_out[k], covariance_out[k]) > 0:
             repaired += 1
     return repaired
 
@@ -154,7 +151,6 @@ def ukf_update(
     covariance: Array,
     z: Array,
     sigma: Array,
-    heading_sign: bool,
     buffers: tuple[Array, Array, Array, Array, Array, Array],
     mean_out: Array,
     covariance_out: Array,
@@ -169,7 +165,6 @@ def ukf_update(
         covariance: (6, 6) P_+.
         z: (5,) z_M; NaN at 2 and 3 where the velocity is unknown.
         sigma: (5,) standard deviations of the measurement noise, ``R = diag(sigma^2)``.
-        heading_sign: whether the sign of the measured heading can be trusted.
         buffers: of `workspace`; what they hold does not matter.
         mean_out: (6,) receives m.
         covariance_out: (6, 6) receives P.
@@ -212,7 +207,7 @@ def ukf_update(
         innovation[2] += z[2] - vx0
         innovation[3] += z[3] - vy0
     turn = innovation[size - 1] + z[4] - phi
-    innovation[size - 1] = wrap(turn) if heading_sign else 0.5 * wrap(2.0 * turn)
+    innovation[size - 1] = 0.5 * wrap(2.0 * turn)
 
     # S = Psi' W Psi + R, factored in place; then W = C L^-T and u = L^-1 nu.
     for r in range(size):

@@ -17,8 +17,10 @@ from oracle_formulas import (
     Measurement,
     birth,
     calibrate,
+    confidence,
     count_inside,
     follow_evidence,
+    follow_sign,
     iou,
     log_likelihood,
     moment_match,
@@ -42,6 +44,7 @@ class Bernoulli:
     seen_ns: int
     score: float
     evidence: float = 0.0
+    heading_odds: float = 0.0
     id: int = 0
     extracted: bool = False
     detection: int = -1
@@ -234,7 +237,11 @@ class Oracle:
                 b.auxiliary = (1 - z.score) * b.auxiliary + z.score * z.auxiliary
                 length = 1 + (now - b.born_ns) * 1e-9 / self.nominal
                 b.score = (1 - math.exp(-length)) * z.score  # eq. (Confidence Score)
-                b.evidence = follow_evidence(c, b.evidence, 1.0 if b.born_ns == now else since, z.score)
+                periods_since = 1.0 if b.born_ns == now else since
+                b.evidence = follow_evidence(c, b.evidence, periods_since, z.score)
+                b.heading_odds, b.mean, b.covariance = follow_sign(
+                    c, b.heading_odds, periods_since, z, b.mean, b.covariance
+                )
                 b.seen_ns, b.detection = now, z.source
             else:
                 r = b.existence
@@ -253,6 +260,9 @@ class Oracle:
             score = (1 - math.exp(-1.0)) * z.score
             b = Bernoulli(h.mean, h.covariance, h.r, z.label, z.auxiliary.copy(), now, now, score)
             b.evidence = follow_evidence(self.classes[z.label], 0.0, 1.0, z.score)
+            b.heading_odds, b.mean, b.covariance = follow_sign(
+                self.classes[z.label], 0.0, 1.0, z, b.mean, b.covariance
+            )
             b.id, b.detection = self.next_id, z.source
             self.bernoulli.append(b)
             self.next_id += 1
@@ -294,9 +304,12 @@ class Oracle:
                 continue
             x, y, v, phi, omega, a = b.mean
             existence, score, covariance = calibrate(c, b)
+            sign, doubt = confidence(c, b.heading_odds)
+            covariance = covariance + np.diag([0.0, 0.0, 0.0, doubt, 0.0, 0.0])
             rows.append(
                 {
                     "id": b.id, "label": b.label, "center": [x, y, b.auxiliary[3]], "size": b.auxiliary[:3], "yaw": phi,
+                    "heading_confidence": sign,
                     "velocity": [v * math.cos(phi), v * math.sin(phi)], "yaw_rate": omega, "acceleration": a,
                     "existence": existence, "score": score, "covariance": covariance,
                     "age": (now - b.born_ns) * 1e-9, "time_since_detection": (now - b.seen_ns) * 1e-9,

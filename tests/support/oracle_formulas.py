@@ -101,7 +101,7 @@ def ukf_update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array, Array
     S = np.mean([np.outer(y - z_hat, y - z_hat) for y in images], axis=0) + np.diag(np.square(deviations))
     C = np.mean([np.outer(x - m, y - z_hat) for x, y in zip(points, images, strict=True)], axis=0)
     nu = np.concatenate([z.xy, z.velocity if z.velocity is not None else [], [z.yaw]]) - z_hat
-    nu[-1] = wrap(nu[-1]) if c.heading_sign_reliable else fold(nu[-1])
+    nu[-1] = fold(nu[-1])
     K = C @ np.linalg.inv(S)
     mean = m + K @ nu
     mean[3] = wrap(mean[3])
@@ -203,6 +203,32 @@ def follow_evidence(c: Any, evidence: float, since: float, score: float | None) 
         odds = 14.0 if score == 1.0 else max(-14.0, min(14.0, math.log(score / (1.0 - score))))
     kept = c.calibration.memory**since
     return float(kept * evidence + (1.0 - kept) * odds)
+
+
+T = np.diag([1.0, 1.0, -1.0, 1.0, 1.0, -1.0])  # the motion with the opposite heading, beside the pi on phi
+
+
+def follow_sign(c: Any, odds: float, since: float, z: Measurement, m: Array, P: Array) -> tuple[float, Array, Array]:
+    """Log odds that the heading is right after a detection, and the state, turned around where they fall below zero."""
+    known = c.heading_sign
+    if known is None:
+        return 0.0, m, P
+    latest = known.detection * z.score * math.cos(z.yaw - m[3])
+    if abs(m[2]) >= known.speed + 2 * math.sqrt(P[2, 2]):
+        latest += known.motion * math.copysign(1.0, m[2])
+    kept = known.memory**since
+    odds = kept * odds + (1 - kept) / (1 - known.memory) * latest
+    if odds >= 0:
+        return odds, m, P
+    turned = T @ m
+    turned[3] = wrap(m[3] + math.pi)
+    return -odds, turned, T @ P @ T
+
+
+def confidence(c: Any, odds: float) -> tuple[float, float]:
+    """Probability that the heading is right, and the variance that the doubt adds."""
+    p = 1.0 if c.heading_sign is None else 1 / (1 + math.exp(-odds))
+    return p, p * (1 - p) * math.pi**2
 
 
 def calibrate(c: Any, b: Any) -> tuple[float, float, Array]:

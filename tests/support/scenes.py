@@ -257,7 +257,7 @@ def random_parameters(
             "clutter_rate": rng.uniform(0.1, 10), "area": rng.uniform(500, 10_000),
             "poisson_steps": int(rng.integers(0, 5)), "extract_new": extract_new, "extract_known": extract_known,
             "extract_misses": int(rng.integers(0, 6)), "max_misses": int(rng.integers(0, 15)),
-            "min_existence": 10 ** rng.uniform(-5, -1), "heading_sign_reliable": bool(rng.random() < 0.5),
+            "min_existence": 10 ** rng.uniform(-5, -1), "heading_sign": _heading_sign(rng),
             "birth_heading_speed": rng.choice([0.0, 1.0, 3.0]),
             "process_noise": {
                 "position": rng.uniform(0.05, 0.5), "speed": rng.uniform(0.1, 2), "heading": rng.uniform(0.02, 0.3),
@@ -278,6 +278,12 @@ def random_parameters(
         for values in classes.values():
             values["calibration"] = _calibration(rng)
     return {"name": f"random-{seed}", "nominal_period": 0.1, "classes": classes}
+
+
+def _heading_sign(rng: np.random.Generator) -> dict[str, Any] | None:
+    values = {"memory": rng.uniform(0.2, 0.95), "detection": rng.uniform(0, 2)}
+    values |= {"motion": rng.uniform(0, 2), "speed": rng.uniform(0, 2)}
+    return values if rng.random() < 0.75 else None
 
 
 def _calibration(rng: np.random.Generator) -> dict[str, Any]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
+import oracle_formulas as textbook
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -208,11 +211,17 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     row, measurement = np.array([0, 2, 3, 5, NEW, NEW]), np.array([4, -1, 1, -1, 0, 2])
     evidence, memory, missed = rng.normal(0, 2, 6), np.array([1.0, 0.5, 0.9]), np.array([0.0, 1.5, 2.5])
     score[4] = 1.0
+    odds, yaw = rng.uniform(0, 2, 6), rng.uniform(-3, 3, 5)
+    sign = np.array([[0.0, 0.0, 0.0, 0.0], [0.9, 1.0, 0.7, 0.5], [0.5, 2.0, 0.1, 3.0]])  # lambda, b_d, b_v, v_0
+    mean, root = rng.normal(0, 3, (6, 6)), rng.normal(0, 0.5, (6, 6, 6))
+    covariance = root @ root.transpose(0, 2, 1)
+    states, spreads = mean.copy(), covariance.copy()
     out = [np.empty(6, np.int64), np.empty((6, 4)), *(np.empty(6, np.int64) for _ in range(3)), np.empty(6)]
-    weighed, flags = np.empty(6), np.empty(6, np.bool_)
-    known = label, auxiliary, identity, born, seen, evidence, extracted
+    weighed, facing, flags = np.empty(6), np.empty(6), np.empty(6, np.bool_)
+    known = label, auxiliary, identity, born, seen, evidence, odds, extracted
     times = NOW, NOW - 150_000_000, PERIOD, memory, missed
-    update_light_weight(row, measurement, *known, 77, measured, boxes, score, *times, *out, weighed, flags)
+    given = (row, measurement, *known, 77, measured, boxes, score, yaw, *times, *sign.T.copy(), states, spreads)
+    update_light_weight(*given, *out, weighed, facing, flags)
     old, new = row >= 0, row == NEW
     m, hit = measurement, measurement >= 0
     np.testing.assert_array_equal(out[0], [*label[row[old]], *measured[m[new]]])
@@ -230,6 +239,15 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
         latest = np.where(hit, np.clip(np.log(score[m] / (1 - score[m])), -SURE, SURE), -missed[out[0]])
     kept = memory[out[0]] ** np.where(birth == NOW, 1.0, 1.5)
     np.testing.assert_allclose(weighed, kept * [*evidence[row[old]], 0, 0] + (1 - kept) * latest, rtol=1e-12)
+    for k in range(6):
+        z = textbook.Measurement(np.zeros(2), None, yaw[m[k]], np.ones(4), 0, score[m[k]], 0)
+        followed = SimpleNamespace(**dict(zip(("memory", "detection", "motion", "speed"), sign[out[0][k]], strict=True)))
+        c, before = SimpleNamespace(heading_sign=followed), odds[row[k]] if old[k] else 0.0
+        wanted = before, mean[k], covariance[k]
+        if hit[k]:
+            wanted = textbook.follow_sign(c, before, 1.0 if birth[k] == NOW else 1.5, z, mean[k], covariance[k])
+        for found, value in zip((facing[k], states[k], spreads[k]), wanted, strict=True):
+            np.testing.assert_allclose(found, value, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("both", [True, False])
@@ -253,27 +271,32 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
     rng = np.random.default_rng(0)
     mean, auxiliary, born, seen = rng.normal(0, 3, (9, 6)), rng.uniform(1, 5, (9, 4)), stamps(rng, 9), stamps(rng, 9)
     rows, measurement, source = np.array([1, 4, 8]), np.arange(9) % 3 - 1, np.array([50, 60])
-    shapes = [(3, 3), (3, 3), (3,), (3, 2), (3,), (3,), (3,), (3,)]
+    shapes = [(3, 3), (3, 3), (3,), (3,), (3, 2), (3,), (3,), (3,), (3,)]
     out = [np.empty(shape) for shape in shapes]
     detection = np.empty(3, np.int64)
     identity, label, r, score = np.arange(9) * 3, rng.integers(0, 4, 9), rng.uniform(0, 1, 9), rng.uniform(0, 1, 9)
     covariance = rng.normal(0, 1, (9, 6, 6))
     ids, labels, told = np.empty(3, np.int64), np.empty(3, np.int64), [np.empty(3), np.empty(3), np.empty((3, 6, 6))]
-    known = identity, label, mean, covariance, r, score, auxiliary, born, seen, rng.normal(0, 3, 9)
+    evidence, odds, followed = rng.normal(0, 3, 9), rng.uniform(0, 3, 9), np.array([True, False, True, False])
+    known = identity, label, mean, covariance, r, score, auxiliary, born, seen, evidence, odds
     bends = np.sort(rng.normal(0, 2, (4, 3)), axis=1)
     curves = bends, rng.uniform(0, 1, (4, 3)), rng.uniform(0, 1, (4, 3)), rng.uniform(0, 1, (4, 3)), np.full(4, True)
     knots = np.full(4, 3 if calibrated else 0)
-    given = *known, measurement, source, NOW, knots, *curves
-    read_tracks(rows, *given, ids, labels, *out[:6], *told, *out[6:], detection)
+    given = *known, measurement, source, NOW, followed, knots, *curves
+    read_tracks(rows, *given, ids, labels, *out[:7], *told, *out[7:], detection)
     wanted_told = [column[rows] for column in (r, score, covariance)]
-    calibrate_rows(rows, label, known[-1], mean, knots, *curves, *wanted_told)
+    calibrate_rows(rows, label, evidence, mean, knots, *curves, *wanted_told)
+    facing = np.where(followed[label[rows]], 1 / (1 + np.exp(-odds[rows])), 1.0)
+    wanted_told[2][:, 3, 3] += facing * (1 - facing) * np.pi**2
     assert np.array_equal(wanted_told[0], r[rows]) != calibrated
+    np.testing.assert_allclose(told[2], wanted_told[2], rtol=1e-12)
+    told[2], wanted_told[2] = told[2][:, :3, :3], wanted_told[2][:, :3, :3]
     copies = zip((ids, labels, *told), (identity[rows], label[rows], *wanted_told), strict=True)
     for copy, column in copies:
         np.testing.assert_array_equal(copy, column)
     x = mean[rows]
     heading = np.column_stack([np.cos(x[:, 3]), np.sin(x[:, 3])])
-    wanted = [np.column_stack([x[:, :2], auxiliary[rows, 3]]), auxiliary[rows, :3], x[:, 3], x[:, 2:3] * heading]
+    wanted = [np.column_stack([x[:, :2], auxiliary[rows, 3]]), auxiliary[rows, :3], x[:, 3], facing, x[:, 2:3] * heading]
     wanted += [x[:, 4], x[:, 5], (NOW - born[rows]) * 1e-9, (NOW - seen[rows]) * 1e-9]
     for found, expected in zip(out, wanted, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-15)
@@ -292,7 +315,7 @@ def test_announced_objects_are_matched_mixtures(seed: int) -> None:
     root = rng.normal(0, 0.5, (count, 6, 6))
     mean, covariance = rng.normal(0, 3, (count, 6)), root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6)
     measured = rng.normal(0, 3, (5, 2)), rng.normal(0, 3, (5, 2)), rng.normal(0, 1, 5), np.array([0, 0, 0, 1, 0])
-    noise = rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2), np.array([True, False])
+    noise = rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2)
     out, spread = np.full((3, 6), np.nan), np.full((3, 6, 6), np.nan)
     given = rows, kind, component, announced, log_e, mean, covariance
     births = rng.uniform(0, 2, 2), rng.uniform(0.1, 1, (2, 6)), rng.uniform(0.1, 1, (2, 6))
