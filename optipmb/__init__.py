@@ -19,7 +19,15 @@ from optipmb.errors import DensityError, EffortError, FrameError, OptipmbError, 
 from optipmb.extract import Tracks
 from optipmb.frame import Frame, PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
-from optipmb.parameters import Calibration, ClassParameters, Parameters, load_profile, parse_parameters, profiles
+from optipmb.parameters import (
+    Calibration,
+    ClassParameters,
+    HeadingSign,
+    Parameters,
+    load_profile,
+    parse_parameters,
+    profiles,
+)
 from optipmb.points import points_in_boxes
 from optipmb.soundness import sound
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
@@ -35,6 +43,7 @@ __all__ = [
     "EffortError",
     "Frame",
     "FrameError",
+    "HeadingSign",
     "Modules",
     "OptipmbError",
     "ParameterError",

@@ -75,10 +75,14 @@ class BirthSpread(_Table):
 class HeadingSign(_Table):
     """How it is found out which way an object faces, as log odds (`optipmb.heading`)."""
 
-    memory: OpenProbability = Field(description="lambda: weight that the log odds keep over one nominal period")
-    detection: NonNegative = Field(description="b_d: log odds of a detection of score 1 that faces the same way")
-    motion: NonNegative = Field(description="b_v: log odds of a nominal period of driving forwards")
-    speed: NonNegative = Field(description="v_0: speed from which an object counts as driving, m/s")
+    memory: OpenProbability = Field(
+        default=0.9, description="lambda: weight that the log odds keep over one nominal period"
+    )
+    detection: NonNegative = Field(
+        default=1.0, description="b_d: log odds of a detection of score 1 that faces the same way"
+    )
+    motion: NonNegative = Field(default=1.0, description="b_v: log odds of a frame of driving forwards")
+    speed: NonNegative = Field(default=1.0, description="v_0: speed from which an object counts as driving, m/s")
 
 
 class Calibration(_Table):

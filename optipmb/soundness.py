@@ -35,8 +35,8 @@ MAX_AGE: Final = 1e12
 def sound(tracks: Tracks) -> bool:
     """Tell whether all numbers of the tracks are finite and within bounds, and the ids ascend.
 
-    Existence and score lie in [0, 1], sizes are positive, ages are not negative, coordinates are at most `MAX_PLACE`,
-    covariances `MAX_COVARIANCE`, ages `MAX_AGE`, all others `MAX_VALUE`.
+    Existence, score and heading confidence lie in [0, 1], sizes are positive, ages are not negative, coordinates are at
+    most `MAX_PLACE`, covariances `MAX_COVARIANCE`, ages `MAX_AGE`, all others `MAX_VALUE`.
     """
     return bool(
         all_within(
@@ -44,6 +44,7 @@ def sound(tracks: Tracks) -> bool:
             tracks.center,
             tracks.size,
             tracks.yaw,
+            tracks.heading_confidence,
             tracks.velocity,
             tracks.yaw_rate,
             tracks.acceleration,
@@ -62,6 +63,7 @@ def all_within(
     center: Array,
     size: Array,
     yaw: Array,
+    heading_confidence: Array,
     velocity: Array,
     yaw_rate: Array,
     acceleration: Array,
@@ -81,6 +83,7 @@ def all_within(
             good &= abs(center[n, s]) <= MAX_PLACE
             good &= 0.0 < size[n, s] <= MAX_VALUE
         good &= abs(yaw[n]) <= MAX_VALUE
+        good &= 0.0 <= heading_confidence[n] <= 1.0
         good &= abs(velocity[n, 0]) <= MAX_VALUE and abs(velocity[n, 1]) <= MAX_VALUE
         good &= abs(yaw_rate[n]) <= MAX_VALUE
         good &= abs(acceleration[n]) <= MAX_VALUE

@@ -18,7 +18,7 @@ from optipmb_schemas.messages import Detections, Points
 from optipmb_schemas.structure import check_msgpack
 
 FORMAT: Final = "optipmb-dump"
-VERSION: Final = 1
+VERSION: Final = 2
 MAX_BYTES: Final = 2**30
 
 STORED: Final = Limits(

@@ -157,6 +157,11 @@ class Tracks(Header):
     yaw: Annotated[NDArray[np.float64], Array("f8", ("N",), -1e5, 1e5)] = Field(
         description="Heading in radians, counter-clockwise about z from the x axis of the world frame."
     )
+    heading_confidence: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1)] | None = Field(
+        default=None,
+        description="Probability that the object faces along `yaw` and not the other way; 1 where the profile does not "
+        "follow it. Absent: from a service that did not tell.",
+    )
     velocity: Annotated[NDArray[np.float64], Array("f8", ("N", 2), -1e5, 1e5)] = Field(
         description="Velocity in m/s along x and y of the world frame."
     )

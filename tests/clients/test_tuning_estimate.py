@@ -40,9 +40,8 @@ def test_turned_boxes_are_counted_and_do_not_count_as_noise() -> None:
     """Flips are a rate of their own; the spread of headings is that of the others."""
     found = estimated(recorded(Habits(flips=0.1)))
     assert found.flip_rate == pytest.approx(0.1, abs=0.01)
-    assert found.values["heading_sign_reliable"] is False
     assert found.values["measurement_noise.heading"] == pytest.approx(0.08, rel=0.05)
-    assert estimated(recorded(Habits())).values["heading_sign_reliable"] is True
+    assert estimated(recorded(Habits())).flip_rate == 0.0
 
 
 def test_found_and_false_ones_are_counted() -> None:

@@ -115,6 +115,7 @@ def tracks(draw: st.DrawFn) -> Tracks:
             ("yaw", -1e5, 1e5),
             ("yaw_rate", -1e5, 1e5),
             ("acceleration", -1e5, 1e5),
+            ("heading_confidence", 0, 1),
             ("existence", 0, 1),
             ("score", 0, 1),
             ("age", 0, 1e12),

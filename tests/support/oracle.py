@@ -260,9 +260,7 @@ class Oracle:
             score = (1 - math.exp(-1.0)) * z.score
             b = Bernoulli(h.mean, h.covariance, h.r, z.label, z.auxiliary.copy(), now, now, score)
             b.evidence = follow_evidence(self.classes[z.label], 0.0, 1.0, z.score)
-            b.heading_odds, b.mean, b.covariance = follow_sign(
-                self.classes[z.label], 0.0, 1.0, z, b.mean, b.covariance
-            )
+            b.heading_odds, b.mean, b.covariance = follow_sign(self.classes[z.label], 0.0, 1.0, z, b.mean, b.covariance)
             b.id, b.detection = self.next_id, z.source
             self.bernoulli.append(b)
             self.next_id += 1

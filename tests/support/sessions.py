@@ -139,6 +139,7 @@ class Chained:
             center=numbers[None, :3],
             size=np.ones((1, 3)),
             yaw=np.zeros(1),
+            heading_confidence=np.ones(1),
             velocity=numbers[None, 3:5],
             yaw_rate=np.zeros(1),
             acceleration=np.zeros(1),

@@ -241,7 +241,9 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     np.testing.assert_allclose(weighed, kept * [*evidence[row[old]], 0, 0] + (1 - kept) * latest, rtol=1e-12)
     for k in range(6):
         z = textbook.Measurement(np.zeros(2), None, yaw[m[k]], np.ones(4), 0, score[m[k]], 0)
-        followed = SimpleNamespace(**dict(zip(("memory", "detection", "motion", "speed"), sign[out[0][k]], strict=True)))
+        followed = SimpleNamespace(
+            **dict(zip(("memory", "detection", "motion", "speed"), sign[out[0][k]], strict=True))
+        )
         c, before = SimpleNamespace(heading_sign=followed), odds[row[k]] if old[k] else 0.0
         wanted = before, mean[k], covariance[k]
         if hit[k]:
@@ -296,7 +298,13 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
         np.testing.assert_array_equal(copy, column)
     x = mean[rows]
     heading = np.column_stack([np.cos(x[:, 3]), np.sin(x[:, 3])])
-    wanted = [np.column_stack([x[:, :2], auxiliary[rows, 3]]), auxiliary[rows, :3], x[:, 3], facing, x[:, 2:3] * heading]
+    wanted = [
+        np.column_stack([x[:, :2], auxiliary[rows, 3]]),
+        auxiliary[rows, :3],
+        x[:, 3],
+        facing,
+        x[:, 2:3] * heading,
+    ]
     wanted += [x[:, 4], x[:, 5], (NOW - born[rows]) * 1e-9, (NOW - seen[rows]) * 1e-9]
     for found, expected in zip(out, wanted, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-15)

@@ -19,6 +19,7 @@ SHAPES = {
     "yaw_rate": ((), -MAX_VALUE, MAX_VALUE),
     "acceleration": ((), -MAX_VALUE, MAX_VALUE),
     "existence": ((), 0.0, 1.0),
+    "heading_confidence": ((), 0.0, 1.0),
     "score": ((), 0.0, 1.0),
     "covariance": ((6, 6), -MAX_COVARIANCE, MAX_COVARIANCE),
     "age": ((), 0.0, MAX_AGE),

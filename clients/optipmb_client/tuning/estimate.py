@@ -35,8 +35,6 @@ WINDOW_S = 1.0
 """Pieces of trajectories in which motion is fitted; at low frame rates four frames."""
 PAIR_LIMIT = 2.0
 """Largest distance between a detection and its label, m; the gate where that is less."""
-RELIABLE_FLIPS = 0.002
-"""Headings count as reliable when fewer detections than this are turned round."""
 MOVING = 0.5
 """Speed from which an object moves, m/s."""
 LEAST_PAIRS = 20
@@ -134,8 +132,6 @@ def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Ru
         for path, value in values.items()
         if math.isfinite(value) and value > 0
     }
-    if count >= LEAST_PAIRS:
-        kept["heading_sign_reliable"] = flips < RELIABLE_FLIPS
     bins, scale, shift = _scores(everything)
     return Estimate(
         name=name,

@@ -29,7 +29,7 @@ from optipmb_client.tuning.ranking import Ranking, rank
 from optipmb_client.tuning.scoring import Measured, Scorer
 from optipmb_client.tuning.search import Outcome, Search
 from optipmb_client.tuning.space import Dimension, dimensions, penalty, repaired
-from optipmb_client.tuning.values import Value, only, value_of, with_calibration, with_values
+from optipmb_client.tuning.values import Value, only, value_of, with_calibration, with_heading_sign, with_values
 from optipmb_client.tuning.watch import Quiet, Watch
 
 __all__ = ["FoldResult", "Plan", "Refined", "refine"]
@@ -248,8 +248,7 @@ class _Work:
         """Return what is best on some sequences, which alone are looked at."""
         plain = [self.bench.variants[0][i] for i in clips]
         estimated = estimate(plain, self.name, self.base, self.bench.scorer.rules).values
-        seen = {path: value for path, value in estimated.items() if path in _SEEN}
-        base = self.told(self._better(self.base, with_values(self.base, self.name, seen), clips), clips)
+        base = self.told(with_heading_sign(self.base, self.name), clips)
         space = dimensions(base, self.name, estimated, plain, everything=self.plan.everything)
         plan = asdict(self.plan)
         settings = {
@@ -372,7 +371,5 @@ class _Choice:
 
 _EARLY, _LATE = 0.004, 0.002
 """By how much a trial may be behind, on half of the sequences and on all, and still be tried on degraded detections."""
-_SEEN = ("heading_sign_reliable",)
-"""What is not searched: it is as estimated, or as it was, whichever is better."""
 _SETTLED = ("metric", "copies", "degradation", "seed", "everything", "penalty", "caution")
 """What of a plan the trials depend on; their number is not in it, so there can be more later."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from optipmb import Calibration, OptipmbError, Parameters, parse_parameters
+from optipmb import Calibration, HeadingSign, OptipmbError, Parameters, parse_parameters
 from optipmb_client.errors import UsageError
 from optipmb_client.files import AtomicText
 
@@ -20,6 +20,7 @@ __all__ = [
     "value_of",
     "with_calibration",
     "with_classes",
+    "with_heading_sign",
     "with_values",
     "write_profile",
 ]
@@ -63,6 +64,13 @@ def with_calibration(parameters: Parameters, name: str, calibration: Calibration
     """Return the parameters with another calibration of one class."""
     document = parameters.model_dump()
     document["classes"][name]["calibration"] = calibration.model_dump() if calibration else None
+    return _parsed(document)
+
+
+def with_heading_sign(parameters: Parameters, name: str) -> Parameters:
+    """Return the parameters with the usual `heading_sign` of a class that has none."""
+    document = parameters.model_dump()
+    document["classes"][name]["heading_sign"] = document["classes"][name]["heading_sign"] or HeadingSign().model_dump()
     return _parsed(document)
 
 

@@ -91,6 +91,7 @@ def live_frame(tracks: Sample | None, detections: Sample | None) -> str | None:
             message.score,
             message.age,
             message.time_since_detection,
+            np.ones(len(message.id)) if message.heading_confidence is None else message.heading_confidence,
         ]
     )[:_MOST]
     numbers = np.round(rows, 3).tolist()

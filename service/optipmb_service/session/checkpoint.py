@@ -17,6 +17,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
 import msgpack
+import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
@@ -29,7 +30,7 @@ from optipmb_service.session.values import MAX_CLOUD_WAIT_NS, MAX_COUNT, MAX_ERR
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-VERSION: Final = 1
+VERSION: Final = 2
 MAGIC: Final = b"OPTIPMB\0"
 DIGEST: Final = 16
 HEAD: Final = len(MAGIC) + 2 + DIGEST
@@ -221,10 +222,29 @@ def _state(state: FilterState) -> dict[str, Any]:
     }
 
 
-# Reading version 1
+# Reading
 
 
 def _read_1(body: Document) -> Checkpoint:
+    """Read version 1, which did not follow the sign of headings.
+
+    Its parameters say by class whether the sign can be trusted, which nothing asks any more; its tracks go on without
+    evidence which way they face.
+    """
+    classes = body.document("parameters").map("classes")
+    for name, table in classes.items():
+        if not isinstance(table, dict):
+            raise body.wrong(f"parameters.classes.{name}", "a map", type(table).__name__)
+        table.pop("heading_sign_reliable", None)
+    for moment in ("base", "head"):
+        if not body.absent(moment):
+            density = body.document(moment).map("density")
+            existence = schemas.read_columns(density).get("bernoulli.existence", np.zeros(0))
+            density |= schemas.pack_columns({"bernoulli.heading_odds": np.zeros(existence.shape)})
+    return _read_2(body)
+
+
+def _read_2(body: Document) -> Checkpoint:
     stream = body.stream("stream")
     parameters = optipmb.parse_parameters(body.map("parameters"))
     schemas.SessionParameters(profile=parameters.name)  # as messages take it
@@ -315,7 +335,7 @@ def _read_state(one: Document, stream: str, parameters: optipmb.Parameters) -> F
     )
 
 
-_READERS: Final[dict[int, Callable[[Document], Checkpoint]]] = {1: _read_1}
+_READERS: Final[dict[int, Callable[[Document], Checkpoint]]] = {1: _read_1, 2: _read_2}
 
 
 def digest_of(checkpoint: Checkpoint) -> str:

@@ -132,6 +132,7 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
         center=tracks.center,
         size=tracks.size,
         yaw=tracks.yaw,
+        heading_confidence=tracks.heading_confidence,
         velocity=tracks.velocity,
         yaw_rate=tracks.yaw_rate,
         acceleration=tracks.acceleration,

@@ -43,6 +43,7 @@ def tracks(seq: int) -> bytes:
             center=[[100.12345, -7.0, 1.0]],
             size=[[4.0, 2.0, 1.5]],
             yaw=one / 3,
+            heading_confidence=one * 0.875,
             velocity=[[1.0, 2.0]],
             yaw_rate=one,
             acceleration=one,
@@ -251,7 +252,7 @@ def test_a_frame_holds_what_is_drawn() -> None:
     text = live_frame((tracks(1), ""), (encode(detections), encoding_of(detections)))
     assert text is not None
     frame = json.loads(text)
-    assert frame["tracks"] == [[5, 0, 100.123, -7.0, 4.0, 2.0, 0.333, 1.0, 2.0, 0.75, 0.5, 2.0, 0.2]]
+    assert frame["tracks"] == [[5, 0, 100.123, -7.0, 4.0, 2.0, 0.333, 1.0, 2.0, 0.75, 0.5, 2.0, 0.2, 0.875]]
     assert frame["sensor"] == [10.0, 20.0, 1.571]
     assert frame["detections"] == [[9.0, 25.0]]
     assert live_frame((b"\xc1", ""), None) is None

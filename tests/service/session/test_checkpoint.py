@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from optipmb_service.session.checkpoint import (
     HEAD,
     MAGIC,
+    VERSION,
     Checkpoint,
     CheckpointError,
     decode_checkpoint,
@@ -31,7 +32,7 @@ import optipmb
 
 NUSCENES = optipmb.load_profile("nuscenes")
 SENSOR = Sensor()
-GOLDEN = Path(__file__).parent / "golden" / "checkpoint-1.bin"
+GOLDEN = Path(__file__).parent / "golden"
 
 
 def example(frames: int = 12) -> Session:
@@ -190,8 +191,9 @@ def test_any_changed_byte_is_noticed() -> None:
 def test_a_later_version_is_refused_by_number() -> None:
     """What a newer service wrote is not guessed at."""
     data = encode_checkpoint(example().snapshot())
-    newer = MAGIC + (2).to_bytes(2, "big") + data[len(MAGIC) + 2 :]
-    with pytest.raises(CheckpointError, match="version 2: from a newer service; this one reads versions up to 1"):
+    newer = MAGIC + (VERSION + 1).to_bytes(2, "big") + data[len(MAGIC) + 2 :]
+    expected = f"version {VERSION + 1}: from a newer service; this one reads versions up to {VERSION}"
+    with pytest.raises(CheckpointError, match=expected):
         decode_checkpoint(newer)
 
 
@@ -268,9 +270,10 @@ def golden() -> Session:
     return one
 
 
-def test_version_1_is_read() -> None:
+@pytest.mark.parametrize("version", range(1, VERSION + 1))
+def test_every_version_is_read(version: int) -> None:
     """A file that an earlier build wrote is taken up, and goes on."""
-    checkpoint = decode_checkpoint(GOLDEN.read_bytes())
+    checkpoint = decode_checkpoint((GOLDEN / f"checkpoint-{version}.bin").read_bytes())
     assert (checkpoint.stream, checkpoint.head.counts.frames, checkpoint.head.counts.gaps) == (SENSOR.stream, 6, 2)
     assert [entry.message.seq for entry in checkpoint.window] == [2, 4, 5, 7]
     assert [entry.revision for entry in checkpoint.window] == [0, 0, 1, 0]
@@ -279,4 +282,4 @@ def test_version_1_is_read() -> None:
 
 
 if __name__ == "__main__":  # writes the golden file: only when there is a new version
-    GOLDEN.write_bytes(encode_checkpoint(golden().snapshot()))
+    (GOLDEN / f"checkpoint-{VERSION}.bin").write_bytes(encode_checkpoint(golden().snapshot()))

@@ -3,8 +3,8 @@
 "use strict";
 
 const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F"]; // Okabe and Ito
-const TRAIL_S = 5, ASK_MS = 2000, AGAIN_MS = 1000, SILENT_MS = 3000, EDGE = 44, SLOW = 0.3;
-const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, EXISTENCE = 9, SCORE = 10, AGE = 11, MISSED = 12;
+const TRAIL_S = 5, ASK_MS = 2000, AGAIN_MS = 1000, SILENT_MS = 3000, EDGE = 44, SLOW = 0.3, KNOWN = 0.95;
+const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, EXISTENCE = 9, SCORE = 10, AGE = 11, MISSED = 12, FACING = 13;
 
 const at = (id) => document.getElementById(id);
 const made = (tag, text) => Object.assign(document.createElement(tag), { textContent: text });
@@ -198,7 +198,7 @@ function box(track) {
   pen.fillStyle = colour;
   pen.fill();
   pen.globalAlpha = bold ? 1 : sure(track[SCORE]);
-  line([[x, y], front], colour, 1.6);
+  line([[x, y], front], colour, 1.6, track[FACING] < KNOWN ? [2, 3] : []); // dotted: it may face the other way
   if (Math.hypot(track[VX], track[VY]) > SLOW) arrow(x, y, x + track[VX], y + track[VY], colour);
   const [px, py] = toScreen(...around.reduce((a, b) => (a[1] > b[1] ? a : b)));
   pen.textAlign = "center";
@@ -236,6 +236,7 @@ function tell() {
     "track": track[ID], "class": frame.labels[track[LABEL]],
     "existence": track[EXISTENCE].toFixed(3), "score": track[SCORE].toFixed(2),
     "speed": `${Math.hypot(track[VX], track[VY]).toFixed(1)} m/s`, "x, y": `${track[X].toFixed(1)}, ${track[Y].toFixed(1)} m`,
+    "faces": `${(track[YAW] * 180 / Math.PI).toFixed(0)}° at ${(100 * track[FACING]).toFixed(1)} %`,
     "age": `${track[AGE].toFixed(1)} s`, "last detected": track[MISSED] > 0 ? `${track[MISSED].toFixed(1)} s ago` : "now",
   };
   at("details").replaceChildren(...Object.entries(rows).flatMap(([name, value]) => [made("dt", name), made("dd", value)]));
