@@ -64,7 +64,7 @@ def toml(document: dict[str, Any]) -> str:
 
     def inline(value: Any) -> str:
         if isinstance(value, dict):
-            return "{ " + ", ".join(f"{key} = {inline(item)}" for key, item in value.items()) + " }"
+            return "{ " + ", ".join(f"{key} = {inline(item)}" for key, item in value.items() if item is not None) + " }"
         if isinstance(value, str):
             return f'"{value}"'
         if isinstance(value, bool):
