@@ -10,12 +10,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from optipmb_schemas import PREFIX, Keys, MessageError, Problem, Topic, Tracks, decode
+from optipmb_schemas import PREFIX, Keys, MessageError, Problem, Tracks, decode
 
 from optipmb_client.merging import Merging, Novelty
 from optipmb_client.transport import Arrival, Connection, Inbox
 
-__all__ = ["Received", "Statistics", "Subscriber", "key_expression"]
+__all__ = ["Received", "Statistics", "Subscriber"]
 
 REMEMBERED = 65_536  # frames whose repetition is recognised
 
@@ -91,7 +91,7 @@ class Subscriber:
         prefix: str = PREFIX,
     ) -> None:
         keys = Keys(prefix)
-        tracks, problems = key_expression(keys, pattern, "tracks"), key_expression(keys, pattern, "problems")
+        tracks, problems = keys.matching(pattern, "tracks"), keys.matching(pattern, "problems")
         self.timeout = timeout
         self._on_problem = on_problem
         self._merging = Merging(REMEMBERED)
@@ -169,9 +169,3 @@ class Subscriber:
         except MessageError:
             self._invalid += 1
             return None
-
-
-def key_expression(keys: Keys, pattern: str, topic: Topic) -> str:
-    """Return the key expression of a topic of the streams that match a pattern with `*` in the place of names."""
-    keys.detections("/".join("any" if part == "*" else part for part in pattern.split("/")))  # checks the other names
-    return f"{keys.prefix}/{pattern}/{topic}"

@@ -74,6 +74,12 @@ class Keys:
         """Return the key expression of a topic of all streams."""
         return f"{self.prefix}/*/*/*/{_one_of(topic, get_args(Topic))}"
 
+    def matching(self, pattern: str, topic: Topic) -> str:
+        """Return the key expression of a topic of the streams of a pattern: a stream's name with `*` for any parts."""
+        named = "/".join("any" if part == "*" else part for part in pattern.split("/"))
+        _named("pattern", check_stream, named)
+        return f"{self.prefix}/{pattern}/{_one_of(topic, get_args(Topic))}"
+
     def all_queries(self, what: Query) -> str:
         """Return the key expression of a query about all streams."""
         return f"{self.prefix}/*/*/*/q/{_one_of(what, get_args(Query))}"

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 PREFIX: Final = "OPTIPMB_"
 DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"
+DEFAULT_GRPC: Final = "127.0.0.1:50051"
 
 Source = Literal["option", "environment", "file", "default"]
 
@@ -231,6 +232,25 @@ class Settings(BaseSettings):
     http_streams: int = Field(
         default=100, ge=0, le=10_000, description="streams that have series of their own in the metrics, by name"
     )
+    grpc: Annotated[str, AfterValidator(_address)] = Field(
+        default="", description="where gRPC is served, as `127.0.0.1:50051`; default: nowhere"
+    )
+    grpc_tls: Path | None = Field(
+        default=None,
+        description="folder with `key.pem`, `cert.pem` and `ca.pem` for gRPC: callers need a certificate of that"
+        " authority, and its name says what they may do; default: no TLS, everybody may do everything",
+    )
+    grpc_names: Path | None = Field(
+        default=None, description="JSON list of the names that may call; default: all that have a certificate or token"
+    )
+    grpc_tokens: str = Field(
+        default="",
+        pattern=r"^([A-Za-z_][\w.]*:[A-Za-z_]\w*)?$",
+        description="`module:function` that turns the metadata of a call into the caller's name; default: none",
+    )
+    grpc_calls: int = Field(
+        default=1000, ge=1, le=100_000, description="calls over gRPC that may be open at once; further ones are refused"
+    )
     log_format: Literal["console", "json"] = Field(default="console", description="form of the log lines on stderr")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="least level that is logged"
@@ -286,13 +306,16 @@ class Loaded:
     """Environment variables that look like settings and are none."""
 
 
-def load(file: Path | None = None, options: Mapping[str, Any] | None = None) -> Loaded:
-    """Merge the file, the environment and the options (None: not given), and check the result.
+def load(
+    file: Path | None = None, options: Mapping[str, Any] | None = None, defaults: Mapping[str, Any] | None = None
+) -> Loaded:
+    """Merge the defaults of a command, the file, the environment and the options (None: not given); check the result.
 
     Raises:
         SettingsInvalidError: the file cannot be read, or a value is not allowed.
     """
     layers: list[tuple[Source, dict[str, Any]]] = [
+        ("default", dict(defaults or {})),
         ("file", _read(file) if file is not None else {}),
         ("environment", _environment()),
         ("option", {name: value for name, value in (options or {}).items() if value is not None}),

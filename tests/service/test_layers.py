@@ -18,7 +18,8 @@ ARROWS = {
     "runtime": {"session", "cluster", "observability", "settings"},
     "zenoh": {"runtime", "settings"},
     "http": {"runtime", "observability"},
-    "app": {"session", "cluster", "observability", "runtime", "zenoh", "http", "settings", "__version__"},
+    "grpc": {"runtime", "observability", "settings", "zenoh"},
+    "app": {"session", "cluster", "observability", "runtime", "zenoh", "http", "grpc", "settings", "__version__"},
     "settings": set(),
     "__init__": set(),
     "__main__": {"app"},
@@ -53,12 +54,13 @@ def test_arrows_run_one_way(source: Path) -> None:
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_libraries_of_an_edge_stay_there(source: Path) -> None:
-    """Zenoh is imported by its folder alone, the HTTP libraries by theirs; nobody imports the client."""
+    """Zenoh is imported by its folder alone, the libraries of HTTP and gRPC by theirs; nobody imports the client."""
     first = {name.partition(".")[0] for name in imported(source.read_text())}
     place = place_of(source)
     assert "optipmb_client" not in first
     assert place == "zenoh" or "zenoh" not in first
     assert place == "http" or not first & {"starlette", "uvicorn"}
+    assert place == "grpc" or not first & {"grpc", "google", "grpc_health", "grpc_reflection", "grpc_status"}
 
 
 @pytest.mark.parametrize("source", sorted(ROOT.glob("session/*.py")), ids=lambda path: path.stem)

@@ -15,7 +15,6 @@ from optipmb_client.asking import DensityAsker
 from optipmb_client.commands.options import Config, Connect, Prefix, mcap_needed, say
 from optipmb_client.commands.replay import speed_of
 from optipmb_client.errors import ClientError, UsageError
-from optipmb_client.subscriber import key_expression
 from optipmb_client.transport import Connection, Inbox
 
 if TYPE_CHECKING:
@@ -120,7 +119,7 @@ def _live(
     """Yield what comes; None now and then while nothing does."""
     keys = Keys(prefix)
     topics = [topic for topic in TOPICS if points or topic != "points"]
-    wanted = [key_expression(keys, pattern, topic) for pattern in patterns for topic in topics]
+    wanted = [keys.matching(pattern, topic) for pattern in patterns for topic in topics]
     inbox = Inbox(WAITING)
     with contextlib.ExitStack() as stack:
         connection = stack.enter_context(Connection(connect, config=config, timeout=timeout))

@@ -17,7 +17,6 @@ from optipmb_schemas import PREFIX, Keys, MessageError, SessionParameters, Topic
 from optipmb_client.errors import ClientError
 from optipmb_client.mcap_files.writing import RecordingWriter
 from optipmb_client.sessions import set_parameters
-from optipmb_client.subscriber import key_expression
 from optipmb_client.transport import Connection, Inbox
 
 __all__ = ["Recording", "record"]
@@ -83,7 +82,7 @@ def record(  # noqa: PLR0913  one argument per decision of the caller
     """
     keys = Keys(prefix)
     topics = (*SMALL, "points") if points else SMALL
-    wanted = {topic: [key_expression(keys, pattern, topic) for pattern in patterns] for topic in topics}
+    wanted = {topic: [keys.matching(pattern, topic) for pattern in patterns] for topic in topics}
     with RecordingWriter(path, about) as writer:
         begun = time.monotonic()
         task = _Task(connection, keys, writer)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+from importlib import import_module
 from inspect import Parameter, Signature, signature
 from pathlib import Path  # noqa: TC003 - typer reads the annotations at run time
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TypedDict, Unpack, get_type_hints
@@ -21,7 +22,7 @@ from optipmb_service.app import health_command
 from optipmb_service.app.loops import leave
 from optipmb_service.app.router import route
 from optipmb_service.observability import logs
-from optipmb_service.settings import Loaded, Settings, SettingsInvalidError, load
+from optipmb_service.settings import DEFAULT_GRPC, DEFAULT_LISTEN, Loaded, Settings, SettingsInvalidError, load
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -59,7 +60,16 @@ class RouterOptions(TypedDict, total=False):
     log_level: Annotated[str | None, typer.Option(metavar="LEVEL", help="debug, info, warning or error.")]
 
 
-class Options(RouterOptions, total=False):
+class GatewayOptions(RouterOptions, total=False):
+    """What a gateway and the service take beyond that."""
+
+    grpc: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Serve gRPC there; as 127.0.0.1:50051.")]
+    grpc_tls: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder with the certificates of gRPC; default: no TLS.")
+    ]
+
+
+class Options(GatewayOptions, total=False):
     """What the service takes beyond that."""
 
     router: Annotated[
@@ -131,6 +141,15 @@ def router_command(**given: Unpack[RouterOptions]) -> None:
     leave(route(_begin(_load({**given, "router": True}))))
 
 
+@app.command("grpc")
+@_taking(GatewayOptions)
+def grpc_command(**given: Unpack[GatewayOptions]) -> None:
+    """Run a gRPC gateway alone, a client of routers, until SIGINT or SIGTERM. Prints one line, `ready …`."""
+    settings = _begin(_load(given, grpc=DEFAULT_GRPC, connect=[DEFAULT_LISTEN]))
+    run = _needed("optipmb_service.app.gateway", "grpc").run
+    leave(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+
+
 @app.command("health", add_help_option=False, context_settings=PASSED_ON)
 def health(context: typer.Context) -> None:
     """Ask a running service how it is; status 0 when well, else 1. See `health --help`."""
@@ -169,12 +188,12 @@ def _run_many(settings: Settings) -> int:
     return asyncio.run(supervise(settings))
 
 
-def _load(given: Mapping[str, Any]) -> Loaded:
+def _load(given: Mapping[str, Any], **defaults: Any) -> Loaded:
     """Return the settings in force with what the command line gives; None and no endpoints: not given."""
     options = {name: value or None if name in {"listen", "connect"} else value for name, value in given.items()}
     file = options.pop("settings")
     try:
-        return load(file, options)
+        return load(file, options, defaults)
     except SettingsInvalidError as error:
         _wrong(str(error))
 
@@ -184,6 +203,16 @@ def _begin(loaded: Loaded) -> Settings:
     logs.configure(loaded.settings.log_format, loaded.settings.log_level)
     logs.unknown_environment(loaded.unknown)
     return loaded.settings
+
+
+def _needed(module: str, extra: str) -> Any:
+    """Return a module that needs an extra; say what to install where it is not."""
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("optipmb"):
+            raise
+        _wrong(f"this needs {error.name}, which is not installed: pip install 'optipmb[{extra}]'")
 
 
 def _wrong(message: str) -> NoReturn:

@@ -87,6 +87,15 @@ METRICS: Final = {
     "stream_latency_seconds": MetricFamily(
         "gauge", ("stream", "quantile"), "Median and 99th percentile of a stream's last 512 latencies."
     ),
+    "grpc_open_calls": MetricFamily("gauge", ("method",), "Calls over gRPC under way."),
+    "grpc_calls_total": MetricFamily("counter", ("method", "code"), "Calls over gRPC that have ended, by status code."),
+    "grpc_requests_total": MetricFamily("counter", ("method",), "Messages that callers sent over gRPC."),
+    "grpc_responses_total": MetricFamily("counter", ("method",), "Messages that were sent to callers over gRPC."),
+    "grpc_skipped_total": MetricFamily(
+        "counter", ("method",), "Messages left out because the caller read too slowly; counted when its call ends."
+    ),
+    "grpc_refused_total": MetricFamily("counter", ("code",), "Messages of callers over gRPC that were not valid."),
+    "grpc_invalid_total": MetricFamily("counter", (), "Messages of the network that were not valid and not sent on."),
     "streams_unlisted": MetricFamily("gauge", (), "Streams without series of their own: more than `http_streams`."),
 }
 """Every metric by its name without the prefix `optipmb_`. The figures of the process itself start with `process_`."""

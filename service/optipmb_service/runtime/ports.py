@@ -85,5 +85,9 @@ class TransportError(Exception):
     """The network cannot be used; the text is one clear line."""
 
 
+class EdgeError(Exception):
+    """An edge beside Zenoh cannot be opened; the text is one clear line."""
+
+
 class HttpError(Exception):
     """The address of the HTTP endpoint cannot be listened on; the text is one clear line."""

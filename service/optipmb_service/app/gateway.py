@@ -1,0 +1,113 @@
+"""The gateway as a process of its own, and beside the service on a thread with a loop of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+import threading
+from typing import TYPE_CHECKING, Final
+
+import structlog
+
+from optipmb_service import __version__
+from optipmb_service.app.loops import StopRequest, beat, unless
+from optipmb_service.app.monitoring import monitoring
+from optipmb_service.grpc.server import GRACE_S, Server
+from optipmb_service.observability.health import ProcessHealth
+from optipmb_service.runtime.ports import EdgeError, HttpError, TransportError
+from optipmb_service.zenoh.client import Client
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from optipmb_service.observability.metrics import Metrics
+    from optipmb_service.settings import Settings
+
+SWITCH_S: Final = 0.0005
+"""By default a thread that waits for the interpreter waits ten times as long."""
+
+log = structlog.get_logger("optipmb_service")
+
+
+class _Gateway:
+    """What a gateway reports: whether it can be used."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    @property
+    def state(self) -> str:
+        """Ready while it has a router."""
+        return "ready" if self._client.linked() else "unlinked"
+
+    def status(self) -> None:
+        """Return nothing: a gateway has no streams."""
+
+
+async def run(settings: Settings) -> int:
+    """Serve until SIGINT or SIGTERM.
+
+    Returns:
+        The exit status: 0, or 1 when the network or an address cannot be used.
+    """
+    asked = StopRequest()
+    sys.setswitchinterval(SWITCH_S)
+    log.info("starting", instance=settings.instance, version=__version__)
+    health = ProcessHealth(settings.instance)
+    beating = asyncio.create_task(beat(health))
+    try:
+        with monitoring(settings, health):
+            log.info("connecting", endpoints=settings.connect)
+            client = await unless(asked, lambda: Client.opened(settings))
+            if client is None:
+                return 0
+            try:
+                server = Server(settings, client)
+                health.metrics.add(server.metrics.figures)
+                await server.start()
+                health.report(_Gateway(client))
+                print(f"ready grpc={server.address} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
+                log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)
+                await asked.wait()
+                health.ends()
+                await server.stop()
+            finally:
+                await asyncio.to_thread(client.close)
+    except (TransportError, HttpError, EdgeError) as error:
+        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+        return 1
+    finally:
+        beating.cancel()
+    log.info("stopped", drained=True)
+    return 0
+
+
+@contextlib.contextmanager
+def beside(settings: Settings, client: Client, metrics: Metrics) -> Iterator[None]:
+    """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other.
+
+    Raises:
+        EdgeError: the address, the certificates or the access cannot be used.
+    """
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, name="grpc", daemon=True)
+    thread.start()
+
+    async def begin() -> Server:
+        server = Server(settings, client)
+        await server.start()
+        return server
+
+    server: Server | None = None
+    try:
+        server = asyncio.run_coroutine_threadsafe(begin(), loop).result()
+        metrics.add(server.metrics.figures)
+        log.info("grpc", address=server.address)
+        yield
+    finally:
+        if server is not None:
+            with contextlib.suppress(TimeoutError):
+                asyncio.run_coroutine_threadsafe(server.stop(), loop).result(2 * GRACE_S)
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join(GRACE_S)

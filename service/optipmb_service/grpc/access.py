@@ -1,0 +1,136 @@
+"""Who calls, and what they may do: by the name in the certificate, as the routers of a protected network decide.
+
+| name | may |
+| --- | --- |
+| `site/node` | publish and track its own streams, `site/node/*`, read and command them |
+| `service/name` | read and command all streams |
+| `viewer/name` | read all streams |
+
+Without certificates and tokens everybody may do everything, as on a network without access control.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import grpc
+
+from optipmb_service.grpc.status import EndCall
+from optipmb_service.runtime.ports import EdgeError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+    from pathlib import Path
+
+    from optipmb_service.grpc.calls import Context
+
+    Tokens = Callable[[Mapping[str, str], str], str | Awaitable[str | None] | None]
+
+ANYBODY: Final = ""
+"""Name of a caller where callers have none."""
+
+NODE_CHUNKS: Final = 2
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who calls, and what they may do.
+
+    Attributes:
+        name: in the certificate, or of the token; empty: anybody.
+    """
+
+    name: str = ANYBODY
+
+    def may_publish(self, stream: str) -> None:
+        """Raise EndCall unless the caller may publish a stream."""
+        self._check(self.name == ANYBODY or self._owns(stream), f"publish {stream}")
+
+    def may_read(self, pattern: str) -> None:
+        """Raise EndCall unless the caller may read all streams of a pattern."""
+        self._check(self.name == ANYBODY or bool(self._role) or self._owns(pattern), f"read {pattern}")
+
+    def may_command(self, stream: str) -> None:
+        """Raise EndCall unless the caller may reset a stream and set its parameters."""
+        self._check(self.name == ANYBODY or self._role == "service" or self._owns(stream), f"command {stream}")
+
+    @property
+    def pattern(self) -> str:
+        """The widest pattern that the caller may read."""
+        return "*/*/*" if self.name == ANYBODY or self._role else f"{self.name}/*"
+
+    @property
+    def _role(self) -> str:
+        head = self.name.partition("/")[0]
+        return head if head in {"viewer", "service"} else ""
+
+    def _owns(self, stream: str) -> bool:
+        return not self._role and self.name.count("/") == NODE_CHUNKS - 1 and stream.startswith(f"{self.name}/")
+
+    def _check(self, allowed: bool, what: str) -> None:  # noqa: FBT001 - the one thing that it is given
+        if not allowed:
+            raise EndCall(grpc.StatusCode.PERMISSION_DENIED, f"{self.name} may not {what}")
+
+
+class Access:
+    """Tells who calls.
+
+    Args:
+        certificates: whether callers show one.
+        names: a JSON file with a list, the names that are let in; default: all that the authority has certified.
+        tokens: `module:function` of one's own, called with the metadata of a call and the name in its certificate (or
+            nothing); it returns the name that holds, or None to refuse. It may be a coroutine.
+
+    Raises:
+        EdgeError: the file or the function cannot be used.
+    """
+
+    def __init__(self, *, certificates: bool, names: Path | None = None, tokens: str = "") -> None:
+        self._certificates = certificates
+        self._names = None if names is None else _read(names)
+        self._tokens = _function(tokens) if tokens else None
+
+    async def caller(self, context: Context) -> Caller:
+        """Return who calls.
+
+        Raises:
+            EndCall: they are not let in.
+        """
+        name = ANYBODY
+        if self._certificates:
+            name = next(iter(context.auth_context().get("x509_common_name", ())), b"").decode(errors="replace")
+        if self._tokens is not None:
+            metadata = {key: value for key, value in context.invocation_metadata() or () if isinstance(value, str)}
+            told = self._tokens(metadata, name)
+            token = await told if inspect.isawaitable(told) else told
+            if not token:
+                raise EndCall(grpc.StatusCode.UNAUTHENTICATED, "the token is missing or not valid")
+            name = token
+        if (self._certificates or self._tokens is not None) and (
+            not name or (self._names is not None and name not in self._names)
+        ):
+            raise EndCall(grpc.StatusCode.PERMISSION_DENIED, f"{name or 'a certificate without a name'} is not let in")
+        return Caller(name)
+
+
+def _read(file: Path) -> frozenset[str]:
+    try:
+        names = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise EdgeError(f"setting grpc_names: {file}: {error}") from error
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise EdgeError(f"setting grpc_names: {file}: expected a JSON list of names")
+    return frozenset(names)
+
+
+def _function(path: str) -> Tokens:
+    module, _, name = path.partition(":")
+    try:
+        function: Tokens = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise EdgeError(f"setting grpc_tokens: {path}: {error}") from error
+    return function

@@ -1,0 +1,155 @@
+"""One call: who makes it, what it is given of the gateway, and how its responses are written."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import grpc
+
+from optipmb_service.grpc.status import EndCall
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    import optipmb_schemas as schemas
+
+    from optipmb_service.grpc.access import Caller
+    from optipmb_service.grpc.feeds import Feeds
+    from optipmb_service.grpc.metrics import CallMetrics
+    from optipmb_service.grpc.outbox import Outbox
+    from optipmb_service.zenoh.client import Client
+
+
+class Context(Protocol):
+    """What is used of gRPC's context of a call."""
+
+    async def read(self) -> Any: ...  # noqa: D102 - the next request, or EOF
+    async def write(self, message: bytes) -> None: ...  # noqa: D102 - a response
+    async def send_initial_metadata(self, initial_metadata: Any) -> None: ...  # noqa: D102 - at the beginning
+    async def abort(self, code: Any, details: str, trailing_metadata: Any) -> Any: ...  # noqa: D102 - an error
+    def auth_context(self) -> Any: ...  # noqa: D102 - of the certificate
+    def invocation_metadata(self) -> Any: ...  # noqa: D102 - of the caller
+    def peer(self) -> str: ...  # noqa: D102 - address of the caller
+    def done(self) -> bool: ...  # noqa: D102 - whether the caller has gone
+
+
+FIRST_S: Final = 30.0
+"""How long a call may be open before its first message."""
+
+
+@dataclass(frozen=True)
+class Gateway:
+    """What calls share."""
+
+    client: Client
+    feeds: Feeds
+    instance: str
+    limits: schemas.Limits
+    refused: Callable[[str, schemas.MessageError], None]
+    """Called for a message that is not valid."""
+    calls: set[Call] = field(default_factory=set)
+
+
+class Call:
+    """A call under way.
+
+    Args:
+        gateway: that serves it.
+        context: of gRPC.
+        caller: who makes it.
+        name: of the method.
+        metrics: what counts its messages.
+
+    Attributes:
+        left_out: responses that the caller was too slow for.
+    """
+
+    def __init__(self, gateway: Gateway, context: Context, caller: Caller, name: str, metrics: CallMetrics) -> None:
+        self.gateway = gateway
+        self.caller = caller
+        self._ended = asyncio.Event()
+        self.left_out = 0
+        self._context = context
+        self._reading: asyncio.Future[Any] | None = None
+        self._outbox: Outbox | None = None
+        self._name = name
+        self._metrics = metrics
+
+    def end(self) -> None:
+        """Read nothing more; a call that only writes ends."""
+        self._ended.set()
+        if self._reading is not None:
+            self._reading.cancel()
+        elif self._outbox is not None:
+            self._outbox.close()
+
+    async def first(self) -> bytes | None:
+        """Return the first request.
+
+        Raises:
+            EndCall: none comes.
+        """
+        try:
+            return await asyncio.wait_for(self.read(), FIRST_S)
+        except TimeoutError:
+            code = grpc.StatusCode.DEADLINE_EXCEEDED
+            raise EndCall(code, f"no message came within {FIRST_S:g} s of the call") from None
+
+    async def read(self) -> bytes | None:
+        """Return the next request; None when the caller has sent all, or the gateway ends."""
+        if self._ended.is_set():
+            return None
+        self._reading = asyncio.ensure_future(self._context.read())
+        try:
+            request = await self._reading
+        except asyncio.CancelledError:
+            if not self._ended.is_set():
+                raise
+            return None
+        finally:
+            self._reading = None
+        if request is grpc.aio.EOF:
+            return None
+        self._metrics.requests[self._name] += 1
+        return bytes(request)
+
+    async def begin(self) -> None:
+        """Tell the caller that the call is in force, before the first response."""
+        await self._context.send_initial_metadata(())
+
+    async def write(self, response: bytes) -> None:
+        """Write a response; waits while the caller reads too slowly."""
+        await self._context.write(response)
+        self._metrics.responses[self._name] += 1
+
+    async def drain(self, outbox: Outbox) -> None:
+        """Write what comes into an outbox until it is closed."""
+        self._outbox = outbox
+        while (response := await outbox.take()) is not None:
+            await self.write(response)
+
+    @contextlib.asynccontextmanager
+    async def writing(self, outbox: Outbox) -> AsyncIterator[None]:
+        """Write what comes into an outbox meanwhile, and at the end what is left in it."""
+        task = asyncio.create_task(self.drain(outbox))
+        try:
+            yield
+            outbox.close()
+            await task
+        finally:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+            self.left_out += outbox.left_out
+
+    def check_ending(self) -> None:
+        """End a call that the gateway has ended and not the caller.
+
+        Raises:
+            EndCall: it has.
+        """
+        if self._ended.is_set():
+            raise EndCall(grpc.StatusCode.UNAVAILABLE, "the gateway ends; call again, at any")

@@ -1,0 +1,148 @@
+"""Subscriptions that calls share: what is wanted by many is received, decoded and encoded once."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import optipmb_schemas as schemas
+import structlog
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+
+from optipmb_service.grpc.selection import Selection
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from optipmb_service.zenoh.client import Client, Message, Subscription
+
+HISTORY_S: Final = 2.0
+"""Longest wait for the caches of the services."""
+
+EVERYTHING: Final = Selection(pb.TrackFilter())
+
+log = structlog.get_logger("optipmb_service")
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """Something that came, as a response of any streaming method; tracks have the number of their frame."""
+
+    stream: str
+    response: bytes
+    tracks: schemas.Tracks | None = None
+
+
+class Listener(Protocol):
+    """A call that wants what comes."""
+
+    @property
+    def selection(self) -> Selection:
+        """What it wants of tracks."""
+
+    def passes(self, tracks: schemas.Tracks) -> bool:
+        """Tell whether it wants the tracks of this frame; called on a thread of the feed."""
+
+    def take(self, item: Item) -> None:
+        """Take something; called on the loop."""
+
+
+@dataclass(eq=False)
+class _Feed:
+    listeners: tuple[Listener, ...] = ()
+    subscription: Subscription | None = None
+
+
+class Feeds:
+    """The subscriptions of a gateway; all methods belong to its loop.
+
+    Args:
+        client: of the network.
+        loop: of the gateway.
+        invalid: called for what comes and is no valid message, on any thread.
+    """
+
+    def __init__(self, client: Client, loop: asyncio.AbstractEventLoop, invalid: Callable[[str], None]) -> None:
+        self._client = client
+        self._loop = loop
+        self._invalid = invalid
+        self._feeds: dict[str, _Feed] = {}
+
+    @contextlib.asynccontextmanager
+    async def joined(self, key: str, listener: Listener) -> AsyncIterator[None]:
+        """Have a listener take what is published under a key expression.
+
+        Raises:
+            TransportError: the network cannot be used.
+        """
+        feed = self._feeds.setdefault(key, _Feed())
+        feed.listeners = (*feed.listeners, listener)
+        try:
+            if feed.subscription is None:
+                feed.subscription = self._client.subscribe(key, lambda message: self._receive(feed, message))
+            yield
+        finally:
+            feed.listeners = tuple(one for one in feed.listeners if one is not listener)
+            if not feed.listeners:
+                del self._feeds[key]
+                if feed.subscription is not None:
+                    await asyncio.shield(asyncio.to_thread(feed.subscription.close))
+
+    async def recent(self, key: str) -> list[schemas.Tracks]:
+        """Return the tracks that the services keep under a key expression, each stream's as they were published.
+
+        Raises:
+            TransportError: the network cannot be used.
+        """
+        return await asyncio.to_thread(self._recent, key)
+
+    def _recent(self, key: str) -> list[schemas.Tracks]:
+        messages = self._client.recent(key, HISTORY_S)
+        return [tracks for one in messages if (tracks := self._decoded(one, schemas.Tracks)) is not None]
+
+    def _receive(self, feed: _Feed, message: Message) -> None:
+        """Take a message on the thread of its subscription."""
+        listeners = feed.listeners
+        handed: list[tuple[Listener, Item]] = []
+        if message.key.endswith("/problems"):
+            problem = self._decoded(message, schemas.Problem)
+            if problem is not None:
+                item = problem_item(problem)
+                handed = [(listener, item) for listener in listeners]
+        else:
+            tracks = self._decoded(message, schemas.Tracks)
+            if tracks is not None:
+                wanting = [one for one in listeners if one.passes(tracks)]
+                items = {one.selection.key: one.selection for one in wanting}
+                made = {key: tracks_item(tracks, selection) for key, selection in items.items()}
+                handed = [(one, made[one.selection.key]) for one in wanting]
+        if handed:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(_hand_over, handed)
+
+    def _decoded(self, message: Message, kind: type[Any]) -> Any:
+        try:
+            return schemas.decode(message.payload, kind, encoding=message.encoding)
+        except schemas.MessageError as error:
+            self._invalid(str(error))
+            return None
+
+
+def tracks_item(tracks: schemas.Tracks, selection: Selection = EVERYTHING) -> Item:
+    """Return tracks as a response."""
+    response = pb.SubscribeResponse(tracks=selection.of(tracks))
+    return Item(tracks.stream, response.SerializeToString(), tracks)
+
+
+def problem_item(problem: schemas.Problem) -> Item:
+    """Return a problem as a response."""
+    response = pb.SubscribeResponse(problem=convert.to_proto(problem))
+    return Item(problem.stream, response.SerializeToString())
+
+
+def _hand_over(handed: list[tuple[Listener, Item]]) -> None:
+    for listener, item in handed:
+        listener.take(item)

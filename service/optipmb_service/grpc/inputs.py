@@ -1,0 +1,283 @@
+"""`Track` and `Publish`: detections and clouds of one stream on their way to the network."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Any, Final
+
+import optipmb_schemas as schemas
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+
+from optipmb_service.grpc.feeds import EVERYTHING, Item, problem_item, tracks_item
+from optipmb_service.grpc.flight import Flight
+from optipmb_service.grpc.outbox import Outbox
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from optipmb_service.grpc.calls import Call
+    from optipmb_service.grpc.selection import Selection
+    from optipmb_service.zenoh.client import Outgoing
+
+CACHE: Final = 200
+"""Detections that are kept for recovery unless the publisher says otherwise: 10 s of a sensor at 20 Hz."""
+
+MAX_CACHE: Final = 4096
+MAX_CACHE_CLOUDS: Final = 64
+
+INLINE_BYTES: Final = 64 * 2**10
+"""What is larger is handed to the network on a thread: it is cut into fragments and may wait for the link."""
+
+WINDOW: Final = 64
+"""Frames of a `Track` call without tracks; beyond it the gateway reads no further, and the caller feels it."""
+
+RESPONSES: Final = 256
+"""Responses that may wait for a caller: more than the window, so that none are left out but for others' frames."""
+
+WANTED_S: Final = 1.0
+"""How long the first cloud waits for it to be known whether anybody takes clouds."""
+
+Input = schemas.Detections | schemas.Points | schemas.Problem | pb.PublishOptions
+
+
+class Incoming:
+    """Reads the messages of one stream, checks them as the service does, and hands them to the network.
+
+    Args:
+        call: with the requests.
+        kind: of the requests, which have `detections` and `points`.
+    """
+
+    def __init__(self, call: Call, kind: type[pb.TrackRequest | pb.PublishRequest]) -> None:
+        self._call = call
+        self._kind = kind
+        self._options = pb.PublishOptions()
+        self._outgoing: Outgoing | None = None
+        self._matched = asyncio.Event()
+        self._waited = False
+        self.stream = ""
+
+    async def first(self) -> Input | None:
+        """Return the first message, which says the stream; None when the caller sends none.
+
+        Raises:
+            EndCall: there is none in time, or it is none of this method, or the caller may not publish this stream.
+        """
+        payload = await self._call.first()
+        return None if payload is None else self._read(payload)
+
+    async def next(self) -> Input | None:
+        """Return the next message, a problem in the place of one that is not valid, None when all have come.
+
+        Raises:
+            EndCall: it is none of this method, or of another stream.
+        """
+        payload = await self._call.read()
+        return None if payload is None else self._read(payload)
+
+    @contextlib.asynccontextmanager
+    async def opened(self, changed: asyncio.Event | None = None) -> AsyncIterator[Outgoing]:
+        """Keep the publishers open meanwhile; `changed` is set when it changes whether anybody takes clouds.
+
+        Raises:
+            TransportError: the network cannot be used.
+        """
+        loop = asyncio.get_running_loop()
+
+        def matched() -> None:
+            self._matched.set()
+            if changed is not None:
+                changed.set()
+
+        def matching() -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(matched)
+
+        options = self._options
+        outgoing = self._call.gateway.client.publish(
+            self.stream, options.cache or CACHE, options.cache_clouds, matching
+        )
+        self._outgoing = outgoing
+        try:
+            yield outgoing
+        finally:
+            await asyncio.shield(asyncio.to_thread(outgoing.close))
+
+    async def send(self, message: schemas.Detections | schemas.Points) -> None:
+        """Hand a message to the network; a cloud only if somebody takes it.
+
+        Raises:
+            TransportError: the network cannot be used.
+        """
+        outgoing = self._outgoing
+        assert outgoing is not None  # noqa: S101 - opened before: said for the type checker
+        if isinstance(message, schemas.Points) and not await self._points_wanted(outgoing):
+            return
+        put = outgoing.detections if isinstance(message, schemas.Detections) else outgoing.points
+        payload = schemas.encode(message)
+        if len(payload) <= INLINE_BYTES:
+            put(payload)
+        else:
+            await asyncio.to_thread(put, payload)
+
+    async def _points_wanted(self, outgoing: Outgoing) -> bool:
+        if not self._waited and not outgoing.points_wanted:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._matched.wait(), WANTED_S)
+        self._waited = True
+        return outgoing.points_wanted
+
+    def _read(self, payload: bytes) -> Input:
+        request = convert.parse(payload, self._kind)
+        name = request.WhichOneof("request")
+        if name is None:
+            raise schemas.MessageError("missing_field", "request", "detections or points", "nothing")
+        message = getattr(request, name)
+        if not self.stream:
+            self._begin(name, message)
+        elif message.stream != self.stream:
+            raise schemas.MessageError("invalid_value", f"{name}.stream", self.stream, ascii(message.stream)[:80])
+        if name == "options":
+            return self._options
+        kind: Any = schemas.Detections if name == "detections" else schemas.Points
+        try:
+            return convert.from_proto(message, kind, self._call.gateway.limits)  # type: ignore[no-any-return]
+        except schemas.MessageError as error:
+            return self._problem(message, error)
+
+    def _begin(self, name: str, message: Any) -> None:
+        try:
+            self._call.gateway.client.keys.detections(message.stream)
+            if name == "options":
+                _bounded("cache", message.cache, MAX_CACHE)
+                _bounded("cache_clouds", message.cache_clouds, MAX_CACHE_CLOUDS)
+                self._options = message
+        except schemas.MessageError as error:
+            raise error.under(name) from None
+        self._call.caller.may_publish(message.stream)
+        self.stream = message.stream
+
+    def _problem(self, message: Any, error: schemas.MessageError) -> schemas.Problem:
+        gateway = self._call.gateway
+        gateway.refused(self.stream, error)
+        problem = schemas.Problem.of(error, stream=self.stream, instance=gateway.instance)
+        known = {name: getattr(message, name) for name in ("seq", "stamp_ns") if message.HasField(name)}
+        return problem.model_copy(update={name: value for name, value in known.items() if value >= 0})
+
+
+class _Answers:
+    """What comes back of a stream, for the call that publishes it."""
+
+    selection: Selection = EVERYTHING
+
+    def __init__(self, outbox: Outbox, flight: Flight | None = None) -> None:
+        self._flight = flight
+        self._outbox = outbox
+
+    def passes(self, _tracks: schemas.Tracks) -> bool:
+        """Tell whether they are wanted: all are."""
+        return True
+
+    def take(self, item: Item) -> None:
+        """Take tracks or a problem."""
+        if self._flight is not None and item.tracks is not None:
+            self._flight.came(item.tracks.epoch, item.tracks.seq)
+        self._outbox.put(item.stream, item.response)
+
+
+async def track(call: Call) -> None:
+    """Detections and clouds in, tracks and problems back."""
+    incoming, outbox, flight = Incoming(call, pb.TrackRequest), Outbox(RESPONSES), Flight()
+    message = await incoming.first()
+    if message is None:
+        return
+    answers = _Answers(outbox, flight)
+    keys, feeds = call.gateway.client.keys, call.gateway.feeds
+    async with (
+        feeds.joined(keys.tracks(incoming.stream), answers),
+        feeds.joined(keys.problems(incoming.stream), answers),
+        incoming.opened(),
+        call.writing(outbox),
+    ):
+        known = await _already_tracked(call, message, outbox)
+        while message is not None:
+            if isinstance(message, schemas.Problem):
+                outbox.put(incoming.stream, problem_item(message).response)
+            elif isinstance(message, schemas.Detections | schemas.Points):
+                if isinstance(message, schemas.Detections) and (message.epoch, message.seq) not in known:
+                    flight.sent(message.epoch, message.seq)
+                await incoming.send(message)
+                await flight.below(WINDOW)
+            message = await incoming.next()
+        await flight.below(1)
+    call.check_ending()
+
+
+async def _already_tracked(call: Call, first: Input, outbox: Outbox) -> set[tuple[bytes, int]]:
+    """Answer what a caller that comes back sends again: it may have been tracked, and is not tracked twice."""
+    known: set[tuple[bytes, int]] = set()
+    if not isinstance(first, schemas.Detections | schemas.Points):
+        return known
+    for tracks in await call.gateway.feeds.recent(call.gateway.client.keys.tracks(first.stream)):
+        if tracks.epoch == first.epoch and tracks.stamp_ns >= first.stamp_ns:
+            known.add((tracks.epoch, tracks.seq))
+            outbox.put(tracks.stream, tracks_item(tracks).response)
+    return known
+
+
+async def publish(call: Call) -> None:
+    """Detections and clouds in, acknowledgements and problems back."""
+    incoming, outbox = Incoming(call, pb.PublishRequest), Outbox(RESPONSES)
+    message = await incoming.first()
+    if message is None:
+        return
+    changed = asyncio.Event()
+    async with (
+        call.gateway.feeds.joined(call.gateway.client.keys.problems(incoming.stream), _Answers(outbox)),
+        incoming.opened(changed) as outgoing,
+        _acknowledging(outbox, outgoing, changed) as progress,
+        call.writing(outbox),
+    ):
+        while message is not None:
+            if isinstance(message, schemas.Problem):
+                outbox.put(incoming.stream, problem_item(message).response)
+            elif isinstance(message, schemas.Detections | schemas.Points):
+                await incoming.send(message)
+                setattr(progress, "detections" if isinstance(message, schemas.Detections) else "points", message.seq)
+                changed.set()
+            message = await incoming.next()
+        _acknowledge(outbox, outgoing, progress)
+    call.check_ending()
+
+
+@contextlib.asynccontextmanager
+async def _acknowledging(
+    outbox: Outbox, outgoing: Outgoing, changed: asyncio.Event
+) -> AsyncIterator[pb.Acknowledgement]:
+    """Acknowledge at once and whenever something has changed; the newest one stands for those before it."""
+    progress = pb.Acknowledgement()
+    _acknowledge(outbox, outgoing, progress)
+
+    async def follow() -> None:
+        while True:
+            await changed.wait()
+            changed.clear()
+            _acknowledge(outbox, outgoing, progress)
+
+    task = asyncio.create_task(follow())
+    try:
+        yield progress
+    finally:
+        task.cancel()
+
+
+def _acknowledge(outbox: Outbox, outgoing: Outgoing, progress: pb.Acknowledgement) -> None:
+    progress.points_wanted = outgoing.points_wanted
+    outbox.replace(pb.PublishResponse(acknowledgement=progress).SerializeToString())
+
+
+def _bounded(name: str, value: int, most: int) -> None:
+    if value > most:
+        raise schemas.MessageError("too_large", name, f"at most {most}", str(value))

@@ -1,0 +1,118 @@
+"""`Subscribe` and `QueryTracks`: tracks on their way to a reader."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Final
+
+import optipmb_schemas as schemas
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+
+from optipmb_service.grpc.feeds import tracks_item
+from optipmb_service.grpc.outbox import Outbox
+from optipmb_service.grpc.selection import Pace, Selection
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from optipmb_service.grpc.calls import Call
+    from optipmb_service.grpc.feeds import Item
+
+QUEUE: Final = 16
+MAX_QUEUE: Final = 1024
+
+Frame = tuple[str, bytes, int, int, int]
+"""One publication of the tracks of a frame: stream, epoch, number, run, revision."""
+
+
+class _Subscriber:
+    """A listener with a queue of its own.
+
+    Args:
+        asked: what is subscribed to.
+
+    Raises:
+        MessageError: it is not valid.
+    """
+
+    def __init__(self, asked: pb.SubscribeRequest) -> None:
+        self.selection = Selection(asked.filter)
+        self._pace = Pace(asked.max_rate_hz)
+        if asked.queue > MAX_QUEUE:
+            raise schemas.MessageError("too_large", "queue", f"at most {MAX_QUEUE}", str(asked.queue))
+        self.outbox = Outbox(asked.queue or QUEUE)
+        self._known: set[Frame] = set()  # what the caches held at the beginning: recovery may bring it again
+        self._early: list[Item] | None = []  # what came before it was known what the caches hold
+
+    def passes(self, tracks: schemas.Tracks) -> bool:
+        return self._pace.passes(tracks.stream, tracks.stamp_ns)
+
+    def take(self, item: Item) -> None:
+        if self._early is not None and len(self._early) < MAX_QUEUE:
+            self._early.append(item)
+        elif item.tracks is None or _frame(item.tracks) not in self._known:
+            self.outbox.put(item.stream, item.response)
+
+    def begin(self, history: list[schemas.Tracks]) -> None:
+        """Take what came while the caches were asked, but for what they had."""
+        self._known = {_frame(tracks) for tracks in history}
+        early, self._early = self._early or [], None
+        for item in early:
+            self.take(item)
+
+
+async def subscribe(call: Call) -> None:
+    """Send the tracks of a pattern until the caller or the gateway ends it."""
+    asked = convert.parse(await call.first() or b"", pb.SubscribeRequest)
+    keys, feeds = call.gateway.client.keys, call.gateway.feeds
+    tracks, problems = keys.matching(asked.pattern, "tracks"), keys.matching(asked.pattern, "problems")
+    call.caller.may_read(asked.pattern)
+    listener = _Subscriber(asked)
+    async with contextlib.AsyncExitStack() as joined:
+        await joined.enter_async_context(feeds.joined(tracks, listener))
+        if asked.problems:
+            await joined.enter_async_context(feeds.joined(problems, listener))
+        await call.begin()
+        history = await feeds.recent(tracks)
+        for one in history if asked.history else ():
+            if listener.passes(one):
+                await call.write(tracks_item(one, listener.selection).response)
+        listener.begin(history)
+        try:
+            await call.drain(listener.outbox)
+        finally:
+            call.left_out += listener.outbox.left_out
+    call.check_ending()
+
+
+async def query_tracks(call: Call) -> None:
+    """Send the tracks that the services keep, of the newest revision of each frame."""
+    asked = convert.parse(await call.first() or b"", pb.QueryTracksRequest)
+    key = call.gateway.client.keys.matching(asked.pattern, "tracks")
+    call.caller.may_read(asked.pattern)
+    selection = Selection(asked.filter)
+    first = asked.from_ns if asked.HasField("from_ns") else 0
+    last = asked.to_ns if asked.HasField("to_ns") else 2**63
+    for tracks in newest(await call.gateway.feeds.recent(key)):
+        if first <= tracks.stamp_ns <= last:
+            await call.write(tracks_item(tracks, selection).response)
+
+
+def newest(publications: Iterable[schemas.Tracks]) -> list[schemas.Tracks]:
+    """Return what holds of each frame, by stream and stamp: that of the latest run, and in it the latest revision."""
+    holding: dict[tuple[str, bytes, int], schemas.Tracks] = {}
+    for tracks in publications:
+        key = tracks.stream, tracks.epoch, tracks.seq
+        known = holding.get(key)
+        if known is None or _order(tracks) >= _order(known):
+            holding[key] = tracks
+    return sorted(holding.values(), key=lambda tracks: (tracks.stream, tracks.stamp_ns, tracks.seq))
+
+
+def _order(tracks: schemas.Tracks) -> tuple[int, int]:
+    return tracks.delivery.run if tracks.delivery else 0, tracks.revision
+
+
+def _frame(tracks: schemas.Tracks) -> Frame:
+    return (tracks.stream, tracks.epoch, tracks.seq, *_order(tracks))

@@ -1,0 +1,125 @@
+"""What a subscriber wants of the tracks: which of them, which columns, and how often."""
+
+from __future__ import annotations
+
+import collections
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import optipmb_schemas as schemas
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MAX_CORNERS: Final = 1000
+MAX_NAMES: Final = 256
+CORNERS: Final = 3
+CONFIRMED_EXISTENCE: Final = 0.5
+TOLERANCE: Final = 0.999
+"""Part of a period that counts as a whole one: stamps of real sensors jitter."""
+REMEMBERED: Final = 64
+
+
+class Selection:
+    """A filter as it was asked for.
+
+    Args:
+        asked: the filter.
+
+    Raises:
+        MessageError: it is not valid, with the path of its field.
+    """
+
+    def __init__(self, asked: pb.TrackFilter) -> None:
+        self.key = asked.SerializeToString(deterministic=True)
+        """Equal filters have equal keys."""
+        for name, values in (("classes", asked.classes), ("fields", asked.fields)):
+            if len(values) > MAX_NAMES:
+                raise schemas.MessageError("too_large", f"filter.{name}", f"at most {MAX_NAMES}", str(len(values)))
+        for row, field in enumerate(asked.fields):
+            if field not in schemas.Tracks.arrays:
+                expected = f"one of {', '.join(schemas.Tracks.arrays)}"
+                raise schemas.MessageError("invalid_value", f"filter.fields[{row}]", expected, ascii(field)[:80])
+        if not 0 <= asked.min_existence <= 1:
+            raise schemas.MessageError(
+                "invalid_value", "filter.min_existence", "a number in [0, 1]", f"{asked.min_existence:g}"
+            )
+        self._classes = frozenset(asked.classes)
+        self._confirmed = asked.confirmed_only
+        self._min_existence = asked.min_existence
+        self._area = _polygon(asked.area) if asked.HasField("area") else None
+        self._fields = frozenset((*asked.fields, "id")) if asked.fields else None
+
+    def of(self, tracks: schemas.Tracks) -> pb.Tracks:
+        """Return what is wanted of the tracks of a frame."""
+        proto: pb.Tracks = convert.to_proto(tracks, self._columns(tracks) if self.key else None)
+        return proto
+
+    def _columns(self, tracks: schemas.Tracks) -> dict[str, NDArray[Any]]:
+        rows = tracks.existence >= self._min_existence
+        if self._classes:
+            wanted = [number for number, name in enumerate(tracks.labels) if name in self._classes]
+            rows &= np.isin(tracks.label, wanted)
+        if self._confirmed:
+            rows &= (tracks.existence > CONFIRMED_EXISTENCE) & (tracks.age > 0.0)
+        if self._area is not None:
+            rows &= inside(tracks.center[:, :2], self._area)
+        names = tracks.arrays if self._fields is None else self._fields
+        return {name: getattr(tracks, name)[rows] for name in names}
+
+
+class Pace:
+    """Leaves out frames that come sooner than a period after the one before, in sensor time, in each stream.
+
+    What corrects a frame that was let through is let through too.
+
+    Args:
+        max_rate_hz: highest rate; 0: all frames.
+
+    Raises:
+        MessageError: it is no rate.
+    """
+
+    def __init__(self, max_rate_hz: float) -> None:
+        if not 0 <= max_rate_hz < float("inf"):
+            raise schemas.MessageError("invalid_value", "max_rate_hz", "a rate in Hz, or 0", f"{max_rate_hz:g}")
+        self._period_ns = TOLERANCE * 1e9 / max_rate_hz if max_rate_hz else 0.0
+        self._passed: dict[str, collections.deque[int]] = {}
+
+    def passes(self, stream: str, stamp_ns: int) -> bool:
+        """Tell whether the frame of this stamp is sent."""
+        if not self._period_ns:
+            return True
+        passed = self._passed.setdefault(stream, collections.deque(maxlen=REMEMBERED))
+        if stamp_ns in passed:
+            return True
+        if passed and abs(stamp_ns - passed[-1]) < self._period_ns:
+            return False
+        passed.append(stamp_ns)
+        return True
+
+
+def inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which points (N, 2) lie in a polygon (K, 2): those from which a ray along x crosses its edges an odd number
+    of times.
+    """  # noqa: D205 - one sentence
+    x, y = points[:, :1], points[:, 1:]
+    x1, y1 = corners.T
+    x2, y2 = np.roll(corners, -1, axis=0).T
+    crosses = (y1 > y) != (y2 > y)
+    with np.errstate(divide="ignore", invalid="ignore"):  # horizontal edges cross no ray
+        crosses &= x < x1 + (y - y1) / (y2 - y1) * (x2 - x1)
+    odd: NDArray[np.bool_] = np.count_nonzero(crosses, axis=1) % 2 == 1
+    return odd
+
+
+def _polygon(area: pb.Polygon) -> NDArray[np.float64]:
+    if not CORNERS <= len(area.x) <= MAX_CORNERS or len(area.y) != len(area.x):
+        expected = f"x and y of {CORNERS} to {MAX_CORNERS} corners"
+        raise schemas.MessageError("invalid_value", "filter.area", expected, f"{len(area.x)} x and {len(area.y)} y")
+    corners = np.array([area.x, area.y], dtype="f8").T
+    if not np.isfinite(corners).all():
+        raise schemas.MessageError("invalid_value", "filter.area", "finite numbers", "others")
+    return corners

@@ -1,0 +1,217 @@
+"""The gateway as a server: methods, health, reflection, limits of connections, and an end in order."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import grpc
+import optipmb_schemas as schemas
+import structlog
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+
+from optipmb_service.grpc import inputs, outputs, questions
+from optipmb_service.grpc.access import Access
+from optipmb_service.grpc.calls import Call, Gateway
+from optipmb_service.grpc.feeds import Feeds
+from optipmb_service.grpc.metrics import CallMetrics
+from optipmb_service.grpc.status import EndCall, refused
+from optipmb_service.grpc.tls import credentials
+from optipmb_service.runtime.ports import EdgeError, TransportError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from optipmb_service.grpc.calls import Context
+    from optipmb_service.settings import Settings
+    from optipmb_service.zenoh.client import Client
+
+SERVICE: Final = pb.DESCRIPTOR.services_by_name["TrackingService"].full_name
+
+METHODS: Final[dict[str, Callable[[Call], Awaitable[None]]]] = {
+    "Track": inputs.track,
+    "Publish": inputs.publish,
+    "Subscribe": outputs.subscribe,
+    "QueryTracks": outputs.query_tracks,
+    "GetState": questions.get_state,
+    "Reset": questions.reset,
+    "SetParameters": questions.set_parameters,
+    "ListStreams": questions.list_streams,
+}
+
+GRACE_S: Final = 2.0
+"""How long calls may take to finish what is under way at the end."""
+
+LINK_S: Final = 0.5
+"""How often the gateway looks whether it has a router."""
+
+HEADROOM: Final = 64 * 2**10
+"""Bytes of a request beyond its payload."""
+
+OPTIONS: Final = (
+    ("grpc.so_reuseport", 0),  # two gateways on one port would share it without a word
+    ("grpc.keepalive_time_ms", 20_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
+    ("grpc.keepalive_permit_without_calls", 1),
+    ("grpc.http2.min_ping_interval_without_data_ms", 5_000),
+    ("grpc.max_connection_idle_ms", 300_000),
+    ("grpc.server_handshake_timeout_ms", 10_000),
+    ("grpc.max_metadata_size", 16 * 2**10),
+)
+
+log = structlog.get_logger("optipmb_service")
+
+
+class Server:
+    """A gateway that serves; to be made and used on its loop.
+
+    Args:
+        settings: address, certificates, access, limits.
+        client: of the network.
+
+    Raises:
+        EdgeError: the address, the certificates or the access cannot be used.
+    """
+
+    def __init__(self, settings: Settings, client: Client) -> None:
+        self.metrics = CallMetrics()
+        self._client = client
+        self._most = settings.grpc_calls
+        self._access = Access(
+            certificates=settings.grpc_tls is not None, names=settings.grpc_names, tokens=settings.grpc_tokens
+        )
+        self._gateway = Gateway(
+            client,
+            Feeds(client, asyncio.get_running_loop(), self._invalid),
+            settings.instance,
+            settings.limits.limits(),
+            self._refused,
+        )
+        most = settings.limits.max_bytes + HEADROOM
+        options = (
+            *OPTIONS,
+            ("grpc.max_receive_message_length", most),
+            ("grpc.max_send_message_length", -1),
+            ("grpc.max_concurrent_streams", settings.grpc_calls),
+        )
+        self._server = grpc.aio.server(options=options)
+        self._health = health.aio.HealthServicer()
+        self._watching: asyncio.Task[None] | None = None
+        self._register()
+        self.address = self._listen(settings)
+
+    async def start(self) -> None:
+        """Serve."""
+        await self._server.start()
+        self._watching = asyncio.create_task(self._watch())
+
+    async def stop(self) -> None:
+        """Take no calls any more, finish what is under way, and end."""
+        if self._watching is not None:
+            self._watching.cancel()
+        await self._health.enter_graceful_shutdown()
+        for call in tuple(self._gateway.calls):
+            call.end()
+        await self._server.stop(GRACE_S)
+
+    def _register(self) -> None:
+        # On the wire a call with one request is a stream of one: all methods have one kind of handler.
+        handlers: dict[str, grpc.RpcMethodHandler[bytes, bytes]] = {
+            name: grpc.stream_stream_rpc_method_handler(self._handler(name)) for name in METHODS
+        }
+        self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handlers),))
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+        names = (SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME)
+        reflection.enable_server_reflection(names, self._server)
+
+    def _listen(self, settings: Settings) -> str:
+        try:
+            if settings.grpc_tls is None:
+                port = self._server.add_insecure_port(settings.grpc)
+            else:
+                port = self._server.add_secure_port(settings.grpc, credentials(settings.grpc_tls))
+        except RuntimeError as error:
+            raise EdgeError(f"cannot listen on {settings.grpc} for gRPC: is the address in use?") from error
+        return f"{settings.grpc.rpartition(':')[0]}:{port}"
+
+    async def _watch(self) -> None:
+        """Tell the health service whether the network can be used, for ever."""
+        known: bool | None = None
+        while True:
+            linked = self._client.linked()
+            if linked != known:
+                known = linked
+                status = health_pb2.HealthCheckResponse
+                for name in ("", SERVICE):
+                    await self._health.set(name, status.SERVING if linked else status.NOT_SERVING)
+            await asyncio.sleep(LINK_S)
+
+    def _handler(self, name: str) -> Callable[[Any, Context], Awaitable[None]]:
+        async def handle(_requests: Any, context: Context) -> None:
+            began, code = time.monotonic(), "OK"
+            self.metrics.open[name] += 1
+            try:
+                await self._serve(name, context)
+            except EndCall as end:
+                code = end.code.name
+                status = end.status()
+                await context.abort(status.code, status.details, tuple(status.trailing_metadata or ()))
+            except asyncio.CancelledError:
+                code = "CANCELLED"
+                raise
+            finally:
+                self.metrics.open[name] -= 1
+                self.metrics.ended[name, code] += 1
+                log.debug(
+                    "grpc_call", method=name, peer=context.peer(), code=code, seconds=round(time.monotonic() - began, 3)
+                )
+
+        return handle
+
+    async def _serve(self, name: str, context: Context) -> None:
+        """Serve a call.
+
+        Raises:
+            EndCall: it cannot be served, or ends otherwise than by its end.
+        """
+        gateway = self._gateway
+        if len(gateway.calls) >= self._most:
+            raise EndCall(grpc.StatusCode.RESOURCE_EXHAUSTED, f"{self._most} calls are open; try another gateway")
+        call = Call(gateway, context, await self._access.caller(context), name, self.metrics)
+        gateway.calls.add(call)
+        try:
+            await METHODS[name](call)
+        except schemas.MessageError as error:
+            self.metrics.refused[error.code] += 1
+            raise refused(error) from None
+        except TransportError as error:
+            raise EndCall(grpc.StatusCode.UNAVAILABLE, f"the network cannot be used: {error}") from error
+        except (EndCall, asyncio.CancelledError):
+            raise
+        except Exception as error:
+            if context.done():
+                raise asyncio.CancelledError from error  # the caller has gone while it was written to
+            log.exception("internal_error", method=name)
+            raise EndCall(grpc.StatusCode.INTERNAL, "a fault of the gateway; its log has it") from error
+        finally:
+            gateway.calls.discard(call)
+            self.metrics.skipped[name] += call.left_out
+
+    def _refused(self, stream: str, error: schemas.MessageError) -> None:
+        self.metrics.refused[error.code] += 1
+        log.warning(
+            "problem",
+            stream=stream,
+            code=error.code,
+            path=error.path,
+            expected=error.expected,
+            received=error.received,
+            count=1,
+        )
+
+    def _invalid(self, reason: str) -> None:
+        self.metrics.invalid += 1
+        log.warning("grpc_invalid", reason=reason)

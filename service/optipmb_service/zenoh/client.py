@@ -1,0 +1,280 @@
+"""A client of the network, for an edge that speaks for others: publishes inputs, reads outputs, asks.
+
+What it declares is what `optipmb_client` declares for a program of its own, so that nothing on the network can tell the
+two apart. Everything here may be called by any thread; `ask` and `recent` wait for answers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self, cast
+
+import optipmb_schemas as schemas
+import structlog
+import zenoh
+import zenoh.ext
+
+from optipmb_service.runtime.ports import TransportError
+from optipmb_service.zenoh.connection import close, line, opened
+from optipmb_service.zenoh.handles import Undeclared, undeclare
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from optipmb_service.settings import Settings
+
+CHANNEL: Final = 1024
+"""Messages between Zenoh and a draining thread; more than any publisher's history."""
+
+HEARTBEAT_S: Final = 0.2
+"""How long the loss of a newest message may stay unnoticed."""
+
+JOIN_S: Final = 5.0
+
+log = structlog.get_logger("optipmb_service")
+
+
+class _Publisher(Undeclared, Protocol):
+    def put(self, payload: bytes) -> object: ...
+
+
+class _Matching(Protocol):
+    @property
+    def matching_status(self) -> Any: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A message as it came: key, payload, Zenoh encoding; `good` is False for an error reply."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    good: bool = True
+
+
+class Outgoing:
+    """The publishers of one stream's detections and clouds.
+
+    Args:
+        session: to publish on.
+        keys: of the network.
+        stream: its name.
+        cache: detections that are kept for recovery.
+        cache_clouds: clouds that are kept; without any they are sent only while somebody subscribes.
+        wanted: called on any thread, and only to pass it on, when it has changed whether anybody takes clouds.
+
+    Raises:
+        TransportError: the session is closed.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: schemas.Keys,
+        stream: str,
+        cache: int,
+        cache_clouds: int,
+        wanted: Callable[[], None],
+    ) -> None:
+        self._session = session
+        self._matching: _Matching | None = None
+        try:
+            self._detections = self._cached(
+                keys.detections(stream), schemas.Detections, cache, zenoh.Priority.DATA_HIGH, express=True
+            )
+            if cache_clouds:
+                self._points = self._cached(
+                    keys.points(stream), schemas.Points, cache_clouds, zenoh.Priority.DATA_LOW, express=False
+                )
+            else:
+                plain = session.declare_publisher(
+                    keys.points(stream),
+                    encoding=schemas.encoding_of(schemas.Points),
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    priority=zenoh.Priority.DATA_LOW,
+                )
+                self._points, self._matching = cast("_Publisher", plain), cast("_Matching", plain)
+                plain.declare_matching_listener(lambda _status: wanted())
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
+
+    @property
+    def points_wanted(self) -> bool:
+        """Whether anybody is known to take clouds; always with a cache, which serves those who come later."""
+        return self._matching is None or bool(self._matching.matching_status.matching)
+
+    def detections(self, payload: bytes) -> None:
+        """Send encoded detections.
+
+        Raises:
+            TransportError: the publisher is withdrawn.
+        """
+        self._put(self._detections, payload)
+
+    def points(self, payload: bytes) -> None:
+        """Send an encoded cloud.
+
+        Raises:
+            TransportError: the publisher is withdrawn.
+        """
+        self._put(self._points, payload)
+
+    def close(self) -> None:
+        """Withdraw both."""
+        undeclare(self._detections)
+        undeclare(self._points)
+
+    def _cached(
+        self, key: str, kind: type[schemas.Message], cache: int, priority: zenoh.Priority, *, express: bool
+    ) -> _Publisher:
+        return zenoh.ext.declare_advanced_publisher(
+            self._session,
+            key,
+            encoding=schemas.encoding_of(kind),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=priority,
+            express=express,
+            cache=zenoh.ext.CacheConfig(cache),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
+            publisher_detection=True,
+        )
+
+    @staticmethod
+    def _put(publisher: _Publisher, payload: bytes) -> None:
+        try:
+            publisher.put(payload)
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
+
+
+class Subscription:
+    """A key expression whose messages a thread hands over; what was lost is recovered from the publishers' caches.
+
+    Args:
+        session: to subscribe on.
+        key: the key expression.
+        receive: called for each message, one after the other.
+
+    Raises:
+        TransportError: the session is closed.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, receive: Callable[[Message], None]) -> None:
+        try:
+            self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+                session,
+                key,
+                zenoh.handlers.FifoChannel(CHANNEL),
+                recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+            )
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
+        self._receive = receive
+        self._thread = threading.Thread(
+            target=self._drain, args=(self._subscriber.handler,), name=f"reader {key}", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """End it; nothing is handed over afterwards."""
+        undeclare(self._subscriber)
+        self._thread.join(JOIN_S)
+
+    def _drain(self, handler: Any) -> None:
+        with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
+            for sample in handler:
+                if sample.kind == zenoh.SampleKind.PUT:
+                    try:
+                        self._receive(_message(sample))
+                    except Exception:
+                        log.exception("internal_error", reader="subscription")  # one message must not end the reading
+
+
+class Client:
+    """A session as edges use it.
+
+    Args:
+        session: where everything is declared.
+        prefix: first chunks of all keys.
+    """
+
+    def __init__(self, session: zenoh.Session, prefix: str) -> None:
+        self.keys = schemas.Keys(prefix)
+        self._session = session
+
+    @classmethod
+    def opened(cls, settings: Settings) -> Self:
+        """Open a session of one's own; waits for a router.
+
+        Raises:
+            TransportError: an endpoint or the configuration cannot be used.
+        """
+        return cls(opened(settings), settings.prefix)
+
+    def close(self) -> None:
+        """Close the session."""
+        close(self._session)
+
+    def linked(self) -> bool:
+        """Whether the session has a router."""
+        return bool(self._session.info.routers_zid())
+
+    def publish(self, stream: str, cache: int, cache_clouds: int, wanted: Callable[[], None]) -> Outgoing:
+        """Open the publishers of a stream; arguments and errors are those of `Outgoing`."""
+        return Outgoing(self._session, self.keys, stream, cache, cache_clouds, wanted)
+
+    def subscribe(self, key: str, receive: Callable[[Message], None]) -> Subscription:
+        """Hand over what is published from now on under a key expression, on a thread of its own."""
+        return Subscription(self._session, key, receive)
+
+    def recent(self, key: str, timeout: float) -> list[Message]:
+        """Return what the caches of advanced publishers hold under a key expression, those of a publisher in order.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        return [one for one in self.ask(f"{key}/@adv/**", timeout=timeout) if one.good]
+
+    def ask(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float) -> list[Message]:
+        """Ask everybody who answers at a key; nothing when nobody did in time (s).
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        answers = []
+        try:
+            for reply in self._session.get(
+                key,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,  # the default keeps one reply per key: of two services one
+                accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
+                timeout=timeout,
+                payload=payload or None,
+                encoding=encoding or None,
+            ):
+                if (sample := reply.ok) is not None:
+                    answers.append(_message(sample))
+                elif (error := reply.err) is not None and (said := error.payload.to_bytes()) != b"Timeout":
+                    answers.append(Message(key, said, str(error.encoding), good=False))
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
+        return answers
+
+    def alive(self, pattern: str, timeout: float) -> list[str]:
+        """Return the keys of the liveliness tokens under a pattern, sorted.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        try:
+            replies = self._session.liveliness().get(pattern, timeout=timeout)
+            return sorted({str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None})
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
+
+
+def _message(sample: zenoh.Sample) -> Message:
+    return Message(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))

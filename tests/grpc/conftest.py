@@ -1,0 +1,43 @@
+"""A service with its own router and a gateway beside it, as processes, for the tests of a module."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from gateway import GatewayProcess
+from service_process import ServiceProcess
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+NUMBERS = itertools.count()
+
+
+@pytest.fixture(scope="module")
+def service() -> Iterator[ServiceProcess]:
+    """A service with its own router."""
+    with ServiceProcess() as process:
+        process.wait_ready()
+        yield process
+
+
+@pytest.fixture(scope="module")
+def gateway(service: ServiceProcess) -> Iterator[GatewayProcess]:
+    """A gateway of that service."""
+    with GatewayProcess(service.endpoint) as process:
+        process.wait_ready()
+        yield process
+
+
+@pytest.fixture
+def stub(gateway: GatewayProcess) -> Any:
+    """The generated stub on a channel of its own."""
+    return gateway.stub()
+
+
+@pytest.fixture
+def stream() -> str:
+    """A stream that no other test uses."""
+    return f"garage/robot-{next(NUMBERS)}/lidar"

@@ -1,0 +1,163 @@
+"""`Track`: what goes in is what a native publisher sends, what comes back is what a native subscriber gets."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from typing import TYPE_CHECKING, Any, Self
+
+import grpc
+import numpy as np
+import pytest
+import zenoh
+from gateway import detections, frame, points
+from google.rpc import error_details_pb2
+from grpc_status import rpc_status
+from optipmb_client import Publisher
+from optipmb_schemas import Detections, Keys, Points, Tracks, decode, encode
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+from routers import open_client
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from service_process import ServiceProcess
+
+KEYS = Keys()
+DEADLINE_S = 30.0
+
+
+class Heard:
+    """What a plain Zenoh session hears of some keys."""
+
+    def __init__(self, endpoint: str, *keys: str) -> None:
+        self.session = open_client(endpoint)
+        self._samples = [self.session.declare_subscriber(key, zenoh.handlers.FifoChannel(4096)) for key in keys]
+        list(self.session.liveliness().get(KEYS.all_alive()))  # the router has taken the subscriptions
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
+
+    def take(self, number: int, at: int = 0) -> list[bytes]:
+        """The next payloads."""
+        ends, payloads = time.monotonic() + DEADLINE_S, []
+        while len(payloads) < number:
+            sample = self._samples[at].try_recv()
+            assert time.monotonic() < ends, f"{len(payloads)} of {number}"
+            payloads += [] if sample is None else [sample.payload.to_bytes()]
+            time.sleep(0 if sample else 0.002)
+        return payloads
+
+
+def violation(raised: pytest.ExceptionInfo[grpc.RpcError]) -> Any:
+    """The field at fault, from the details of a status."""
+    status = rpc_status.from_call(raised.value)
+    details = error_details_pb2.BadRequest()
+    assert status is not None
+    assert status.details[0].Unpack(details)
+    return details.field_violations[0]
+
+
+def test_tracks_are_those_on_zenoh(service: ServiceProcess, stub: Any, stream: str) -> None:
+    """The tracks of every frame come back, byte-equal, as msgpack, to what was published on Zenoh."""
+    with Heard(service.endpoint, KEYS.tracks(stream)) as heard:
+        responses = list(stub.Track(detections(frame(seq, stream)) for seq in range(40)))
+        published = heard.take(40)
+    assert [encode(convert.from_proto(one.tracks, Tracks)) for one in responses] == published
+    assert [one.tracks.seq for one in responses] == list(range(40))
+    assert len(convert.from_proto(responses[-1].tracks, Tracks).id) == 2
+
+
+def test_what_is_published_is_what_the_client_library_publishes(
+    service: ServiceProcess, stub: Any, stream: str
+) -> None:
+    """Detections and a cloud in the sensor frame are on Zenoh, byte for byte, as `Publisher` would have sent them."""
+    car: dict[str, Any] = {"label": ["car"], "center": [[1, 2, 0.8]], "size": [[4.5, 1.9, 1.6]], "yaw": [0.5]}
+    pose = ([1.0, 2.0, 3.0], [1.0, 0.0, 0.0, 0.0])
+    cloud = np.linspace(0, 50, 30_000, dtype="f4").reshape(-1, 3)
+    with Heard(service.endpoint, KEYS.detections(stream), KEYS.points(stream)) as heard:
+        with Publisher(stream, service.endpoint) as publisher:
+            publisher.publish(
+                stamp_ns=10**18, **car, score=[0.9], velocity=[[1, 0]], pose=pose, points=cloud, has_points=True
+            )
+            native = (*heard.take(1), *heard.take(1, at=1))
+        requests = [
+            points(decode(native[1], Points)),
+            detections(decode(native[0], Detections)),
+        ]
+        list(stub.Track(iter(requests)))
+        assert (*heard.take(1), *heard.take(1, at=1)) == native
+
+
+def test_tracks_with_clouds_are_those_without_gateway(service: ServiceProcess, stub: Any, stream: str) -> None:
+    """Frames that announce a cloud are tracked with it."""
+    del service
+    box = np.array([[0.0, 0.0, 0.8], [0.5, 0.2, 0.9]], dtype="f4")
+    stub.SetParameters(pb.SetParametersRequest(stream=stream, parameters=pb.SessionParameters(cloud_wait_s=5.0)))
+
+    def requests() -> Iterator[pb.TrackRequest]:
+        for seq in range(10):
+            one = frame(seq, stream, has_points=True)
+            cloud = Points(
+                stream=stream, epoch=one.epoch, seq=seq, stamp_ns=one.stamp_ns, frame="world", xyz=box + np.float32(seq)
+            )
+            yield points(cloud)
+            yield detections(one)
+
+    responses = list(stub.Track(requests()))
+    assert [one.tracks.cloud_used for one in responses] == [True] * 10
+
+
+def test_a_refused_frame_is_a_problem_and_the_stream_goes_on(stub: Any, stream: str) -> None:
+    """A value that is not allowed is answered by a problem with its path; the frames around it are tracked."""
+    bad = detections(frame(1, stream))
+    bad.detections.score.data = np.array([0.5, 1.5]).tobytes()
+    requests = [detections(frame(0, stream)), bad, detections(frame(2, stream))]
+    responses = list(stub.Track(iter(requests)))
+    problems = [one.problem for one in responses if one.WhichOneof("response") == "problem"]
+    assert {one.tracks.seq for one in responses if one.WhichOneof("response") == "tracks"} == {0, 2}
+    assert [(problem.code, problem.path, problem.seq) for problem in problems] == [("invalid_value", "score[1]", 1)]
+    assert problems[0].expected == "a number in (0, 1]"
+
+
+def test_a_caller_that_comes_back_gets_what_was_tracked(stub: Any, stream: str) -> None:
+    """Frames that are sent again by a caller that lost its call are answered, and not tracked twice."""
+    epoch = secrets.token_bytes(16)
+    first = list(stub.Track(detections(frame(seq, stream, epoch)) for seq in range(20)))
+    again = list(stub.Track(detections(frame(seq, stream, epoch)) for seq in range(10, 30)))
+    assert [one.tracks.seq for one in again] == list(range(10, 30))
+    assert [one.SerializeToString() for one in again[:10]] == [one.SerializeToString() for one in first[10:]]
+    assert stub.GetState(pb.GetStateRequest(stream=stream)).state.frames == 30
+
+
+@pytest.mark.parametrize(
+    ("second", "path"),
+    [
+        (lambda: detections(frame(1, "another/robot/lidar")), "detections.stream"),
+        (pb.TrackRequest, "request"),
+    ],
+)
+def test_what_is_no_message_of_the_call_ends_it(stub: Any, stream: str, second: Any, path: str) -> None:
+    """Another stream, or nothing at all, is INVALID_ARGUMENT with the path of the field."""
+    with pytest.raises(grpc.RpcError) as raised:
+        list(stub.Track(iter([detections(frame(0, stream)), second()])))
+    assert raised.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+    assert violation(raised).field == path
+
+
+def test_bytes_that_are_no_protobuf(gateway: Any) -> None:
+    """They end the call as INVALID_ARGUMENT, malformed."""
+    call = grpc.insecure_channel(gateway.address).stream_stream("/optipmb.v1.TrackingService/Track")
+    with pytest.raises(grpc.RpcError) as raised:
+        list(call(iter([b"\xff\xff\xff\xff"])))
+    assert raised.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+    assert violation(raised).reason == "MALFORMED"
+
+
+def test_a_call_without_a_message_ends(stub: Any) -> None:
+    """Nothing in, nothing out, no error."""
+    assert list(stub.Track(iter([]))) == []

@@ -1,0 +1,69 @@
+"""A real gateway in a process of its own, and what tests say to it with the generated stubs alone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import grpc
+import numpy as np
+from optipmb_schemas import Detections, Points
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
+from routers import free_endpoint
+from service_process import ServiceProcess
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+EPOCH = bytes(range(16))
+STREAM = "garage/robot-1/lidar"
+
+
+class GatewayProcess(ServiceProcess):
+    """`optipmb-service grpc` on a free port, a client of a router.
+
+    Args:
+        router: its endpoint.
+        options: further ones.
+        environment: variables.
+    """
+
+    def __init__(self, router: str, *options: str, environment: Mapping[str, str] | None = None) -> None:
+        port = free_endpoint().rpartition(":")[2]
+        self.address = f"127.0.0.1:{port}"
+        super().__init__(
+            "grpc", "--connect", router, "--grpc", self.address, *options, environment=environment, listen=False
+        )  # fmt: skip
+
+    def stub(self) -> Any:
+        """The generated stub on a channel of its own."""
+        return rpc.TrackingServiceStub(grpc.insecure_channel(self.address))
+
+
+def frame(seq: int, stream: str = STREAM, epoch: bytes = EPOCH, **changes: Any) -> Detections:
+    """A car that drives along x at 10 m/s and a pedestrian who stands, seen ten times a second."""
+    fields: dict[str, Any] = {
+        "stream": stream,
+        "epoch": epoch,
+        "seq": seq,
+        "stamp_ns": 10**18 + seq * 10**8,
+        "frame": "world",
+        "labels": ("car", "pedestrian"),
+        "label": np.array([0, 1]),
+        "center": np.array([[seq * 1.0, 0.0, 0.8], [5.0, 20.0, 0.9]]),
+        "size": np.array([[4.5, 1.9, 1.6], [0.6, 0.7, 1.8]]),
+        "yaw": np.zeros(2),
+        "score": np.array([0.9, 0.8]),
+    }
+    return Detections(**fields | changes)
+
+
+def detections(message: Detections, kind: Any = pb.TrackRequest) -> Any:
+    """A request with detections."""
+    return kind(detections=convert.to_proto(message))
+
+
+def points(message: Points, kind: Any = pb.TrackRequest) -> Any:
+    """A request with a cloud."""
+    return kind(points=convert.to_proto(message))
