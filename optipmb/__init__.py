@@ -13,11 +13,13 @@
 Pure computation: no files but the profiles, no network, no state outside the density.
 """
 
+from optipmb.class_names import common_name, like
 from optipmb.columns import columns_of, density_of
 from optipmb.density import Bernoullis, Density, Poissons
 from optipmb.errors import DensityError, EffortError, FrameError, OptipmbError, ParameterError
 from optipmb.extract import Tracks
 from optipmb.frame import Frame, PointCloud, Pose, make_frame
+from optipmb.generic import generic_parameters
 from optipmb.geometry import bev_iou
 from optipmb.parameters import (
     Calibration,
@@ -56,7 +58,10 @@ __all__ = [
     "Tracks",
     "bev_iou",
     "columns_of",
+    "common_name",
     "density_of",
+    "generic_parameters",
+    "like",
     "load_profile",
     "make_frame",
     "parse_parameters",

@@ -7,8 +7,9 @@ import numpy as np
 
 from optipmb_client.datasets import DataSequence
 from optipmb_client.evaluation import ClassResult
+from optipmb_client.evaluation.tracks import read_tracks
 from optipmb_client.pictures import draw_tracks
-from optipmb_client.results import ResultTable, read_kitti_results
+from optipmb_client.results import ResultTable
 
 __all__ = ["draw_results"]
 
@@ -25,7 +26,7 @@ def draw_results(
     Args:
         picture: The PNG file.
         sequence: What was tracked.
-        folder: Where its result file is.
+        folder: Where its result file is, or a table of tracks.
         results: Figures of the classes; their misses and identity changes are marked.
         score: Least mean score of the tracks that are shown; default: the best threshold of each class, by `results`.
 
@@ -33,7 +34,7 @@ def draw_results(
         DatasetError: There is no such result file, or it is wrong.
         ClientError: matplotlib is not installed.
     """
-    table = read_kitti_results(folder / f"{sequence.name}.txt").to_world(sequence.poses)
+    table = read_tracks(folder, sequence).to_world(sequence.poses)
     shown = _from_score(table, results, score)
     best = [result.sweep.results[result.sweep.best] for result in results]
     draw_tracks(picture, sequence, shown, sequence.truth(), best)

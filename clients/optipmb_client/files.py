@@ -95,7 +95,7 @@ def _number(path: Path, line: int, field: str) -> float:
 
 
 class AtomicText:
-    """A text file that appears under its name all at once, when it is closed.
+    """A file, of text as a rule, that appears under its name all at once, when it is closed.
 
     Until then its lines stand in a temporary file in the same folder; `discard` removes that one and leaves what was
     there.
@@ -111,6 +111,11 @@ class AtomicText:
     def write(self, text: str) -> None:
         """Append text."""
         self._file.write(text)
+
+    def write_bytes(self, data: bytes) -> None:
+        """Append bytes."""
+        self._file.flush()
+        self._file.buffer.write(data)
 
     def close(self) -> None:
         """Put the file in its place; a second call does nothing."""

@@ -3,10 +3,15 @@
 It gives the same bytes as replaying the dataset through the service (`optipmb_client.replay`).
 """
 
+import concurrent.futures.process
+import itertools
+import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
+from typing import Final
 
 from optipmb import (
     Modules,
@@ -16,16 +21,39 @@ from optipmb import (
     Pose,
     Tracker,
     Tracks,
+    generic_parameters,
+    like,
     load_profile,
     make_frame,
     warm_up,
 )
-from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame
-from optipmb_client.errors import UsageError
+from optipmb_client.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame
+from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.geometry import Floats, Ints
-from optipmb_client.recording import Latency, latency, selected_frames, write_results
+from optipmb_client.recording import Latency, Results, latency, selected_frames
 
-__all__ = ["NamedTracks", "TrackedSequence", "read_profile", "track", "track_sequence", "warm_up"]
+__all__ = [
+    "AUTO",
+    "NamedTracks",
+    "TrackedSequence",
+    "doubts",
+    "profile_for",
+    "read_profile",
+    "track",
+    "track_sequence",
+    "warm_up",
+]
+
+AUTO: Final = "auto"
+"""Name of the profile that is made for the data: rate, classes and scores as they come."""
+USUAL_PERIOD: Final = 0.1
+FAR: Final = 1.6
+"""A rate so many times that of the profile, or a part of it, is far from it."""
+LOOKED_AT: Final = 20
+"""Sequences, and"""
+LOOKED_INTO: Final = 300
+"""frames of each that tell rate and scores."""
+ATTEMPTS: Final = 3
 
 
 @dataclass(frozen=True)
@@ -114,9 +142,35 @@ class TrackedSequence:
     file: Path
     frames: int
     clouds: int
+    detections: int
+    left_out: int
+    """Detections of classes that the profile lacks."""
     tracks: int
     seconds: float
     step: Latency | None
+
+
+@dataclass(frozen=True)
+class Job:
+    """One sequence and how it is tracked; can be sent to another process."""
+
+    data: DatasetArguments | None
+    sequence: str
+    parameters: Parameters
+    classes: tuple[str, ...] = ()
+    modules: Modules | None = None
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """The tracks of one sequence by frame index, and what they took."""
+
+    tracks: dict[int, NamedTracks]
+    clouds: int
+    detections: int
+    left_out: int
+    steps_ns: tuple[int, ...]
+    seconds: float
 
 
 def read_profile(profile: str) -> Parameters:
@@ -131,10 +185,73 @@ def read_profile(profile: str) -> Parameters:
         raise UsageError(f"--profile {profile}: {error}") from error
 
 
+def profile_for(profile: str, sequences: Sequence[DataSequence]) -> Parameters:
+    """Return a profile by name or file, or for `auto` one that is made for these sequences.
+
+    Raises:
+        UsageError: There is none, or its content is not valid, or it has no class of the sequences.
+    """
+    parameters = _made_for(sequences) if profile == AUTO else read_profile(profile)
+    labels = tuple(dict.fromkeys(label for one in sequences for label in one.labels))
+    if labels and not set(labels) & set(parameters.labels):
+        raise UsageError(
+            f"--profile {profile}: it has the classes {', '.join(parameters.labels)}, and the detections are of "
+            f"{', '.join(labels)}: nothing would be tracked{_renamed(labels, parameters.labels)}"
+        )
+    return parameters
+
+
+def doubts(parameters: Parameters, sequences: Sequence[DataSequence]) -> Iterator[str]:
+    """Yield what does not fit between a profile and the sequences, a line each."""
+    missing = [
+        name for name in dict.fromkeys(n for one in sequences for n in one.labels) if name not in parameters.classes
+    ]
+    if missing:
+        hint = _renamed(missing, parameters.labels)
+        yield f"profile {parameters.name} does not track {', '.join(missing)}: left out{hint}"
+    period, nominal = _period(sequences), parameters.nominal_period
+    if period is not None and not 1.0 / FAR <= period / nominal <= FAR:
+        yield (
+            f"frames come at {1.0 / period:.3g} Hz, profile {parameters.name} is for {1.0 / nominal:.3g} Hz: "
+            "--profile auto, or a profile tuned at this rate, may track better"
+        )
+
+
+def _renamed(labels: Sequence[str], known: tuple[str, ...]) -> str:
+    pairs = [f"--option class.{name}={alike}" for name in labels if (alike := like(name, known)) is not None]
+    return f" ({' '.join(pairs)} renames classes of a table; --profile auto takes any)" if pairs else ""
+
+
+def _period(sequences: Sequence[DataSequence]) -> float | None:
+    """Return the median time in seconds between neighbouring frames at the start of the first sequences."""
+    steps = [
+        (after.stamp_ns - before.stamp_ns) / 1e9
+        for one in sequences[:LOOKED_AT]
+        for before, after in itertools.pairwise(itertools.islice(one.frames(), LOOKED_INTO))
+    ]
+    return median(steps) or None if steps else None
+
+
+def _made_for(sequences: Sequence[DataSequence]) -> Parameters:
+    labels = tuple(dict.fromkeys(label for one in sequences for label in one.labels))
+    scores: dict[str, list[float]] = {label: [] for label in labels}
+    for one in sequences[:LOOKED_AT]:
+        for frame in itertools.islice(one.frames(), LOOKED_INTO):
+            for label, score in zip(frame.label.tolist(), frame.score.tolist(), strict=True):
+                scores[frame.labels[label]].append(score)
+    try:
+        return generic_parameters(labels or ("object",), _period(sequences) or USUAL_PERIOD, scores)
+    except OptipmbError as error:
+        raise UsageError(f"--profile {AUTO}: {error}") from error
+
+
 def track_sequence(
     parameters: Parameters, sequence: DataSequence, classes: Sequence[str] = (), modules: Modules | None = None
-) -> Iterator[tuple[DetectionFrame, NamedTracks, int]]:
-    """Track one sequence; yield each frame with its tracks and the nanoseconds that the step took.
+) -> Iterator[tuple[DetectionFrame, NamedTracks, int, int]]:
+    """Track one sequence.
+
+    Yields each frame with its tracks, how many detections were left out because the profile lacks their class, and the
+    nanoseconds that the step took.
 
     Raises:
         UsageError: A frame holds values that the tracker refuses.
@@ -145,7 +262,7 @@ def track_sequence(
     for given in selected_frames(sequence, classes):
         try:
             cloud = given.cloud
-            frame, _ = make_frame(
+            frame, left_out = make_frame(
                 parameters,
                 stamp_ns=given.stamp_ns,
                 labels=given.labels,
@@ -164,40 +281,114 @@ def track_sequence(
         result = tracker.step(density, frame)
         took = time.perf_counter_ns() - begun
         density = result.density
-        yield given, NamedTracks(result.tracks, names), took
+        yield given, NamedTracks(result.tracks, names), left_out, took
 
 
-def track(
+def run(job: Job, sequence: DataSequence | None = None, on_frame: Callable[[], None] = lambda: None) -> Tracked:
+    """Track one sequence; it is opened where it is not given.
+
+    Raises:
+        UsageError: A frame holds values that the tracker refuses.
+        DatasetError: The sequence cannot be read.
+    """
+    warm_up()
+    if sequence is None:
+        if job.data is None:
+            raise UsageError("several processes need to know which data to open")
+        (sequence,) = job.data.open().sequences([job.sequence])
+    begun = time.monotonic()
+    results: dict[int, NamedTracks] = {}
+    steps: list[int] = []
+    clouds = detections = left_out = 0
+    for frame, tracks, missed, took in track_sequence(job.parameters, sequence, job.classes, job.modules):
+        results[frame.index] = tracks
+        steps.append(took)
+        clouds += frame.cloud is not None
+        detections += len(frame)
+        left_out += missed
+        on_frame()
+    return Tracked(results, clouds, detections, left_out, tuple(steps), time.monotonic() - begun)
+
+
+def track(  # noqa: PLR0913  one argument per decision of the caller
     dataset: Dataset,
     sequences: Sequence[DataSequence],
     out: Path,
     *,
-    profile: str,
+    parameters: Parameters,
+    data: DatasetArguments | None = None,
     classes: Sequence[str] = (),
     modules: Modules | None = None,
     full: bool = False,
+    jobs: int = 1,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Iterator[TrackedSequence]:
-    """Track sequences one after the other and write the result file of each into `out`; yield each when it is done.
+    """Track sequences in `jobs` processes and write their results into `out`, a folder or a table.
 
-    With `full`, all that is known of the tracks is written too, beside each result file.
+    Yields each sequence when it is done and written, in their order. With `full`, all that is known of the tracks is
+    written too. The results are the same bytes with any number of processes.
 
     Raises:
-        UsageError: No such profile or class, or values that the tracker refuses.
+        UsageError: No such class, or values that the tracker refuses.
     """
-    parameters = read_profile(profile)
-    warm_up()
-    for sequence in sequences:
-        begun = time.monotonic()
-        results: dict[int, NamedTracks] = {}
-        steps: list[int] = []
-        clouds = 0
-        for frame, tracks, took in track_sequence(parameters, sequence, classes, modules):
-            results[frame.index] = tracks
-            steps.append(took)
-            clouds += frame.cloud is not None
-            on_frame()
-        file = write_results(dataset, sequence, out, results, full=full)
-        identities = {int(number) for tracks in results.values() for number in tracks.id}
-        seconds = time.monotonic() - begun
-        yield TrackedSequence(sequence.name, file, len(results), clouds, len(identities), seconds, latency(steps))
+    results = Results(dataset, out, full=full)
+    work = [Job(data, sequence.name, parameters, tuple(classes), modules) for sequence in sequences]
+    done = (
+        run_jobs(work, jobs)
+        if jobs > 1
+        else (run(job, one, on_frame) for job, one in zip(work, sequences, strict=True))
+    )
+    for sequence, tracked in zip(sequences, done, strict=True):
+        file = results.write(sequence, tracked.tracks)
+        identities = {int(number) for tracks in tracked.tracks.values() for number in tracks.id}
+        if jobs > 1:
+            for _ in tracked.tracks:
+                on_frame()
+        yield TrackedSequence(
+            sequence.name,
+            file,
+            len(tracked.tracks),
+            tracked.clouds,
+            tracked.detections,
+            tracked.left_out,
+            len(identities),
+            tracked.seconds,
+            latency(tracked.steps_ns),
+        )
+    results.close()
+
+
+def run_jobs(work: Sequence[Job], jobs: int) -> Iterator[Tracked]:
+    """Run jobs in so many processes; yield what they gave, in their order.
+
+    A process that dies takes no result with it: what was not done is done again by new processes, three times at most.
+
+    Raises:
+        UsageError, DatasetError: as `run`.
+        ClientError: the processes died again and again.
+    """
+    done: dict[int, Tracked] = {}
+    following = 0
+    for _ in range(ATTEMPTS):
+        left = [place for place in range(following, len(work)) if place not in done]
+        context = multiprocessing.get_context("spawn")  # a fork would copy the threads' locks of the libraries here
+        with concurrent.futures.ProcessPoolExecutor(min(jobs, len(left)), context) as pool:
+            futures = {place: pool.submit(run, work[place]) for place in left}
+            try:
+                while following < len(work):
+                    if following not in done:
+                        done[following] = futures[following].result()
+                    yield done.pop(following)
+                    following += 1
+            except concurrent.futures.process.BrokenProcessPool:
+                for place, future in futures.items():
+                    if place >= following and future.done() and future.exception() is None:
+                        done[place] = future.result()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+            else:
+                return
+    raise ClientError(
+        f"sequence {work[following].sequence}: its process died {ATTEMPTS} times; it may need more memory"
+    )

@@ -12,8 +12,10 @@ import numpy as np
 from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame, Truth
 from optipmb_client.errors import UsageError
 from optipmb_client.results.full import FullRows, full_path, write_full
+from optipmb_client.results.table import TrackColumns, join
+from optipmb_client.table_files import Columns, is_table, write_table
 
-__all__ = ["Latency", "Preloaded", "latency", "selected_frames", "write_results"]
+__all__ = ["Latency", "Preloaded", "Results", "latency", "selected_frames"]
 
 
 @dataclass(frozen=True)
@@ -83,18 +85,40 @@ def selected_frames(sequence: DataSequence, classes: Sequence[str]) -> Iterator[
         )
 
 
-def write_results(
-    dataset: Dataset, sequence: DataSequence, out: Path, tracks: Mapping[int, FullRows], *, full: bool = False
-) -> Path:
-    """Write the result file of a sequence from its tracks by frame index, in order of frames; return its path.
+class Results:
+    """Where the tracks of a run go: a result file for each sequence in a folder, or one table of all of them.
 
-    With `full`, a file with all columns is put beside it; without, one of an earlier run is removed.
+    Args:
+        dataset: What was tracked; it knows the format of its result files.
+        out: The folder, or a file with the suffix of a table.
+        full: Whether all that is known of the tracks is written: into a file beside each result file, or into further
+            columns of the table; what an earlier run left beside a result file is removed otherwise.
     """
-    with dataset.writer(out, sequence) as writer:
-        for index in sorted(tracks):
-            writer.add(index, sequence.poses[index], tracks[index])
-    if full:
-        write_full(full_path(writer.path), tracks)
-    else:
-        full_path(writer.path).unlink(missing_ok=True)
-    return writer.path
+
+    def __init__(self, dataset: Dataset, out: Path, *, full: bool = False) -> None:
+        self._dataset = dataset
+        self._out = out
+        self._full = full
+        self._parts: dict[str, Columns] | None = {} if is_table(out) and not out.is_dir() else None
+
+    def write(self, sequence: DataSequence, tracks: Mapping[int, FullRows]) -> Path:
+        """Take the tracks of a sequence by frame index; return the file that they are written into."""
+        if self._parts is not None:
+            columns = TrackColumns(sequence, full=self._full)
+            for index, one in tracks.items():
+                columns.add(index, one)
+            self._parts[sequence.name] = columns.columns()
+            return self._out
+        with self._dataset.writer(self._out, sequence) as writer:
+            for index in sorted(tracks):
+                writer.add(index, sequence.poses[index], tracks[index])
+        if self._full:
+            write_full(full_path(writer.path), tracks)
+        else:
+            full_path(writer.path).unlink(missing_ok=True)
+        return writer.path
+
+    def close(self) -> None:
+        """Write the table, in the order of the names of the sequences."""
+        if self._parts:
+            write_table(self._out, join([self._parts[name] for name in sorted(self._parts)]))

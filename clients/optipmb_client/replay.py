@@ -21,7 +21,7 @@ from optipmb_schemas import PREFIX, Problem, SessionParameters, Tracks
 
 from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame
 from optipmb_client.publisher import Publisher
-from optipmb_client.recording import Latency, latency, selected_frames, write_results
+from optipmb_client.recording import Latency, Results, latency, selected_frames
 from optipmb_client.sessions import close_session, set_parameters
 from optipmb_client.subscriber import Subscriber
 from optipmb_client.transport import Connection
@@ -92,7 +92,7 @@ def replay(  # noqa: PLR0913  one argument per decision of the caller
     full: bool = False,
     on_frame: Callable[[], None] = lambda: None,
 ) -> list[ReplayedSequence]:
-    """Replay sequences, `streams` of them at once, and write the result file of each into `out`.
+    """Replay sequences, `streams` of them at once, and write the results into `out`, a folder or a table.
 
     With `full`, all that is known of the tracks is written too, beside each result file.
 
@@ -102,7 +102,8 @@ def replay(  # noqa: PLR0913  one argument per decision of the caller
         UsageError: No such class.
     """
     run = f"{dataset.name}-{secrets.token_hex(3)}"
-    task = _Task(connection, dataset, out, profile, pace, classes, prefix, full, on_frame)
+    results = Results(dataset, out, full=full)
+    task = _Task(connection, results, profile, pace, classes, prefix, on_frame)
     work = [_Replay(task, sequence, f"replay/{run}/{sequence.name}") for sequence in sequences]
     with concurrent.futures.ThreadPoolExecutor(max_workers=streams, thread_name_prefix="replay") as pool:
         futures = [pool.submit(_replay_and_write, one) for one in work]
@@ -116,6 +117,7 @@ def replay(  # noqa: PLR0913  one argument per decision of the caller
             task.stop.set()
             pool.shutdown(cancel_futures=True)
             raise
+    results.close()
     return [future.result() for future in futures]
 
 
@@ -125,7 +127,7 @@ def _replay_and_write(one: "_Replay") -> ReplayedSequence:
     if one.task.stop.is_set():
         raise concurrent.futures.CancelledError
     seconds = time.monotonic() - begun
-    file = write_results(one.task.dataset, one.sequence, one.task.out, one.results, full=one.task.full)
+    file = one.task.results.write(one.sequence, one.results)
     return ReplayedSequence(
         name=one.sequence.name,
         stream=one.stream,
@@ -149,13 +151,11 @@ class _Task:
     """What the sequences of one replay share."""
 
     connection: Connection
-    dataset: Dataset
-    out: Path
+    results: Results
     profile: str
     pace: Pace
     classes: Sequence[str]
     prefix: str
-    full: bool
     on_frame: Callable[[], None]
     stop: threading.Event = field(default_factory=threading.Event)
 

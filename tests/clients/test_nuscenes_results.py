@@ -14,7 +14,7 @@ from nuscenes_tables import box, crowd, write_detections, write_root
 from optipmb_client import Connection
 from optipmb_client.datasets import DatasetError
 from optipmb_client.datasets.nuscenes import NuScenesDataset
-from optipmb_client.offline import track
+from optipmb_client.offline import read_profile, track
 from optipmb_client.replay import Pace, replay
 from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES, read_nuscenes_results, result_table
 
@@ -185,7 +185,7 @@ def test_offline_tracking_writes_it(root: Path, tmp_path: Path) -> None:
     """Tracking the dataset with its own profile gives a file that can be read, with all samples."""
     dataset = NuScenesDataset(root)
     sequences = dataset.sequences(["all"])
-    done = list(track(dataset, sequences, tmp_path, profile=dataset.profile))
+    done = list(track(dataset, sequences, tmp_path, parameters=read_profile(dataset.profile)))
     assert [result.frames for result in done] == [6, 5]
     results = read_nuscenes_results(tmp_path)
     assert all(token in results for sequence in sequences for token in sequence.samples)

@@ -21,7 +21,7 @@ def test_the_same_data_give_the_same_bytes(dataset: Dataset, tmp_path: Path) -> 
     """Two runs write the same file, and it is not empty."""
     files = []
     for run in ("one", "two"):
-        (result,) = track(dataset, dataset.sequences(["0000"]), tmp_path / run, profile="kitti")
+        (result,) = track(dataset, dataset.sequences(["0000"]), tmp_path / run, parameters=read_profile("kitti"))
         files.append(result.file.read_bytes())
     assert files[0] == files[1]
     assert len(files[0].splitlines()) > 40
@@ -30,7 +30,13 @@ def test_the_same_data_give_the_same_bytes(dataset: Dataset, tmp_path: Path) -> 
 def test_what_is_reported_is_what_was_written(dataset: Dataset, tmp_path: Path) -> None:
     """Frames, clouds, track identities and durations of the report agree with the file and the sequence."""
     seen: list[int] = []
-    (result,) = track(dataset, dataset.sequences(["0000"]), tmp_path, profile="kitti", on_frame=lambda: seen.append(1))
+    (result,) = track(
+        dataset,
+        dataset.sequences(["0000"]),
+        tmp_path,
+        parameters=read_profile("kitti"),
+        on_frame=lambda: seen.append(1),
+    )
     rows = [line.split() for line in result.file.read_text().splitlines()]
     assert (result.name, result.frames, result.clouds, len(seen)) == ("0000", 20, 20, 20)
     assert result.tracks == len({row[1] for row in rows})
@@ -46,7 +52,7 @@ def test_clouds_change_the_tracks(dataset: Dataset) -> None:
     bare = Preloaded(sequence)
     bare._frames = [replace(frame, cloud=None) for frame in bare._frames]
     with_clouds, without = (
-        np.concatenate([tracks.existence for _, tracks, _ in track_sequence(parameters, one)])
+        np.concatenate([tracks.existence for _, tracks, _, _ in track_sequence(parameters, one)])
         for one in (sequence, bare)
     )
     assert with_clouds.shape != without.shape or not np.array_equal(with_clouds, without)

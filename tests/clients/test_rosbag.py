@@ -15,7 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 from optipmb_client.cli import run
 from optipmb_client.datasets import DataSequence, dataset_at, open_dataset
 from optipmb_client.files import DatasetError
-from optipmb_client.offline import track
+from optipmb_client.offline import read_profile, track
 from optipmb_client.results.full import FullTable, full_path, read_full
 from real_data import kitti_root
 
@@ -40,7 +40,7 @@ def bag(scene: DataSequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tracks_of(name: str, root: Path | None, out: Path, profile: str = "scene", **options: Any) -> FullTable:
     """Give the tracks of the only sequence of a dataset."""
     dataset = open_dataset(name, root, **options)
-    (result,) = track(dataset, dataset.sequences(["all"])[:1], out, profile=profile, full=True)
+    (result,) = track(dataset, dataset.sequences(["all"])[:1], out, parameters=read_profile(profile), full=True)
     return read_full(full_path(result.file))
 
 
@@ -174,9 +174,9 @@ def test_the_command_tells_a_bag_from_other_files(
         20,
     )
     for arguments, text in (
-        (["nothing.mcap"], "nothing.mcap: expected a bag"),
-        ([tmp_path], "expected a bag of ROS 2"),
-        ([bag, "--dataset", "rosbag"], "a path, or --dataset"),
+        (["nothing.mcap"], "nothing.mcap: expected a table"),
+        ([tmp_path], "a bag of ROS 2 (with metadata.yaml"),
+        ([bag, "--root", bag], "one of them names the data"),
         ([bag, "--option", "speed=1"], "option speed: expected one of fixed_frame, odometry, points"),
         ([bag, "--sequences", "other"], "topics of detections: /detector/boxes"),
         (["--dataset", "scene", "--out", "x.mcap"], "only tracks of a bag"),

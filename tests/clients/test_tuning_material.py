@@ -62,7 +62,7 @@ _COLUMNS = ("center", "size", "yaw", "velocity", "score", "label", "source")
 
 def tracked(dataset: Dataset, names: list[str], out: Path) -> None:
     """Write the result files of some sequences."""
-    list(offline.track(dataset, dataset.sequences(names), out, profile="kitti-paper"))
+    list(offline.track(dataset, dataset.sequences(names), out, parameters=offline.read_profile("kitti-paper")))
 
 
 def test_figures_of_kitti_are_those_of_its_result_files(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_figures_of_nuscenes_are_the_official_ones_of_its_result_file(tmp_path: 
     """A trial's figures are those of the benchmark's evaluation in memory, and of the file up to its rounding."""
     dataset = open_dataset("nuscenes", nuscenes_root(), "centerpoint", clouds=False)
     sequences = dataset.sequences(["all"])
-    list(offline.track(dataset, sequences, tmp_path, profile="nuscenes-paper"))
+    list(offline.track(dataset, sequences, tmp_path, parameters=offline.read_profile("nuscenes-paper")))
     official = evaluate_nuscenes(nuscenes_root(), tmp_path)
     parameters = optipmb.load_profile("nuscenes-paper")
     clips = [load(sequence, parameters, rules_of("nuscenes")) for sequence in sequences]

@@ -15,7 +15,7 @@ FOLDER = Path(optipmb.__file__).parent
 MODULES = {path.stem: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(FOLDER.glob("*.py"))}
 ALLOWED = {
     "__future__", "collections", "dataclasses", "functools", "hashlib", "importlib", "math", "numba", "numpy",
-    "operator", "optipmb", "pathlib", "pydantic", "sys", "tomllib", "typing",
+    "operator", "optipmb", "pathlib", "pydantic", "re", "sys", "tomllib", "typing",
 }  # fmt: skip
 TOUCHES_FILES = {"compiled", "parameters", "prepared"}
 DOES_IO = {"open", "print", "input", "exec", "eval", "__import__"}

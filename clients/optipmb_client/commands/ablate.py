@@ -14,6 +14,9 @@ from optipmb_client.commands.options import (
     Profile,
     Root,
     Sequences,
+    Source,
+    Truth,
+    asked_for,
     open_sequences,
     print_json,
     print_table,
@@ -31,12 +34,14 @@ SHOWN = ("AMOTA", "AMOTP", "FN", "FP", "IDS", "sAMOTA", "MOTA", "MOTP", "HOTA", 
 
 
 def ablate(  # noqa: PLR0913  these are the command's options
+    data: Source = None,
     *,
-    dataset: DatasetName,
+    dataset: DatasetName = None,
     root: Root = None,
     detections: Detections = None,
     sequences: Sequences = None,
     option: Options = None,
+    truth: Truth = None,
     profile: Profile = None,
     classes: Classes = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown.")] = False,
@@ -49,23 +54,24 @@ def ablate(  # noqa: PLR0913  these are the command's options
     from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
     from optipmb_client.offline import read_profile  # noqa: PLC0415  as above
 
-    opened, chosen = open_sequences(dataset, root, detections, sequences, option)
+    asked = asked_for(data, dataset, root, detections, option, truth)
+    opened, chosen = open_sequences(asked, sequences)
     name = profile or opened.profile
     parameters = read_profile(name)
-    source = tuning.Source.of(dataset, detections, chosen, parameters, classes)
+    source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, classes)
     lengths = [len(clip.frames) for clip in source.clips] * len(tuning.ROWS)
     done = iter(lengths)
     with FrameProgress("ablation", sum(lengths)) as progress:
         rows = list(
             tuning.ablate(
-                dataset, chosen, source.clips, parameters, source.classes, lambda: progress.advance(next(done))
+                asked.name, chosen, source.clips, parameters, source.classes, lambda: progress.advance(next(done))
             )
         )
     if as_json:
         print_json(
             {
                 "command": "ablate",
-                "dataset": dataset,
+                "dataset": asked.name,
                 "profile": name,
                 "sequences": [sequence.name for sequence in chosen],
                 "rows": [row.to_json() for row in rows],

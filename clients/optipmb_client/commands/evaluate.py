@@ -12,7 +12,10 @@ from optipmb_client.commands.options import (
     Options,
     Root,
     Sequences,
+    Source,
     Tracks,
+    Truth,
+    asked_for,
     open_sequences,
     print_json,
     print_table,
@@ -27,13 +30,15 @@ if TYPE_CHECKING:
 
 
 def evaluate(  # noqa: PLR0913  these are the command's options
+    data: Source = None,
     *,
-    dataset: DatasetName,
+    dataset: DatasetName = None,
     tracks: Tracks,
     root: Root = None,
     detections: Detections = None,
     sequences: Sequences = None,
     option: Options = None,
+    truth: Truth = None,
     classes: Annotated[
         list[str] | None,
         typer.Option("--class", "--classes", metavar="NAME...", help="Classes to evaluate.", show_default=False),
@@ -70,32 +75,33 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     )
     from optipmb_client.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
 
-    _, chosen = open_sequences(dataset, root, detections, sequences, option)
+    asked = asked_for(data, dataset, root, detections, option, truth)
+    _, chosen = open_sequences(asked, sequences)
     sequence_names = [sequence.name for sequence in chosen]
     names = tuple(classes or labels_of(chosen))
     report: dict[str, Any] = {
         "command": "evaluate",
-        "dataset": dataset,
+        "dataset": asked.name,
         "tracks": tracks,
         "sequences": sequence_names,
     }
     head: list[RenderableType] = []
     settings = Settings(cutoff=cutoff, order=order) if iou is None else Settings((iou,), cutoff, order)
-    if dataset == "nuscenes" and root is not None:
+    if asked.name == "nuscenes" and asked.root is not None:
         if iou is not None or distance is not None:
             raise UsageError("--iou and --distance: the benchmark of nuScenes has its own rules")
-        scores = evaluate_nuscenes(root, tracks, sequence_names)
+        scores = evaluate_nuscenes(asked.root, tracks, sequence_names)
         head = [nuscenes_table(scores, names)]
         report["overall"] = scores.to_json()["overall"]
         parts = {name: {"nuscenes": one.to_json()} for name, one in scores.classes.items() if name in names}
         best = {name: scores.classes[name].best.threshold for name in parts}
     else:
-        results = evaluate_files(chosen, tracks, names, _rules(dataset, iou, distance))
+        results = evaluate_files(chosen, tracks, names, _rules(asked.name, iou, distance))
         parts = {one.name: _figures(one) for one in results}
-        best = {} if dataset == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
-        if dataset != "kitti" or distance is not None:  # AB3DMOT's protocol gives them at its own threshold
+        best = {} if asked.name == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
+        if asked.name != "kitti" or distance is not None:  # AB3DMOT's protocol gives them at its own threshold
             head = [clear_table(results, metres=iou is None)]
-    figures = evaluate_figures(dataset, load_recordings(dataset, chosen, tracks), names, settings, best)
+    figures = evaluate_figures(asked.name, load_recordings(asked.name, chosen, tracks), names, settings, best)
     if not figures:
         raise UsageError("neither the truth nor the tracks have objects of these classes")
     if as_json:

@@ -16,6 +16,7 @@ from optipmb_client.commands.options import (
     Profile,
     Root,
     Sequences,
+    asked_for,
     open_sequences,
     print_json,
     print_table,
@@ -59,7 +60,8 @@ def load(  # noqa: PLR0913  these are the command's options
         latency_ms = latency_ms or 20.0
     material: Frames | None = None
     if dataset is not None:
-        opened, chosen = open_sequences(dataset, root, detections, sequences, option)
+        asked = asked_for(None, dataset, root, detections, option)
+        opened, chosen = open_sequences(asked, sequences)
         material, profile = recorded(chosen, clouds=clouds), profile or opened.profile
         if not len(material):
             raise UsageError("--sequences: they have no frames")

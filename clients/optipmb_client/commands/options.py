@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console, RenderableType
 
-from optipmb_client.datasets import DATASETS, DataSequence, Dataset, open_dataset
+from optipmb_client.datasets import DATASETS, DataSequence, Dataset, DatasetArguments, dataset_at
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.transport import DEFAULT_ENDPOINT
 
@@ -31,22 +31,42 @@ __all__ = [
     "Profile",
     "Root",
     "Sequences",
+    "Source",
     "Speed",
     "Tracks",
+    "Truth",
     "Wait",
     "Window",
+    "asked_for",
     "mcap_needed",
     "open_sequences",
     "print_json",
     "print_table",
     "say",
+    "warn",
 ]
 
 WIDE = 200
 MANY = ("--sequences", "--classes", "--class", "--streams")  # options that take several values after one flag
 
-DatasetName = Annotated[str, typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.")]
-Root = Annotated[Path | None, typer.Option("--root", help="Folder of the dataset; generated scenes need none.")]
+Source = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="[DATA]",
+        help="Your data: a table (CSV, Parquet, JSON Lines, Feather) or a folder of them, a bag of ROS 2, a recording "
+        "(.mcap), or a folder of KITTI or nuScenes. In the place of --dataset and --root.",
+        show_default=False,
+    ),
+]
+DatasetName = Annotated[
+    str | None,
+    typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False),
+]
+Truth = Annotated[
+    Path | None,
+    typer.Option("--truth", help="Table of the true objects, for data that are a table.", show_default=False),
+]
+Root = Annotated[Path | None, typer.Option("--root", help="File or folder of the dataset; scenes need none.")]
 Detections = Annotated[
     str | None, typer.Option("--detections", help="Detector: name of a folder in detections/, or a path.")
 ]
@@ -60,14 +80,26 @@ Classes = Annotated[
 ]
 Options = Annotated[
     list[str] | None,
-    typer.Option("--option", metavar="NAME=VALUE", help="Option of the dataset, such as frames=50 of a scene."),
+    typer.Option(
+        "--option", metavar="NAME=VALUE", help="Option of the dataset: frames=50 of a scene, yaw=degrees of a table."
+    ),
 ]
-Tracks = Annotated[Path, typer.Option("--tracks", help="Folder with the result files of track or replay.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder for the results; made if needed.")]
+Tracks = Annotated[
+    Path, typer.Option("--tracks", help="Folder with the result files of track or replay, or a table of tracks.")
+]
+Out = Annotated[
+    Path,
+    typer.Option("--out", help="Folder for the results, or one table: tracks.csv, .parquet, .jsonl or .feather."),
+]
 Full = Annotated[
     bool, typer.Option("--full", help="Also write all that is known of the tracks, with covariances, as .npz files.")
 ]
-Profile = Annotated[str | None, typer.Option("--profile", help="Parameter profile; default: the dataset's own.")]
+Profile = Annotated[
+    str | None,
+    typer.Option(
+        "--profile", help="Parameter profile, or auto for a detector that nobody tuned; default: the dataset's own."
+    ),
+]
 Connect = Annotated[
     list[str] | None,
     typer.Option(
@@ -88,22 +120,55 @@ Prefix = Annotated[str, typer.Option("--prefix", help="First part of all keys, a
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
-def open_sequences(
-    dataset: str, root: Path | None, detections: str | None, sequences: list[str] | None, options: list[str] | None
-) -> tuple[Dataset, list[DataSequence]]:
-    """Open a dataset and the sequences asked for; all of them by default.
+def asked_for(
+    source: Path | None,
+    dataset: str | None,
+    root: Path | None,
+    detections: str | None,
+    options: list[str] | None,
+    truth: Path | None = None,
+) -> DatasetArguments:
+    """Return which data the options of a command name.
+
+    Raises:
+        DatasetError: The source looks like no data that are known.
+        UsageError: No data are named, or two, or an option is not `NAME=VALUE`.
+    """
+    if source is not None:
+        if root is not None:
+            raise UsageError(f"{source} and --root {root}: one of them names the data")
+        dataset, root = dataset or dataset_at(source), source
+    if dataset is None:
+        raise UsageError("no data: name a table, a recording or a folder, or give --dataset and --root")
+    chosen = dict(_option(text) for text in options or ())
+    if truth is not None:
+        if dataset != "table":
+            raise UsageError(f"--truth: for tables; {dataset} has annotations of its own")
+        chosen["truth"] = str(truth)
+    return DatasetArguments(dataset, root, detections, tuple(chosen.items()))
+
+
+def open_sequences(asked: DatasetArguments, sequences: list[str] | None) -> tuple[Dataset, list[DataSequence]]:
+    """Open a dataset and the sequences asked for, all of them by default; say what was assumed about it.
 
     Raises:
         DatasetError: Any of it is not there; says what.
-        UsageError: An option is not `NAME=VALUE`.
     """
-    opened = open_dataset(dataset, root, detections, **dict(_option(text) for text in options or ()))
-    return opened, list(opened.sequences(sequences or ["all"]))
+    opened = asked.open()
+    chosen = list(opened.sequences(sequences or ["all"]))
+    for note in (note for one in (opened, *chosen) for note in getattr(one, "notes", ())):
+        warn(note)
+    return opened, chosen
+
+
+def warn(text: str) -> None:
+    """Print a line on standard error."""
+    typer.echo(f"optipmb: {text}", err=True)
 
 
 def _option(text: str) -> tuple[str, float | str]:
     name, equals, value = text.partition("=")
-    if not name or not equals:
+    if not (name and equals and value):
         raise UsageError(f"--option: expected NAME=VALUE, received {text!r}")
     try:
         number = float(value)

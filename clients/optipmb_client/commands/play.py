@@ -24,7 +24,7 @@ from optipmb_client.commands.options import (
 from optipmb_client.commands.replay import speed_of
 from optipmb_client.datasets import open_dataset
 from optipmb_client.progress import FrameProgress
-from optipmb_client.recording import write_results
+from optipmb_client.recording import Results
 from optipmb_client.replay import Pace
 from optipmb_client.transport import Connection
 
@@ -89,6 +89,7 @@ def play(  # noqa: PLR0913  these are the command's options
         )
     if out is not None:
         dataset = open_dataset("mcap", file)
+        files = Results(dataset, out, full=full)
         for result in results:
             (sequence,) = dataset.sequences([result.name])
             indexed = {
@@ -96,7 +97,8 @@ def play(  # noqa: PLR0913  these are the command's options
                 for index, frame in enumerate(plans[result.name].frames)
                 if frame in result.tracks
             }
-            write_results(dataset, sequence, out, indexed, full=full)
+            files.write(sequence, indexed)
+        files.close()
     if as_json:
         print_json({"command": "play", "cut": recording.cut, "out": out, "streams": [_summary(one) for one in results]})
     else:

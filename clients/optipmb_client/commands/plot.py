@@ -13,7 +13,10 @@ from optipmb_client.commands.options import (
     Options,
     Root,
     Sequences,
+    Source,
     Tracks,
+    Truth,
+    asked_for,
     open_sequences,
     print_json,
     say,
@@ -22,14 +25,16 @@ from optipmb_client.errors import UsageError
 
 
 def plot(  # noqa: PLR0913  these are the command's options
+    data: Source = None,
     *,
-    dataset: DatasetName,
+    dataset: DatasetName = None,
     tracks: Tracks,
     out: Annotated[Path, typer.Option("--out", help="The PNG file.")],
     root: Root = None,
     detections: Detections = None,
     sequences: Sequences = None,
     option: Options = None,
+    truth: Truth = None,
     score: Annotated[float | None, typer.Option(help="Least mean score of a track; default: the best one.")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -37,14 +42,15 @@ def plot(  # noqa: PLR0913  these are the command's options
     from optipmb_client.drawing import draw_results  # noqa: PLC0415  loads the solvers of scipy
     from optipmb_client.evaluation import default_rules, evaluate_files  # noqa: PLC0415  as above
 
-    _, chosen = open_sequences(dataset, root, detections, sequences, option)
+    asked = asked_for(data, dataset, root, detections, option, truth)
+    _, chosen = open_sequences(asked, sequences)
     if len(chosen) != 1:
         raise UsageError(f"--sequences: one sequence makes a picture, received {len(chosen)}")
     (sequence,) = chosen
-    truth = sequence.truth()
-    results = evaluate_files(chosen, tracks, labels_of(chosen), default_rules(dataset)) if truth is not None else []
+    known = sequence.truth() is not None
+    results = evaluate_files(chosen, tracks, labels_of(chosen), default_rules(asked.name)) if known else []
     draw_results(out, sequence, tracks, results, score)
     if as_json:
-        print_json({"command": "plot", "dataset": dataset, "sequence": sequence.name, "picture": out})
+        print_json({"command": "plot", "dataset": asked.name, "sequence": sequence.name, "picture": out})
     else:
         say(f"picture in {out}")

@@ -21,9 +21,11 @@ from optipmb_client.commands.options import (
     Profile,
     Root,
     Sequences,
+    Source,
     Speed,
     Wait,
     Window,
+    asked_for,
     open_sequences,
     print_json,
     say,
@@ -36,8 +38,9 @@ from optipmb_client.transport import Connection
 
 
 def replay(  # noqa: PLR0913  these are the command's options
+    data: Source = None,
     *,
-    dataset: DatasetName,
+    dataset: DatasetName = None,
     root: Root = None,
     detections: Detections = None,
     sequences: Sequences = None,
@@ -61,7 +64,8 @@ def replay(  # noqa: PLR0913  these are the command's options
     The profile is one that the service knows. Ends with status 1 when tracks of some frames did not come back.
     """
     pace = Pace(speed_of(speed), window, patience, wait)
-    opened, chosen = open_sequences(dataset, root, detections, sequences, option)
+    asked = asked_for(data, dataset, root, detections, option)
+    opened, chosen = open_sequences(asked, sequences)
     name = profile or opened.profile
     with (
         Connection(connect, config=config, timeout=wait) as connection,
@@ -84,7 +88,7 @@ def replay(  # noqa: PLR0913  these are the command's options
         print_json(
             {
                 "command": "replay",
-                "dataset": dataset,
+                "dataset": asked.name,
                 "profile": name,
                 "out": out,
                 "missing": sum(result.missing for result in results),

@@ -1,15 +1,16 @@
 """`optipmb track`: a dataset through the tracker, in this process; or what a service saved when tracking failed."""
 
+import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
+    DatasetName,
     Detections,
     Full,
     Options,
@@ -17,24 +18,30 @@ from optipmb_client.commands.options import (
     Profile,
     Root,
     Sequences,
+    Source,
+    asked_for,
     open_sequences,
     print_json,
     say,
+    warn,
 )
-from optipmb_client.datasets import DATASETS, DataSequence, dataset_at
 from optipmb_client.errors import TrackingFailed, UsageError
 from optipmb_client.progress import FrameProgress
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence as Many
+
+    from optipmb_client.datasets import DataSequence
+    from optipmb_client.offline import TrackedSequence
+
+WORTH_PROCESSES: Final = 3000
+"""Frames from which further processes are faster than this one alone."""
+
 
 def track(  # noqa: PLR0913  these are the command's options
-    path: Annotated[
-        Path | None,
-        typer.Argument(help="A bag of ROS 2 or a recording, in place of --dataset and --root.", show_default=False),
-    ] = None,
+    data: Source = None,
     *,
-    dataset: Annotated[
-        str | None, typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False)
-    ] = None,
+    dataset: DatasetName = None,
     root: Root = None,
     detections: Detections = None,
     sequences: Sequences = None,
@@ -46,13 +53,17 @@ def track(  # noqa: PLR0913  these are the command's options
     keep_input: Annotated[
         bool, typer.Option("--keep-input", help="Of a bag, with --out FILE.mcap: also copy what is in it.")
     ] = False,
+    jobs: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes that track; default: one for each processor.", show_default=False),
+    ] = None,
     dump: Annotated[
         Path | None, typer.Option("--dump", help="What a service saved of a stream when tracking it failed.")
     ] = None,
     trace: Annotated[bool, typer.Option("--trace", help="With --dump: also print where the error was raised.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Track a dataset or a file in this process, without a service, and write its result files.
+    """Track your data on this machine, without a service: optipmb track detections.csv --out tracks.csv.
 
     From a bag of ROS 2, --out FILE.mcap makes a bag with the tracks as TrackedObjects, Detection3DArray and markers.
 
@@ -64,26 +75,31 @@ def track(  # noqa: PLR0913  these are the command's options
     if dump is not None:
         _replay_dump(dump, trace=trace, as_json=as_json)
         return
-    if path is not None:
-        if dataset is not None or root is not None:
-            raise UsageError("expected a path, or --dataset and --root, received both")
-        dataset, root = dataset_at(path), path
-    if dataset is None:
-        raise UsageError("expected a path, --dataset or --dump, received none")
     from optipmb_client import offline  # noqa: PLC0415  loads the tracker and its compiler
 
     if keep_input:
         option = [*(option or ()), "keep_input=1"]
-    opened, chosen = open_sequences(dataset, root, detections, sequences, option)
-    _check_out(out, dataset, chosen)
+    asked = asked_for(data, dataset, root, detections, option)
+    opened, chosen = open_sequences(asked, sequences)
+    _check_out(out, asked.name, chosen)
     name = profile or opened.profile
-    offline.read_profile(name)  # a wrong one is told before anything is shown
-    for note in (note for sequence in chosen for note in getattr(sequence, "notes", ())):
-        typer.echo(f"optipmb: {note}", err=True)
+    parameters = offline.profile_for(name, chosen)
+    for doubt in offline.doubts(parameters, chosen):
+        warn(doubt)
+    if name == offline.AUTO:
+        warn(f"profile auto: {parameters.provenance}")
     results = []
     with FrameProgress("tracking", sum(map(len, chosen))) as progress:
         for result in offline.track(
-            opened, chosen, out, profile=name, classes=classes or (), full=full, on_frame=progress.advance
+            opened,
+            chosen,
+            out,
+            data=asked,
+            parameters=parameters,
+            classes=classes or (),
+            full=full,
+            jobs=_jobs(jobs, chosen),
+            on_frame=progress.advance,
         ):
             results.append(result)
             if not as_json:
@@ -91,17 +107,35 @@ def track(  # noqa: PLR0913  these are the command's options
                 step = f", step p50 {result.step.p50_ms:.2f} ms p99 {result.step.p99_ms:.2f} ms" if result.step else ""
                 say(f"{result.name}: {result.frames} frames, {result.tracks} tracks, {rate:.0f} frames/s{step}")
     if as_json:
-        print_json({"command": "track", "dataset": dataset, "profile": name, "out": out, "sequences": results})
+        print_json({"command": "track", "dataset": asked.name, "profile": name, "out": out, "sequences": results})
     else:
         say(f"results in {out}")
+    _complain(results, parameters.name)
 
 
-def _check_out(out: Path, dataset: str, chosen: Sequence[DataSequence]) -> None:
+def _complain(results: "list[TrackedSequence]", profile: str) -> None:
+    """Say what was left out; end with status 1 when there were detections and not one track came of them."""
+    left_out, detections = (sum(getattr(one, name) for one in results) for name in ("left_out", "detections"))
+    if left_out:
+        warn(f"{left_out} of {detections} detections are of classes that profile {profile} lacks, and were left out")
+    if detections and not any(one.tracks for one in results):
+        warn(f"no tracks came of {detections} detections: do their scores and rate fit profile {profile}?")
+        raise typer.Exit(1)
+
+
+def _jobs(asked: int | None, sequences: "Many[DataSequence]") -> int:
+    """Return how many processes track: by default one for each processor, and for little data just this one."""
+    if asked is None:
+        asked = len(os.sched_getaffinity(0)) if sum(map(len, sequences)) > WORTH_PROCESSES else 1
+    return min(asked, len(sequences))
+
+
+def _check_out(out: Path, dataset: str, chosen: "Many[DataSequence]") -> None:
     """A bag of tracks is one file, and holds those of one topic of a bag."""
     if out.suffix != ".mcap":
         return
     if dataset != "rosbag":
-        raise UsageError(f"--out {out}: expected a folder, for only tracks of a bag are written as a bag")
+        raise UsageError(f"--out {out}: expected a folder, or a table: only tracks of a bag are written as a bag")
     if len(chosen) > 1:
         names = " ".join(sequence.name for sequence in chosen)
         raise UsageError(f"--out {out}: expected one of the bag's topics by --sequences, received {names}")

@@ -18,6 +18,9 @@ from optipmb_client.commands.options import (
     Profile,
     Root,
     Sequences,
+    Source,
+    Truth,
+    asked_for,
     open_sequences,
     print_json,
     print_table,
@@ -37,12 +40,14 @@ METRICS = ("combination", "samota", "amota", "mota", "hota", "both")
 
 
 def tune(  # noqa: PLR0913  these are the command's options
+    data: Source = None,
     *,
-    dataset: DatasetName,
+    dataset: DatasetName = None,
     root: Root = None,
     detections: Detections = None,
     sequences: Sequences = None,
     option: Options = None,
+    truth: Truth = None,
     profile: Profile = None,
     classes: Classes = None,
     out: Out = Path("out/tune"),
@@ -71,9 +76,10 @@ def tune(  # noqa: PLR0913  these are the command's options
 
     if metric not in METRICS:
         raise UsageError(f"--metric: one of {', '.join(METRICS)}, received {metric!r}")
-    opened, chosen = open_sequences(dataset, root, detections, sequences, option)
+    asked = asked_for(data, dataset, root, detections, option, truth)
+    opened, chosen = open_sequences(asked, sequences)
     parameters = read_profile(profile or opened.profile)
-    source = tuning.Source.of(dataset, detections, chosen, parameters, classes)
+    source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, classes)
     estimates = tuning.estimate_all(source, parameters, out)
     if not as_json:
         for one in estimates.values():

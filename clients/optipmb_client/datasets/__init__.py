@@ -1,7 +1,9 @@
 """Datasets: detections, poses, clouds and truth, read or generated, behind one interface."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 from optipmb_client.datasets.interface import (
     Cloud,
@@ -16,12 +18,14 @@ from optipmb_client.datasets.nuscenes import NuScenesDataset
 from optipmb_client.datasets.scene import SceneDataset, scene_options
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Pose
+from optipmb_client.table_files import is_table
 
 __all__ = [
     "DATASETS",
     "Cloud",
     "DataSequence",
     "Dataset",
+    "DatasetArguments",
     "DatasetError",
     "DetectionFrame",
     "Pose",
@@ -35,11 +39,25 @@ _ROS2_MCAP = b"\x04\x00\x00\x00ros2"
 """Profile in the header of an MCAP file of ROS 2."""
 _HEAD = 64
 
-DATASETS = ("kitti", "nuscenes", "scene", "mcap", "rosbag")
+DATASETS = ("kitti", "nuscenes", "scene", "mcap", "rosbag", "table")
+
+
+@dataclass(frozen=True)
+class DatasetArguments:
+    """What `open_dataset` is called with: enough to open the same dataset in another process."""
+
+    name: str
+    root: Path | None = None
+    detections: str | None = None
+    options: tuple[tuple[str, float | str], ...] = ()
+
+    def open(self) -> Dataset:
+        """Open the dataset; raises as `open_dataset` does."""
+        return open_dataset(self.name, self.root, self.detections, **dict(self.options))
 
 
 def open_dataset(
-    name: str, root: Path | str | None = None, detections: str | Path | None = None, **options: float | bool | str
+    name: str, root: Path | str | None = None, detections: str | Path | None = None, **options: float | str
 ) -> Dataset:
     """Return a dataset by name.
 
@@ -49,65 +67,97 @@ def open_dataset(
         detections: the detector whose results are used: its name, its folder or file. None when there is just one, or
             when only truth, poses and clouds are read.
         options: of the dataset. kitti: `clouds`; nuscenes: `clouds`, `z_bottom`; scene: the fields of `SceneOptions`;
-            mcap: none; rosbag: `points`, `odometry`, `fixed_frame`, `keep_input` and `class.NAME`.
+            mcap: none; rosbag: `points`, `odometry`, `fixed_frame`, `keep_input` and `class.NAME`;
+            table: those of `optipmb_client.datasets.table.OPTIONS`.
 
     Raises:
         DatasetError: the name, the root, the detector or an option is not known.
 
     """
-    if name not in DATASETS:
-        raise DatasetError("--dataset", " or ".join(DATASETS), repr(name))
     if name == "scene":
         if root is not None or detections is not None:
             raise DatasetError("--root and --detections", "nothing, for scenes are generated", str(root or detections))
-        return SceneDataset(scene_options({name: _number(name, value) for name, value in options.items()}))
+        return SceneDataset(scene_options(_numbers(options)))
+    if name not in DATASETS:
+        raise DatasetError("--dataset", " or ".join(DATASETS), repr(name))
     if root is None:
-        raise DatasetError("--root", "the folder or file of the dataset", "nothing")
-    if name in {"mcap", "rosbag"}:
-        if detections is not None:
-            raise DatasetError("--detections", f"nothing, for the file of {name} holds them", str(detections))
-        return _recorded(name, Path(root), options)
-    _known(options, {"clouds"} if name == "kitti" else {"clouds", "z_bottom"})
-    clouds = bool(options.get("clouds", True))
-    if name == "kitti":
-        return KittiDataset(Path(root), detections, clouds=clouds)
+        raise DatasetError("--root", "the file or folder of the dataset", "nothing")
+    if name in {"table", "mcap", "rosbag"} and detections is not None:
+        raise DatasetError("--detections", "nothing, for the file itself has them", repr(str(detections)))
+    return _OPEN[name](Path(root), detections, options)
+
+
+_Options: TypeAlias = dict[str, float | str]
+
+
+def _kitti(root: Path, detections: str | Path | None, options: _Options) -> Dataset:
+    _known(options, {"clouds"})
+    return KittiDataset(root, detections, clouds=bool(options.get("clouds", True)))
+
+
+def _nuscenes(root: Path, detections: str | Path | None, options: _Options) -> Dataset:
+    _known(options, {"clouds", "z_bottom"})
     z_bottom = bool(options["z_bottom"]) if "z_bottom" in options else None
-    return NuScenesDataset(Path(root), detections, clouds=clouds, z_bottom=z_bottom)
+    return NuScenesDataset(root, detections, clouds=bool(options.get("clouds", True)), z_bottom=z_bottom)
 
 
-def _recorded(name: str, path: Path, options: dict[str, float | bool | str]) -> Dataset:
-    if name == "rosbag":
-        from optipmb_client.datasets.rosbag import RosbagDataset  # noqa: PLC0415 - needs packages of an extra
-
-        return RosbagDataset(path, options)
-    from optipmb_client.datasets.mcap import RecordedDataset  # noqa: PLC0415 - as above
+def _mcap(root: Path, _: str | Path | None, options: _Options) -> Dataset:
+    from optipmb_client.datasets.mcap import RecordedDataset  # noqa: PLC0415 - needs packages of an extra
 
     _known(options, set())
-    return RecordedDataset(path)
+    return RecordedDataset(root)
+
+
+def _table(root: Path, _: str | Path | None, options: _Options) -> Dataset:
+    from optipmb_client.datasets.table import TableDataset  # noqa: PLC0415 - needs packages of an extra
+
+    return TableDataset(root, {key: str(value) for key, value in options.items()})
+
+
+def _rosbag(root: Path, _: str | Path | None, options: _Options) -> Dataset:
+    from optipmb_client.datasets.rosbag import RosbagDataset  # noqa: PLC0415 - needs packages of an extra
+
+    return RosbagDataset(root, dict(options))
+
+
+_OPEN = {"kitti": _kitti, "nuscenes": _nuscenes, "mcap": _mcap, "rosbag": _rosbag, "table": _table}
 
 
 def dataset_at(path: Path) -> str:
-    """Return the name of the dataset that a path is: a bag of ROS 2, or a recording of streams.
+    """Return the name of the dataset that a file or folder is by its looks.
 
     Raises:
-        DatasetError: it is neither.
+        DatasetError: it looks like none.
     """
+    if is_table(path):
+        return "table"
     if (path / "metadata.yaml").is_file() or path.suffix == ".db3":
         return "rosbag"
     if path.suffix == ".mcap" and path.is_file():
         with path.open("rb") as file:
             return "rosbag" if _ROS2_MCAP in file.read(_HEAD) else "mcap"
-    received = "a folder without it" if path.is_dir() else "another file" if path.exists() else "nothing"
-    raise DatasetError(path, "a bag of ROS 2 (with metadata.yaml, or .mcap or .db3) or a recording (.mcap)", received)
-
-
-def _number(name: str, value: float | bool | str) -> float:  # noqa: FBT001  an option's value
-    if isinstance(value, str):
-        raise DatasetError(f"option {name}", "a number", repr(value))
-    return value
+    if path.is_dir():
+        if any(path.glob("v1.0-*")):
+            return "nuscenes"
+        if (path / "training").is_dir() or (path / "testing").is_dir():
+            return "kitti"
+        if any(is_table(file) for file in path.iterdir()):
+            return "table"
+    expected = (
+        "a table (.csv, .parquet, .jsonl, .feather), a bag of ROS 2 (with metadata.yaml, or .mcap or .db3), a "
+        "recording (.mcap), or a folder of KITTI or nuScenes"
+    )
+    raise DatasetError(path, expected, "another file or folder" if path.exists() else "nothing")
 
 
 def _known(options: Mapping[str, object], known: set[str]) -> None:
     for option in options:
         if option not in known:
             raise DatasetError(f"option {option}", f"one of {', '.join(sorted(known))}", "an unknown option")
+
+
+def _numbers(options: _Options) -> dict[str, float | bool]:
+    for option, value in options.items():
+        if isinstance(value, str):
+            raise DatasetError(f"option {option}", "a number", repr(value))
+    return {option: value for option, value in options.items() if not isinstance(value, str)}

@@ -20,7 +20,8 @@ from optipmb_client.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate
 from optipmb_client.evaluation.hota import HotaResult, evaluate_hota
 from optipmb_client.evaluation.hota_2d import evaluate_hota_2d, hota_2d_rules
 from optipmb_client.evaluation.run import default_rules
-from optipmb_client.results import ResultTable, read_kitti_results
+from optipmb_client.evaluation.tracks import read_full_tracks, read_tracks
+from optipmb_client.results import ResultTable
 from optipmb_client.results.full import FullTable, full_path, read_full
 from optipmb_client.results.nuscenes import read_nuscenes_results, result_table
 
@@ -104,15 +105,13 @@ def load_recordings(dataset: str, sequences: Sequence[DataSequence], results: Pa
         DatasetError: a sequence has no truth, or its results are missing or wrong.
 
     """
-    read = _nuscenes_reader(results) if dataset == "nuscenes" else _kitti_reader(results)
+    read = _nuscenes_reader(results) if dataset == "nuscenes" else _reader(results)
     recordings = []
     for sequence in sequences:
         truth = sequence.truth()
         if truth is None:
             raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
-        path, tracks = read(sequence)
-        beside = full_path(path)
-        recordings.append(Recording(sequence, truth, tracks, read_full(beside) if beside.is_file() else None))
+        recordings.append(Recording(sequence, truth, *read(sequence)))
     return recordings
 
 
@@ -216,27 +215,24 @@ def _names(tracks: ResultTable) -> np.ndarray:
     return np.asarray(tracks.labels, dtype=np.str_)[np.unique(tracks.label)] if len(tracks) else np.empty(0, np.str_)
 
 
-def _kitti_reader(results: Path) -> Callable[[DataSequence], tuple[Path, ResultTable]]:
-    def read(sequence: DataSequence) -> tuple[Path, ResultTable]:
-        path = results / f"{sequence.name}.txt"
-        table = read_kitti_results(path)
-        if len(table) and table.frame[-1] >= len(sequence):
-            raise DatasetError(path, f"frames from 0 to {len(sequence) - 1}", f"frame {table.frame[-1]}")
-        return path, table.to_world(sequence.poses)
+def _reader(results: Path) -> Callable[[DataSequence], tuple[ResultTable, FullTable | None]]:
+    def read(sequence: DataSequence) -> tuple[ResultTable, FullTable | None]:
+        return read_tracks(results, sequence).to_world(sequence.poses), read_full_tracks(results, sequence)
 
     return read
 
 
-def _nuscenes_reader(results: Path) -> Callable[[DataSequence], tuple[Path, ResultTable]]:
+def _nuscenes_reader(results: Path) -> Callable[[DataSequence], tuple[ResultTable, FullTable | None]]:
     submission = read_nuscenes_results(results)
 
-    def read(sequence: DataSequence) -> tuple[Path, ResultTable]:
+    def read(sequence: DataSequence) -> tuple[ResultTable, FullTable | None]:
         if not isinstance(sequence, NuScenesSequence):
             raise TypeError(f"a sequence of nuScenes is wanted, received {type(sequence).__name__}")
         table = result_table(submission, sequence.name, sequence.samples)
         # The benchmark compares only what is near, by class; truth farther away is ignored already.
         reach = np.array([CLASS_RANGE.get(name, 0.0) for name in table.labels] or [0.0])
         near = sequence.ego_distance(table.frame, table.center) < reach[table.label]
-        return submission.path.parent / "scenes" / f"{sequence.name}.json", table.take(near)
+        beside = full_path(submission.path.parent / "scenes" / f"{sequence.name}.json")
+        return table.take(near), read_full(beside) if beside.is_file() else None
 
     return read

@@ -11,7 +11,7 @@ from pathlib import Path
 from optipmb_client.datasets import DataSequence, DatasetError
 from optipmb_client.evaluation.cases import Case, Measure, Rules, prepare
 from optipmb_client.evaluation.clear import ClearResult, Sweep, clear, combine, sweep
-from optipmb_client.results import read_kitti_results
+from optipmb_client.evaluation.tracks import read_tracks
 
 _ALIKE = {"Car": ("Van",), "Pedestrian": ("Person", "Person_sitting")}
 
@@ -48,11 +48,11 @@ class ClassResult:
 def evaluate_files(
     sequences: Sequence[DataSequence], results: Path, names: Sequence[str], rules: Rules
 ) -> list[ClassResult]:
-    """Return the figures of each class from `results/SSSS.txt` of each sequence.
+    """Return the figures of each class from the tracks of each sequence.
 
     Args:
         sequences: what to compare with; each must have a truth.
-        results: the folder of the result files.
+        results: the folder of the result files, or a table of tracks.
         names: classes; those that occur neither in the truth nor in the results are left out.
         rules: how to compare.
 
@@ -65,10 +65,7 @@ def evaluate_files(
         truth = sequence.truth()
         if truth is None:
             raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
-        path = results / f"{sequence.name}.txt"
-        table = read_kitti_results(path)
-        if len(table) and table.frame[-1] >= len(sequence):
-            raise DatasetError(path, f"frames from 0 to {len(sequence) - 1}", f"frame {table.frame[-1]}")
+        table = read_tracks(results, sequence)
         local = truth.to_sensor(sequence.poses)
         for name in names:
             cases[name].append(prepare(local, table, name, rules, sequence.name))

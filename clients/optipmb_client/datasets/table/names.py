@@ -1,0 +1,123 @@
+"""Which column of a table means what, by its name.
+
+Names are compared in lower case, with every run of other characters as one underscore, and without a unit at the end
+(`yaw_deg`, `x [m]`). What a name says about units is kept.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+__all__ = ["ALIASES", "Column", "find_columns"]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column that was found.
+
+    Attributes:
+        name: as the table has it.
+        unit: that its name states: `deg`, `rad`, `s`, `ms`, `us`, `ns`, or None.
+        base: its name without the unit, normalised.
+    """
+
+    name: str
+    unit: str | None
+    base: str
+
+
+def _vector(bases: str, part: str, place: int) -> tuple[str, ...]:
+    found: list[str] = []
+    for base in bases.split():
+        found += [f"{base}_{part}", f"{part}_{base}", f"{base}{part}", f"{base}_{place}"]
+    return tuple(found)
+
+
+_CENTER: Final = "center centre pos position loc location translation xyz c p t bbox box"
+_SIZE: Final = "size dim dims dimension dimensions extent extents lwh box_size"
+_SPEED: Final = "v vel velocity speed"
+_POSE: Final = "pose ego sensor_pose ego_pose ego_translation pose_translation ego_position sensor_position"
+_TURN: Final = "pose ego sensor_pose ego_pose ego_rotation pose_rotation"
+_BOX_TURN: Final = "q quat quaternion rotation rot orientation"
+
+
+def _turn(bases: str, part: str, place: int) -> tuple[str, ...]:
+    return (*(f"{base}_q{part}" for base in bases.split()), *_vector(bases, part, place))
+
+
+ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
+    "stamp": ("stamp", "t", "time", "timestamp", "ts", "sec", "secs", "seconds", "nanoseconds", "sim_time", "datetime"),
+    "frame": ("frame", "frame_id", "frame_index", "frame_idx", "frame_number", "frame_no", "frame_nr"),
+    "x": ("x", "cx", "px", "x_center", *_vector(_CENTER, "x", 0)),
+    "y": ("y", "cy", "py", "y_center", *_vector(_CENTER, "y", 1)),
+    "z": ("z", "cz", "pz", "z_center", *_vector(_CENTER, "z", 2)),
+    "l": ("l", "length", "box_length", "dx", *_vector(_SIZE, "x", 0), *_vector(_SIZE, "l", 0), "size_length"),
+    "w": ("w", "width", "box_width", "dy", *_vector(_SIZE, "y", 1), *_vector(_SIZE, "w", 1), "size_width"),
+    "h": ("h", "height", "box_height", "dz", *_vector(_SIZE, "z", 2), *_vector(_SIZE, "h", 2), "size_height"),
+    "yaw": ("yaw", "heading", "theta", "yaw_angle", "heading_angle", "rotation_z", "rot_z", "rz", "rotation_y", "ry",
+            "rot", "rotation", "orientation", "angle"),
+    "qw": ("qw", *_vector(_BOX_TURN, "w", 0)),
+    "qx": ("qx", *_vector(_BOX_TURN, "x", 1)),
+    "qy": ("qy", *_vector(_BOX_TURN, "y", 2)),
+    "qz": ("qz", *_vector(_BOX_TURN, "z", 3)),
+    "score": ("score", "confidence", "conf", "prob", "probability", "detection_score", "det_score", "tracking_score"),
+    "class": ("class", "class_name", "cls", "label", "label_name", "category", "category_name", "type", "object_type",
+              "obj_type", "class_id", "label_id", "classification", "object_class", "name", "tracking_name"),
+    "vx": _vector(_SPEED, "x", 0),
+    "vy": _vector(_SPEED, "y", 1),
+    "id": ("id", "track_id", "object_id", "obj_id", "tracking_id", "instance_id", "instance",
+           "instance_token", "track"),
+    "recording": ("recording", "recording_id", "sequence", "sequence_id", "sequence_name", "scene", "scene_name",
+                  "scene_id", "session", "log", "log_id", "run", "run_id", "drive", "segment", "bag", "stream"),
+    "sensor": ("sensor", "sensor_id", "sensor_name", "node", "lidar", "device"),
+    "pose_x": _vector(_POSE, "x", 0),
+    "pose_y": _vector(_POSE, "y", 1),
+    "pose_z": _vector(_POSE, "z", 2),
+    "pose_yaw": ("pose_yaw", "ego_yaw", "sensor_yaw", "pose_heading", "ego_heading"),
+    "pose_qw": _turn(_TURN, "w", 0),
+    "pose_qx": _turn(_TURN, "x", 1),
+    "pose_qy": _turn(_TURN, "y", 2),
+    "pose_qz": _turn(_TURN, "z", 3),
+}  # fmt: skip
+"""Names of each column, the most telling first."""
+
+_UNITS: Final[Mapping[str, str]] = {
+    "deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad",
+    "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us",
+    "ns": "ns", "nsec": "ns", "nanoseconds": "ns",
+}  # fmt: skip
+_LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
+
+
+def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, Column]:
+    """Return the column of each meaning that the table has.
+
+    Args:
+        names: of all columns.
+        chosen: meanings whose column the user has named.
+    """
+    known = [_normalised(name) for name in names]
+    taken: dict[str, Column] = {}
+    used = set(chosen.values())
+    for role, aliases in ALIASES.items():
+        if role in chosen:
+            unit = next((one.unit for one in known if one.name == chosen[role]), None)
+            taken[role] = Column(chosen[role], unit, "")
+            continue
+        fitting = [one for one in known if one.base in aliases and one.name not in used]
+        if fitting:
+            best = min(fitting, key=lambda one: aliases.index(one.base))
+            taken[role] = best
+            used.add(best.name)
+    return taken
+
+
+def _normalised(name: str) -> Column:
+    base = re.sub(r"[^a-z0-9]+", "_", re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()).strip("_")
+    head, _, tail = base.rpartition("_")
+    if head and tail in _UNITS:
+        return Column(name, _UNITS[tail], head)
+    if base in _UNITS and base not in {"s", "ms", "us", "ns"}:
+        return Column(name, _UNITS[base], base)
+    return Column(name, None, head if head and tail in _LENGTHS else base)

@@ -1,0 +1,297 @@
+"""A table of boxes, one row per box: read, checked, in nanoseconds, metres and radians with z up."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optipmb_client.datasets.table.names import find_columns
+from optipmb_client.datasets.table.values import (
+    Reading,
+    read_angle,
+    read_axes,
+    read_scores,
+    read_sizes,
+    read_stamps,
+)
+from optipmb_client.files import DatasetError
+from optipmb_client.geometry import Floats, Ints, wrap_angle
+from optipmb_client.table_files import Columns, read_table
+
+__all__ = ["NO_CLASS", "Boxes", "read_boxes"]
+
+NO_CLASS: Final = "object"
+"""Class of all boxes of a table without classes."""
+_UNIT: Final = 1e-3
+_MOST_SHOWN: Final = 6
+_POSE: Final = ("pose_x", "pose_y", "pose_z")
+_TURNS: Final = ("w", "x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """The rows of one table; those of a row that stands for an empty frame are left out of all but the frames."""
+
+    frame_stamp: Ints
+    """(R,) ns, of every row, also those without a box."""
+    frame_key: NDArray[np.str_]
+    """(R,) recording and sensor of every row."""
+    frame_pose: Floats | None
+    """(R, 7) translation and quaternion, world from sensor; None where boxes are in the world frame."""
+    frame_time: NDArray[Any]
+    """(R,) time as the table has it."""
+    row: Ints
+    """(B,) row of each box, counted from 0."""
+    center: Floats
+    """(B, 3)"""
+    size: Floats
+    """(B, 3)"""
+    yaw: Floats
+    """(B,)"""
+    velocity: Floats | None
+    """(B, 2); rows of NaN where unknown."""
+    score: Floats
+    """(B,) in (0, 1]"""
+    name: NDArray[np.str_]
+    """(B,) class"""
+    id: Ints | None
+    """(B,) object; None where the table has no such column."""
+    time_column: str
+    key_columns: tuple[str, ...]
+    keys: Mapping[str, tuple[str, ...]]
+    """Key -> values of the columns that it stands for."""
+
+
+def read_boxes(reading: Reading, *, scored: bool) -> Boxes:
+    """Read the table of a `Reading`; what was assumed is noted there.
+
+    Args:
+        reading: the file and the options of the user.
+        scored: whether boxes are detections, which have a score.
+
+    Raises:
+        DatasetError: a column is missing or a value is not allowed; names the line.
+        ClientError: pyarrow is not installed.
+    """
+    columns = read_table(reading.path)
+    if not columns or not len(next(iter(columns.values()))):
+        raise DatasetError(reading.path, "rows", f"none, columns {', '.join(columns) or 'none'}")
+    return _Table(reading, columns).read(scored=scored)
+
+
+class _Table:
+    def __init__(self, reading: Reading, columns: Columns) -> None:
+        self._reading = reading
+        self._columns = columns
+        self._rows = len(next(iter(columns.values())))
+        chosen = {
+            key.removeprefix("column."): name for key, name in reading.options.items() if key.startswith("column.")
+        }
+        for role, name in chosen.items():
+            if name not in columns:
+                raise DatasetError(f"--option column.{role}", f"a column: {', '.join(columns)}", repr(name))
+        self._found = find_columns(columns, chosen)
+
+    def _line(self, row: int) -> int:
+        return row + (2 if self._reading.path.name.lower().endswith((".csv", ".tsv", ".gz")) else 1)
+
+    def _numbers(self, role: str, otherwise: float | None = None) -> Floats:
+        """Return a column of numbers, NaN where there is none."""
+        column = self._found.get(role)
+        if column is None:
+            if otherwise is None:
+                have = ", ".join(self._columns)
+                raise DatasetError(
+                    self._reading.path, f"a column {role} (--option column.{role}=NAME)", f"the columns {have}"
+                )
+            return np.full(self._rows, otherwise)
+        values = self._columns[column.name]
+        if values.dtype.kind not in "if":
+            bad = np.array([not _is_number(text) for text in values.tolist()])
+            self._reading.first(bad, self._line, f"a number in column {column.name}", values)
+            values = np.array([float(text) if text else np.nan for text in values.tolist()])
+        return values.astype(np.float64)
+
+    def _unit(self, role: str) -> str | None:
+        return self._found[role].unit if role in self._found else None
+
+    def read(self, *, scored: bool) -> Boxes:
+        reading, found = self._reading, self._found
+        stamp, time, time_column = self._stamps()
+        key, key_columns, keys = self._keys()
+        center = np.column_stack([self._numbers("x"), self._numbers("y"), self._numbers("z", 0.0)])
+        size = np.column_stack([self._numbers("l"), self._numbers("w"), self._numbers("h", 1.5)])
+        yaw = self._yaw()
+        score = self._numbers("score", 1.0)
+        names, id_ = self._names(), self._ids()
+        for role, text in (("z", "z = 0"), ("h", "a height of 1.5 m"), ("score", "a score of 1")):
+            if role not in found and (scored or role != "score"):
+                reading.note(f"no column for {role}: {text} for every box")
+        empty = np.isnan(center[:, :2]).all(axis=1) & np.isnan(size[:, :2]).all(axis=1)
+        kept = self._valid(np.asarray(~empty), center, size, yaw, score)
+        if "score" in found and scored:
+            score[kept] = read_scores(reading, score[kept])
+            outside = kept & ((score < 0.0) | (score > 1.0))
+            reading.first(outside, self._line, "a score from 0 to 1 (--option score=logit, or percent)", score)
+            zero = kept & (score == 0.0)
+            if zero.any():
+                reading.note(f"{int(zero.sum())} detections with a score of 0 are left out")
+                kept &= ~zero
+        row = np.flatnonzero(kept)
+        stated = found["l"].base in {"l", "length", "box_length"} or found["l"].base.endswith("_l")
+        size = read_sizes(reading, size[row], names[row], stated=stated)
+        angle = read_angle(reading, yaw[row], self._unit("yaw"))
+        center, size, angle = read_axes(reading, center[row], size, angle)
+        velocity = None
+        if "vx" in found and "vy" in found:
+            velocity = np.column_stack([self._numbers("vx"), self._numbers("vy")])[row]
+            velocity[np.isnan(velocity).any(axis=1)] = np.nan
+        unused = [name for name in self._columns if name not in {one.name for one in found.values()}]
+        if unused:
+            more = f" and {len(unused) - _MOST_SHOWN} more" if len(unused) > _MOST_SHOWN else ""
+            reading.note(f"columns not used: {', '.join(unused[:_MOST_SHOWN])}{more}")
+        return Boxes(
+            frame_stamp=stamp,
+            frame_key=key,
+            frame_pose=self._poses(),
+            frame_time=time,
+            row=row,
+            center=center,
+            size=size,
+            yaw=wrap_angle(angle),
+            velocity=velocity,
+            score=score[row],
+            name=names[row],
+            id=None if id_ is None else id_[row],
+            time_column=time_column,
+            key_columns=key_columns,
+            keys=keys,
+        )
+
+    def _stamps(self) -> tuple[Ints, NDArray[Any], str]:
+        reading, found = self._reading, self._found
+        rate = _rate(reading.options)
+        column = found.get("stamp") if rate is None else found.get("frame", found.get("stamp"))
+        if column is None:
+            expected = "a column of stamps (t, stamp_ns …; --option column.stamp=NAME)"
+            if "frame" in found:
+                expected += ", or the rate of the frames that are counted (--option rate=HZ)"
+            raise DatasetError(reading.path, expected, f"the columns {', '.join(self._columns)}")
+        values = self._columns[column.name]
+        missing = np.isnat(values) if values.dtype.kind == "M" else values != values  # noqa: PLR0124  NaN differs from itself
+        reading.first(missing, self._line, f"a stamp in column {column.name}", values)
+        if rate is not None:
+            return np.round(values.astype(np.float64) * (1e9 / rate)).astype(np.int64), values, column.name
+        stamp = read_stamps(reading, values, column.unit)
+        if stamp.min() < 0:
+            reading.first(stamp < 0, self._line, "a stamp that is not negative", values)
+        return stamp, values, column.name
+
+    def _keys(self) -> tuple[NDArray[np.str_], tuple[str, ...], dict[str, tuple[str, ...]]]:
+        names = tuple(self._found[role].name for role in ("recording", "sensor") if role in self._found)
+        if not names:
+            return np.full(self._rows, "", dtype=np.str_), (), {"": ()}
+        parts = [self._columns[name].astype(np.str_).tolist() for name in names]
+        joined = [".".join(row) for row in zip(*parts, strict=True)]
+        return np.array(joined, dtype=np.str_), names, dict(zip(joined, zip(*parts, strict=True), strict=True))
+
+    def _yaw(self) -> Floats:
+        if "yaw" in self._found:
+            return self._numbers("yaw")
+        turns = [f"q{part}" for part in _TURNS]
+        if all(role in self._found for role in turns):
+            w, x, y, z = (self._numbers(role) for role in turns)
+            return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+        return self._numbers("yaw")  # raises: there is none
+
+    def _names(self) -> NDArray[np.str_]:
+        column = self._found.get("class")
+        if column is None:
+            self._reading.note(f"no column for class: every box is of class {NO_CLASS}")
+            return np.full(self._rows, NO_CLASS, dtype=np.str_)
+        names = self._columns[column.name].astype(np.str_)
+        renamed = {
+            key.removeprefix("class."): name for key, name in self._reading.options.items() if key.startswith("class.")
+        }
+        unknown = sorted(set(renamed) - set(names.tolist()))
+        if unknown:
+            have = ", ".join(sorted(set(names.tolist())))
+            raise DatasetError(f"--option class.{unknown[0]}", f"a class of the table: {have}", repr(unknown[0]))
+        return np.array([renamed.get(name, name) for name in names.tolist()], dtype=np.str_)
+
+    def _ids(self) -> Ints | None:
+        column = self._found.get("id")
+        if column is None:
+            return None
+        values = self._columns[column.name]
+        if values.dtype.kind == "i":
+            return values.astype(np.int64)
+        return np.unique(values.astype(np.str_), return_inverse=True)[1].astype(np.int64)
+
+    def _poses(self) -> Floats | None:
+        """Return the poses (R, 7) that the table has."""
+        if not all(role in self._found for role in _POSE[:2]):
+            self._reading.note(
+                "no columns for the pose of the sensor: boxes are taken to be in a frame that stands still"
+            )
+            return None
+        translation = np.column_stack([self._numbers("pose_x"), self._numbers("pose_y"), self._numbers("pose_z", 0.0)])
+        roles = [f"pose_q{part}" for part in _TURNS]
+        if all(role in self._found for role in roles):
+            quaternion = np.column_stack([self._numbers(role) for role in roles])
+            norm = np.linalg.norm(quaternion, axis=1)
+            self._reading.first(
+                np.asarray(~(abs(norm - 1.0) < _UNIT)), self._line, "a pose with a unit quaternion", norm
+            )
+        else:
+            turn = read_angle(self._reading, self._numbers("pose_yaw"), self._unit("pose_yaw"))
+            zero = np.zeros(self._rows)
+            quaternion = np.column_stack([np.cos(turn / 2), zero, zero, np.sin(turn / 2)])
+        bad = np.asarray(~np.isfinite(translation).all(axis=1))
+        self._reading.first(bad, self._line, "a pose of finite numbers", translation[:, 0])
+        return np.column_stack([translation, quaternion])
+
+    def _valid(
+        self, kept: NDArray[np.bool_], center: Floats, size: Floats, yaw: Floats, score: Floats
+    ) -> NDArray[np.bool_]:
+        """Return the rows with a box that can be used; raise for one that cannot, unless the user leaves them out."""
+        skip = self._reading.chosen("invalid", ("skip", "refuse")) == "skip"
+        good = kept.copy()
+        for name, values in (
+            ("x, y and z", center),
+            ("length, width and height", size),
+            ("yaw", yaw),
+            ("score", score),
+        ):
+            fine = np.isfinite(values if values.ndim > 1 else values[:, None]).all(axis=1)
+            if values is size:
+                fine &= (np.where(np.isfinite(size), size, 1.0) > 0.0).all(axis=1)
+            bad = kept & ~fine
+            if bad.any() and not skip:
+                kind = "positive " if values is size else "finite "
+                expected = f"{kind}{name} (--option invalid=skip leaves such rows out)"
+                self._reading.first(np.asarray(bad), self._line, expected, values)
+            good &= fine
+        left = int((kept & ~good).sum())
+        if left:
+            self._reading.note(f"{left} rows with values that are missing, not finite or not positive are left out")
+        return good
+
+
+def _rate(options: Mapping[str, str]) -> float | None:
+    text = options.get("rate")
+    if text is None:
+        return None
+    if not _is_number(text) or not 0.0 < float(text) < float("inf"):
+        raise DatasetError("--option rate", "frames per second, a positive number", repr(text))
+    return float(text)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text or "nan")
+    except ValueError:
+        return False
+    return True

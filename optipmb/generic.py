@@ -1,0 +1,117 @@
+"""Parameters for detectors that nobody tuned: careful values from the classes, the rate and the scores.
+
+Everything that counts frames follows from durations and the period. Noise is that of an average LiDAR detector, rather
+too wide than too narrow. Thresholds on scores follow the scores, so that a detector whose scores are low is not
+silenced; existence probabilities are not calibrated.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from optipmb.class_names import common_name
+from optipmb.parameters import parse_parameters
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from numpy.typing import ArrayLike
+
+    from optipmb.parameters import Parameters
+
+OTHER: Final = "other"
+REACH: Final = (  # gate: metres at once, and metres per second of the period
+    ("car", (3.0, 12.0)), ("truck", (4.0, 12.0)), ("bus", (4.0, 12.0)), ("trailer", (4.0, 12.0)),
+    ("pedestrian", (1.8, 0.4)), ("bicycle", (2.5, 3.0)), ("motorcycle", (2.5, 8.0)), (OTHER, (2.5, 6.0)),
+)  # fmt: skip
+SIZED: Final = frozenset({"truck", "bus", "trailer"})
+AGILE: Final = frozenset({"pedestrian"})
+TWO_WHEELED: Final = frozenset({"bicycle", "motorcycle"})
+
+REMEMBERED_S: Final = 2.0
+"""How long an object is kept without a detection."""
+SHOWN_S: Final = 0.4
+"""How long a track is shown without a detection; two frames at least."""
+LEAVING_RATE: Final = 0.02
+"""Share of the objects that leave in a second."""
+BIRTH_QUANTILE: Final = 0.5
+BIRTH_SCORE: Final = (0.2, 0.6)
+"""Least and greatest score from which an unused detection starts a track at once."""
+USUAL_SCORE: Final = 0.5
+
+
+def generic_parameters(
+    labels: Iterable[str], period: float, scores: Mapping[str, ArrayLike] | None = None, *, name: str = "auto"
+) -> Parameters:
+    """Return parameters for classes, by what their names mean (`optipmb.class_names`).
+
+    Args:
+        labels: names of the classes; what their names do not tell is taken for objects of middling size and speed.
+        period: seconds between frames.
+        scores: of some detections, by class.
+        name: of the profile.
+
+    Raises:
+        ParameterError: no label, a name that is none, or a period that is not positive.
+    """
+    classes = {label: _of_class(common_name(label) or OTHER, period, _birth_score(label, scores)) for label in labels}
+    kinds = ", ".join(f"{label} as {common_name(label) or OTHER}" for label in classes)
+    provenance = f"For a detector that nobody tuned: {1.0 / period if period > 0.0 else 0.0:.3g} Hz; {kinds}."
+    return parse_parameters(
+        {"name": name, "nominal_period": period, "provenance": provenance[:10_000], "classes": classes}
+    )
+
+
+def _birth_score(label: str, scores: Mapping[str, ArrayLike] | None) -> float:
+    values = np.asarray(scores[label], dtype=np.float64) if scores and label in scores else np.empty(0)
+    usual = float(np.quantile(values, BIRTH_QUANTILE)) if len(values) else USUAL_SCORE
+    return round(float(np.clip(usual, *BIRTH_SCORE)), 3)
+
+
+def _of_class(kind: str, period: float, birth_score: float) -> dict[str, Any]:
+    still, moving = dict(REACH)[kind]
+    agile, two_wheeled, sized = kind in AGILE, kind in TWO_WHEELED, kind in SIZED
+    return {
+        "score_filter": round(0.3 * birth_score, 3),
+        "nms_iou": 0.1,
+        "survival": max(0.5, 1.0 - LEAVING_RATE * period),
+        "gate": round(still + moving * period, 3),
+        "detection": 0.8,
+        "expected_points": 10.0,
+        "detection_floor": 0.6,
+        "birth_score": birth_score,
+        "adaptive_birth_rate": 0.2,
+        "undetected_birth_rate": 0.5,
+        "clutter_rate": 2.0,
+        "area": 10_000.0,
+        "poisson_steps": 2,
+        "extract_new": 0.7,
+        "extract_known": 0.8,
+        "extract_misses": max(2, round(SHOWN_S / period)),
+        "max_misses": max(4, round(REMEMBERED_S / period)),
+        "min_existence": 0.01,
+        "heading_sign_reliable": False,
+        "birth_heading_speed": 1.0,
+        "process_noise": {
+            "position": 0.1,
+            "speed": 0.8 if agile else 1.0,
+            "heading": 0.6 if agile else 0.2 if two_wheeled else 0.08,
+            "turn_rate": 0.4 if agile or two_wheeled else 0.3,
+            "acceleration": 0.5 if agile else 1.5,
+        },
+        "measurement_noise": {
+            "position": 0.5 if sized else 0.25 if agile or two_wheeled else 0.3,
+            "velocity": 1.0,
+            "heading": 0.6 if agile else 0.3,
+        },
+        "birth": {
+            "position": 0.5,
+            "speed": 1.0 if agile else 3.0,
+            "unknown_speed": 2.0 if agile else 5.0 if two_wheeled else 8.0,
+            "heading": 0.8 if agile else 0.4,
+            "turn_rate": 0.3,
+            "acceleration": 0.5 if agile else 1.0,
+        },
+    }

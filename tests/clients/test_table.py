@@ -1,0 +1,277 @@
+"""Own data: tables of detections in four formats, what is found in them and said, and tables of tracks."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import optipmb, result_of
+from optipmb_client.datasets import DataSequence, DatasetError, open_dataset
+from optipmb_client.datasets.table import TableDataset, TableSequence, match_stamps
+from optipmb_client.table_files import read_table, write_table
+
+FRAMES, PERIOD = 30, 0.1
+CLASSES = ("Car", "Pedestrian")
+
+
+def boxes(**changed: Any) -> dict[str, np.ndarray]:
+    """Give the detections of two cars and a pedestrian at 10 Hz, as columns; some of them may be changed."""
+    t = np.repeat(np.arange(FRAMES) * PERIOD, 3)
+    columns: dict[str, Any] = {
+        "t": t.round(6),
+        "x": np.tile([0.0, 40.0, 5.0], FRAMES) + t * np.tile([8.0, -6.0, 1.2], FRAMES),
+        "y": np.tile([0.0, 4.0, 9.0], FRAMES),
+        "z": np.tile([0.8, 0.8, 0.9], FRAMES),
+        "l": np.tile([4.5, 4.2, 0.6], FRAMES),
+        "w": np.tile([1.9, 1.8, 0.6], FRAMES),
+        "h": np.tile([1.6, 1.5, 1.7], FRAMES),
+        "yaw": np.tile([0.0, 3.1, 0.1], FRAMES),
+        "score": np.tile([0.9, 0.8, 0.7], FRAMES),
+        "class": np.array(["Car", "Car", "Pedestrian"] * FRAMES),
+    }
+    columns |= changed
+    return {name: np.asarray(values) for name, values in columns.items() if values is not None}
+
+
+def table(path: Path, columns: Mapping[str, np.ndarray]) -> Path:
+    """Write a table and give its path."""
+    write_table(path, columns)
+    return path
+
+
+def only(dataset: TableDataset) -> TableSequence:
+    """Give the one recording of a dataset."""
+    (sequence,) = dataset.sequences(["all"])
+    assert isinstance(sequence, TableSequence)
+    return sequence
+
+
+def same(one: DataSequence, other: DataSequence) -> None:
+    """Check that two recordings have the same frames."""
+    for a, b in zip(one.frames(), other.frames(), strict=True):
+        assert a.stamp_ns == b.stamp_ns
+        for name in ("center", "size", "yaw", "score"):
+            np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-9)
+        assert [a.labels[i] for i in a.label] == [b.labels[i] for i in b.label]
+
+
+def notes_and_frames(path: Path, columns: Mapping[str, np.ndarray], **options: str) -> tuple[str, TableSequence]:
+    """Give what is said about a table, and its recording."""
+    dataset = TableDataset(table(path, columns), options)
+    return " | ".join(dataset.notes), only(dataset)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".tsv", ".parquet", ".jsonl", ".feather"])
+def test_every_format_gives_the_same_frames(tmp_path: Path, suffix: str) -> None:
+    """A table reads the same in every format, to the last bit."""
+    plain = only(TableDataset(table(tmp_path / "plain.parquet", boxes())))
+    other = only(TableDataset(table(tmp_path / f"other{suffix}", boxes())))
+    assert len(other) == FRAMES
+    same(plain, other)
+
+
+STAMPS = np.repeat(np.arange(FRAMES) * 100_000_000 + 1_700_000_000_000_000_000, 3)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"t": np.repeat(np.arange(FRAMES) * 100, 3)}, "stamps look like milliseconds"),
+        ({"t": np.repeat(np.arange(FRAMES) * 100_000, 3)}, "stamps look like microseconds"),
+        ({"t": None, "timestamp": STAMPS}, "stamps look like nanoseconds"),
+        ({"t": None, "timestamp": STAMPS / 1e9}, "stamps look like seconds"),
+        ({"t": None, "stamp_ns": STAMPS}, ""),
+        ({"t": None, "stamp": STAMPS.astype("datetime64[ns]")}, ""),
+        ({"yaw": np.tile([0.0, 177.617, 5.72958], FRAMES)}, "yaw looks like degrees (up to 177.6)"),
+        ({"yaw": None, "heading_deg": np.tile([0.0, 177.617, 5.72958], FRAMES)}, ""),
+        ({"score": np.tile([2.197, 1.386, -0.8473], FRAMES)}, "scores look like logits"),
+        ({"score": np.tile([90.0, 80.0, 70.0], FRAMES)}, "scores look like percent"),
+    ],
+)
+def test_units_are_found_and_said(tmp_path: Path, changed: dict[str, Any], said: str) -> None:
+    """Units that no name states are found in the values, and one line says so."""
+    notes, sequence = notes_and_frames(tmp_path / "d.parquet", boxes(**changed))
+    assert said in notes
+    assert ("look" in notes) == bool(said) or "t" in boxes(**changed)
+    frames = list(sequence.frames())
+    assert np.diff([frame.stamp_ns for frame in frames]) == pytest.approx(1e8, abs=300)
+    assert frames[0].yaw == pytest.approx([0.0, 3.1, 0.1], abs=1e-5)
+    assert frames[0].score == pytest.approx([0.9, 0.8, 0.7] if "score" not in changed or said.endswith("percent")
+                                            else [0.9, 0.8, 0.3], abs=1e-4)  # fmt: skip
+
+
+def test_sizes_in_another_order_are_found_where_no_name_says_the_order(tmp_path: Path) -> None:
+    """`size` as height, width, length is told from the cars; columns l, w, h that look so are read as named."""
+    hwl = {"l": None, "w": None, "h": None, "size_0": boxes()["h"], "size_1": boxes()["w"], "size_2": boxes()["l"]}
+    notes, sequence = notes_and_frames(tmp_path / "a.csv", boxes(**hwl))
+    assert "sizes look like h, w, l" in notes
+    assert next(sequence.frames()).size[0] == pytest.approx([4.5, 1.9, 1.6])
+    swapped = boxes(l=boxes()["h"], h=boxes()["l"])
+    notes, sequence = notes_and_frames(tmp_path / "b.csv", swapped)
+    assert "sizes look like h, w, l, and not as their columns are named: --option sizes=hwl reads them so" in notes
+    assert next(sequence.frames()).size[0] == pytest.approx([1.6, 1.9, 4.5])
+    _, sequence = notes_and_frames(tmp_path / "c.csv", swapped, sizes="hwl")
+    assert next(sequence.frames()).size[0] == pytest.approx([4.5, 1.9, 1.6])
+
+
+def test_camera_axes_are_refused_until_they_are_named(tmp_path: Path) -> None:
+    """Boxes whose z runs over the road are not taken for z up; as camera boxes they stand where they are."""
+    plain = boxes()
+    camera = boxes(x=-plain["y"], y=-(plain["z"] - 0.5 * plain["h"]), z=plain["x"], yaw=-plain["yaw"] - np.pi / 2)
+    with pytest.raises(DatasetError, match="axes=camera"):
+        notes_and_frames(tmp_path / "a.csv", camera)
+    _, sequence = notes_and_frames(tmp_path / "b.csv", camera, axes="camera")
+    same(sequence, only(TableDataset(table(tmp_path / "c.csv", plain))))
+
+
+def test_names_of_columns_are_many(tmp_path: Path) -> None:
+    """Lists, dotted names, units in brackets and the names of other tools are found."""
+    plain = boxes()
+    other = {
+        "timestamp [s]": plain["t"],
+        "center.x": plain["x"],
+        "center.y": plain["y"],
+        "center.z": plain["z"],
+        "boxLength": plain["l"],
+        "Width (m)": plain["w"],
+        "height_m": plain["h"],
+        "Heading_rad": plain["yaw"],
+        "confidence": plain["score"],
+        "category_name": plain["class"],
+        "weather": np.full(3 * FRAMES, "rain"),
+    }
+    notes, sequence = notes_and_frames(tmp_path / "a.csv", other)
+    assert "columns not used: weather" in notes
+    same(sequence, only(TableDataset(table(tmp_path / "b.csv", plain))))
+    east = {name: values for name, values in {**plain, "east": plain["x"]}.items() if name != "x"}
+    with pytest.raises(DatasetError, match=r"a column x \(--option column.x=NAME\)"):
+        notes_and_frames(tmp_path / "c.csv", east)
+    same(notes_and_frames(tmp_path / "d.csv", east, **{"column.x": "east"})[1], sequence)
+
+
+def test_lists_inside_rows_are_columns(tmp_path: Path) -> None:
+    """JSON Lines with `center`, `size` and `velocity` as lists read as flat columns do."""
+    plain = boxes()
+    lines = [
+        f'{{"t": {t}, "center": [{x}, {y}, {z}], "size": [{length}, {w}, {h}], "yaw": {yaw}, "score": {s}, '
+        f'"class": "{c}", "velocity": [1.0, 2.0]}}'
+        for t, x, y, z, length, w, h, yaw, s, c in zip(*(plain[name].tolist() for name in plain), strict=True)
+    ]
+    path = tmp_path / "a.jsonl"
+    path.write_text("\n".join(lines))
+    sequence = only(TableDataset(path))
+    same(sequence, only(TableDataset(table(tmp_path / "b.csv", plain))))
+    velocity = next(sequence.frames()).velocity
+    assert velocity is not None
+    assert velocity.tolist() == [[1.0, 2.0]] * 3
+
+
+def test_recordings_and_sensors_are_told_apart_by_their_columns(tmp_path: Path) -> None:
+    """Each recording and sensor is a sequence of its own; rows in any order come in the order of their stamps."""
+    plain = boxes()
+    twice = {name: np.concatenate([values, values])[::-1] for name, values in plain.items()}
+    twice["log"] = np.repeat(["two", "one"], 3 * FRAMES)
+    twice["lidar"] = np.full(6 * FRAMES, "front")
+    dataset = TableDataset(table(tmp_path / "a.csv", twice))
+    names = [one.name for one in dataset.sequences(["all"])]
+    assert names == ["two.front", "one.front"]
+    for one in dataset.sequences(["all"]):
+        stamps = [frame.stamp_ns for frame in one.frames()]
+        assert stamps == sorted(stamps)
+        assert len(stamps) == FRAMES
+
+
+def test_poses_carry_boxes_to_the_world(tmp_path: Path) -> None:
+    """With columns of a pose boxes are in the frame of the sensor, and so is the truth, which comes in the world."""
+    plain = boxes(ego_x=np.full(3 * FRAMES, 100.0), ego_y=np.zeros(3 * FRAMES), ego_yaw=np.full(3 * FRAMES, np.pi / 2))
+    sequence = only(TableDataset(table(tmp_path / "a.csv", {**plain, "id": np.tile([1, 2, 3], FRAMES)})))
+    truth = sequence.truth()
+    assert truth is not None
+    assert truth.center[0] == pytest.approx([100.0, 0.0, 0.8])
+    assert truth.yaw[0] == pytest.approx(np.pi / 2)
+    assert sequence.poses[0].quaternion == pytest.approx([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+
+
+def test_a_row_with_a_stamp_alone_is_a_frame_without_detections(tmp_path: Path) -> None:
+    """Missing frames are counted and said; rows that hold nothing but their stamp are frames."""
+    plain = boxes()
+    kept = (plain["t"] < 0.95) | (plain["t"] > 1.25)
+    some = {name: values[kept] for name, values in plain.items()}
+    notes, sequence = notes_and_frames(tmp_path / "a.csv", some)
+    assert "3 frames at 10 Hz have no row" in notes
+    assert len(sequence) == FRAMES - 3
+    text = (tmp_path / "a.csv").read_text() + "1.0,,,,,,,,,\n1.1,,,,,,,,,\n1.2,,,,,,,,,\n"
+    (tmp_path / "b.csv").write_text(text)
+    dataset = TableDataset(tmp_path / "b.csv")
+    assert "no row" not in " ".join(dataset.notes)
+    assert [len(frame) for frame in only(dataset).frames()] == [3] * 10 + [0] * 3 + [3] * 17
+
+
+def test_stamps_match_the_nearest_frame() -> None:
+    """A stamp belongs to the frame that is nearest, within half the time between frames."""
+    stamps = np.arange(5) * 100
+    assert match_stamps(stamps, np.array([0, 49, 51, 120, 400, 449, 460, -60])).tolist() == [0, 0, 1, 1, 4, 4, -1, -1]
+
+
+def test_a_table_in_gives_a_table_out(tmp_path: Path) -> None:
+    """`optipmb track d.csv --out t.csv`: rows keep the times and name the detections; evaluation finds three tracks."""
+    plain = boxes()
+    data = table(tmp_path / "d.csv", plain)
+    truth = {name: plain[name] for name in ("t", "x", "y", "z", "l", "w", "h", "yaw", "class")}
+    table(tmp_path / "truth.csv", {**truth, "id": np.tile([1, 2, 3], FRAMES)})
+    done = optipmb("track", data, "--out", tmp_path / "t.csv")
+    assert done.returncode == 0, done.stderr
+    assert "profile auto: " in done.stderr
+    tracks = read_table(tmp_path / "t.csv")
+    assert sorted(set(tracks["t"].tolist())) == sorted(set(plain["t"].tolist()))
+    rows = tracks["detection_row"][~np.isnan(tracks["detection_row"])].astype(int)
+    assert len(rows) > 2.8 * FRAMES
+    np.testing.assert_allclose(tracks["x"][: len(rows)], plain["x"][rows], atol=0.5)
+    assert np.isnan(tracks["vx"][tracks["age"] == 0.0]).all()
+    assert not np.isnan(tracks["vx"][tracks["age"] > 0.0]).any()
+    asked = ("evaluate", data, "--truth", tmp_path / "truth.csv", "--tracks", tmp_path / "t.csv", "--json")
+    figures = result_of(optipmb(*asked))
+    for name in CLASSES:
+        assert figures["classes"][name]["all"]["MOTA"] == pytest.approx(1.0)
+        assert figures["classes"][name]["all"]["IDS"] == 0
+
+
+def test_processes_give_the_bytes_of_one(tmp_path: Path) -> None:
+    """`--jobs 2` over four recordings writes the same table as one process, and the same files into a folder."""
+    plain = boxes()
+    four = {name: np.concatenate([values] * 4) for name, values in plain.items()}
+    data = table(tmp_path / "d.parquet", {**four, "log": np.repeat(["a", "b", "c", "d"], 3 * FRAMES)})
+    for jobs in ("1", "2"):
+        assert optipmb("track", data, "--out", tmp_path / jobs / "t.jsonl", "--jobs", jobs).returncode == 0
+        assert optipmb("track", data, "--out", tmp_path / jobs / "files", "--jobs", jobs, "--full").returncode == 0
+    files = sorted(path.relative_to(tmp_path / "1") for path in (tmp_path / "1").rglob("*") if path.is_file())
+    assert len(files) == 9
+    for path in files:
+        assert (tmp_path / "1" / path).read_bytes() == (tmp_path / "2" / path).read_bytes(), path
+
+
+def test_other_datasets_are_written_as_tables_too(tmp_path: Path) -> None:
+    """A generated scene tracked into one table evaluates as its result files do, to their rounding."""
+    data = ("--dataset", "scene", "--option", "frames=30", "--option", "clouds=0")
+    for out in (tmp_path / "t.feather", tmp_path / "files"):
+        assert optipmb("track", *data, "--out", out).returncode == 0
+    figures = [
+        result_of(optipmb("evaluate", *data, "--tracks", out, "--json"))["classes"]
+        for out in (tmp_path / "t.feather", tmp_path / "files")
+    ]
+    for name, one in figures[1].items():
+        assert figures[0][name]["all"]["MOTA"] == pytest.approx(one["all"]["MOTA"])
+        assert figures[0][name]["gospa"]["all"]["GOSPA"] == pytest.approx(one["gospa"]["all"]["GOSPA"], abs=1e-5)
+
+
+def test_a_dataset_is_guessed_from_its_file(tmp_path: Path) -> None:
+    """A folder of tables is a dataset of as many recordings; a file of no known kind is refused with the known ones."""
+    for name in ("one", "two"):
+        table(tmp_path / "many" / f"{name}.csv", boxes())
+    dataset = open_dataset("table", tmp_path / "many")
+    assert [one.name for one in dataset.sequences(["all"])] == ["one", "two"]
+    (tmp_path / "a.xyz").write_text("nothing")
+    done = optipmb("track", tmp_path / "a.xyz")
+    assert done.returncode == 2
+    assert "expected a table (.csv, .parquet, .jsonl, .feather)" in done.stderr
