@@ -53,7 +53,9 @@ def commented(source: str) -> str:
         names = [match[1] for line in lines if (match := _FIELD.fullmatch(line))]
         if names != [name for name in model.model_fields if name in names] or len(names) != len(model.model_fields):
             odd = sorted(set(names) ^ set(model.model_fields)) or "their order"
-            raise ValueError(f"{SOURCE}: fields of {model.__name__} differ from its model: {odd}")
+            raise ValueError(
+                f"{SOURCE}: fields of {model.__name__} differ from its model: {odd}; new ones get the next free number"
+            )
         described = [
             text
             for name, line in zip(names, lines, strict=True)

@@ -67,7 +67,7 @@ class Selection:
         if self._area is not None:
             rows &= inside(tracks.center[:, :2], self._area)
         names = tracks.arrays if self._fields is None else self._fields
-        return {name: getattr(tracks, name)[rows] for name in names}
+        return {name: column[rows] for name in names if (column := getattr(tracks, name)) is not None}
 
 
 class Pace:
