@@ -2,6 +2,12 @@
 
     import optipmb
 
+    tracker = optipmb.OnlineTracker("kitti")
+    for t, boxes in detections:
+        tracks = tracker.update(boxes, t=t)
+
+Or as a pure function, from a density and a frame to the next density and tracks:
+
     parameters = optipmb.load_profile("nuscenes")
     tracker = optipmb.Tracker(parameters)
     density = tracker.initial()
@@ -21,6 +27,7 @@ from optipmb.extract import Tracks
 from optipmb.frame import Frame, PointCloud, Pose, make_frame
 from optipmb.generic import generic_parameters
 from optipmb.geometry import bev_iou
+from optipmb.online import OnlineTracker, OnlineTracks
 from optipmb.parameters import (
     Calibration,
     ClassParameters,
@@ -35,6 +42,8 @@ from optipmb.soundness import sound
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
 from optipmb.warm import warm_up
 
+__version__ = "0.1.0"
+
 __all__ = [
     "Bernoullis",
     "Calibration",
@@ -47,6 +56,8 @@ __all__ = [
     "FrameError",
     "HeadingSign",
     "Modules",
+    "OnlineTracker",
+    "OnlineTracks",
     "OptipmbError",
     "ParameterError",
     "Parameters",
