@@ -33,13 +33,20 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 
 install: $(VENV)/.installed
 
-demo: install
-	$(BIN)/optipmb demo --out out/demo
+# What the demo needs, and no tools of developers; in the environment of developers it is all there.
+DEMO ?= $(if $(wildcard $(VENV)/.installed),$(VENV),.venv-demo)
+$(DEMO)/bin/optipmb:
+	$(PYTHON) -m venv $(DEMO)
+	$(DEMO)/bin/python -m pip install --quiet --constraint requirements.lock ".[demo]"
+
+demo: $(DEMO)/bin/optipmb
+	$(DEMO)/bin/optipmb demo --out out/demo
 
 stack: install
 	$(BIN)/python docker/stack.py --work out/stack
 
-test: lint types tests schemas wheel demo
+test: lint types tests schemas wheel
+	$(MAKE) demo
 
 # For figures, nothing else should run on the machine. SERVICE holds options of the service, SECONDS how long a run takes.
 load: install
@@ -115,5 +122,5 @@ $(FUZZ_TARGETS): fuzz-%: install
 	$(BIN)/python tests/fuzz/search.py $* $(FUZZ_S)
 
 clean:
-	rm -rf $(VENV) out build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-demo out build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -13,7 +13,7 @@ trap 'rm -rf "$work"' EXIT INT TERM
 "$bin/python" -m build --wheel --outdir "$work/dist" "$root" >"$work/build.log" 2>&1 || { cat "$work/build.log"; exit 1; }
 "$python" -m venv "$work/venv"
 "$work/venv/bin/python" -m pip install --quiet --disable-pip-version-check \
-  --constraint "$root/requirements.lock" "$work"/dist/optipmb-*.whl
+  --constraint "$root/requirements.lock" "$(echo "$work"/dist/optipmb-*.whl)[service]"
 
 cd "$work" # nothing of the source tree is importable from here
 unset PYTHONPATH

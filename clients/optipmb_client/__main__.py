@@ -1,6 +1,22 @@
-"""`python -m optipmb_client` is the command `optipmb`."""
+"""The command `optipmb`, which is also `python -m optipmb_client`."""
 
-from optipmb_client.cli import main
+import sys
+from typing import NoReturn
+
+from optipmb_client.extras import to_install
+
+
+def main() -> NoReturn:
+    """Run the command line of this process and exit; say what to install where its packages are missing."""
+    try:
+        from optipmb_client import cli  # noqa: PLC0415 - packages of an extra
+    except ModuleNotFoundError as error:
+        text = to_install(error.name or "", "the command optipmb")
+        if text is None:
+            raise
+        sys.exit(f"optipmb: {text}")
+    cli.main()
+
 
 if __name__ == "__main__":
     main()

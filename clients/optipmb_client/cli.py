@@ -28,6 +28,7 @@ from optipmb_client.commands.warm_up import warm_up
 from optipmb_client.commands.watch import watch
 from optipmb_client.datasets import DatasetError
 from optipmb_client.errors import ClientError, UsageError
+from optipmb_client.extras import to_install
 
 __all__ = ["app", "main", "run"]
 
@@ -69,10 +70,13 @@ def run(arguments: Sequence[str]) -> int:
         return int(result or 0)
     except _OptionError as error:
         return _fail(WRONG, error.format_message())
-    except (UsageError, DatasetError, MessageError) as error:
-        return _fail(WRONG, str(error))
-    except ClientError as error:
-        return _fail(FAILED, str(error))
+    except ModuleNotFoundError as error:
+        text = to_install(error.name or "", f"optipmb {arguments[0]}")
+        if text is None:
+            raise
+        return _fail(FAILED, text)
+    except (UsageError, DatasetError, MessageError, ClientError) as error:
+        return _fail(FAILED if isinstance(error, ClientError) else WRONG, str(error))
     except OSError as error:
         return _fail(WRONG, f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except (KeyboardInterrupt, typer.Abort):

@@ -9,8 +9,12 @@ def main() -> None:
     """Run the command line; `health` without loading anything of the tracker: containers ask every few seconds."""
     if sys.argv[1:2] == ["health"]:
         sys.exit(health_command.main(sys.argv[2:]))
-    from optipmb_service.app import cli  # noqa: PLC0415 - a second that `health` can do without
-
+    try:
+        from optipmb_service.app import cli  # noqa: PLC0415 - a second that `health` can do without
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("optipmb"):
+            raise
+        sys.exit(f"optipmb-service needs {error.name}, which is not installed: pip install 'optipmb[service]'")
     cli.main()
 
 

@@ -7,6 +7,7 @@ import typer
 
 from optipmb_client.commands.options import AsJson, Out, print_json, say
 from optipmb_client.commands.replay import complain
+from optipmb_client.extras import needed
 from optipmb_client.progress import FrameProgress
 
 
@@ -21,6 +22,7 @@ def demo(
 
     The service is a process of its own on a free port and ends with the demo.
     """
+    needed("optipmb demo", "demo", "uvicorn", "starlette", "structlog", "prometheus_client", "scipy")
     from optipmb_client.demo import demonstrate  # noqa: PLC0415  loads what only this command needs
 
     with FrameProgress("replaying", frames) as progress:

@@ -56,7 +56,7 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     """Compare result files with the truth, per class.
 
     CLEAR MOT figures, HOTA of centres in the plane, GOSPA and OSPA; of KITTI, AB3DMOT's protocol and the HOTA of image
-    boxes (where TrackEval is installed). Tracks that were written with --full are tested for calibration too.
+    boxes. Tracks that were written with --full are tested for calibration too.
 
     No detections are needed; where they are named, or there is just one detector, only its classes are evaluated.
 

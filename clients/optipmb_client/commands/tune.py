@@ -27,6 +27,7 @@ from optipmb_client.commands.options import (
     say,
 )
 from optipmb_client.errors import UsageError
+from optipmb_client.extras import needed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -74,6 +75,8 @@ def tune(  # noqa: PLR0913  these are the command's options
     from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
     from optipmb_client.offline import read_profile  # noqa: PLC0415  as above
 
+    if not estimate_only:
+        needed("optipmb tune", "tune", "optuna")
     if metric not in METRICS:
         raise UsageError(f"--metric: one of {', '.join(METRICS)}, received {metric!r}")
     asked = asked_for(data, dataset, root, detections, option, truth)

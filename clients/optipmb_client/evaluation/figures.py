@@ -12,13 +12,12 @@ import numpy as np
 
 from optipmb_client.datasets import DataSequence, DatasetError, Truth
 from optipmb_client.datasets.nuscenes import CLASS_RANGE, NuScenesSequence
-from optipmb_client.errors import ClientError
 from optipmb_client.evaluation.ab3dmot import IOU_LIMITS, Ab3dmotResult, ab3dmot_rules, evaluate_ab3dmot
 from optipmb_client.evaluation.calibration import CalibrationResult, evaluate_calibration
 from optipmb_client.evaluation.cases import Case, Rules, prepare
 from optipmb_client.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate_gospa
 from optipmb_client.evaluation.hota import HotaResult, evaluate_hota
-from optipmb_client.evaluation.hota_2d import evaluate_hota_2d, hota_2d_rules
+from optipmb_client.evaluation.hota_2d import hota_2d_rules
 from optipmb_client.evaluation.run import default_rules
 from optipmb_client.evaluation.tracks import read_full_tracks, read_tracks
 from optipmb_client.results import ResultTable
@@ -61,7 +60,7 @@ class TrackFigures:
     threshold: float
     """Lowest mean score of these tracks; minus infinity for all."""
     hota_2d: HotaResult | None
-    """KITTI only, and only where TrackEval is installed."""
+    """KITTI only."""
     hota: HotaResult
     """Of centres in the plane."""
     gospa: GospaResult
@@ -189,7 +188,7 @@ class _Cases:
         sets = zip(_from_score(self._sets, threshold), self._frames, strict=True)
         return TrackFigures(
             threshold=threshold,
-            hota_2d=_hota_2d(_from_score(self._image, threshold)),
+            hota_2d=evaluate_hota(_from_score(self._image, threshold), hota_2d_rules()) if self._image else None,
             hota=evaluate_hota(_from_score(self._centres, threshold), self.near),
             gospa=evaluate_gospa(sets, self._cutoff, self._order),
         )
@@ -197,13 +196,6 @@ class _Cases:
 
 def _from_score(cases: Sequence[Case], threshold: float) -> list[Case]:
     return [case.keep(case.mean_scores() >= threshold) for case in cases]
-
-
-def _hota_2d(cases: Sequence[Case]) -> HotaResult | None:
-    try:
-        return evaluate_hota_2d(cases) if cases else None
-    except ClientError:
-        return None  # the package is an extra of the installation
 
 
 def _to_sensor(one: Recording) -> tuple[Truth, ResultTable, str]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optipmb_client.errors import UsageError
+from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.tuning.space import Dimension
 from optipmb_client.tuning.values import Value
 
@@ -58,7 +58,8 @@ class Search:
         seed: of all chance.
 
     Raises:
-        UsageError: Optuna is not installed, or the file has this study with other settings.
+        ClientError: Optuna is not installed.
+        UsageError: The file has this study with other settings.
     """
 
     def __init__(
@@ -193,6 +194,6 @@ def _load_optuna() -> Any:
             warnings.simplefilter("ignore")
             import optuna  # noqa: PLC0415  an extra that only this needs
     except ImportError as error:
-        raise UsageError("tuning needs Optuna: install optipmb[tune]") from error
+        raise ClientError("tuning needs optuna, which is not installed: pip install 'optipmb[tune]'") from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna
