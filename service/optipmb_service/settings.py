@@ -175,9 +175,6 @@ class Settings(BaseSettings):
     workers: int = Field(
         default=1, ge=1, le=64, description="processes that track, each a share of the streams; 1: this process itself"
     )
-    threads: int = Field(
-        default=1, ge=1, le=256, description="threads that track, per worker; more than one make the tail longer"
-    )
     max_pairs: int = Field(
         default=20_000,
         ge=100,
@@ -224,6 +221,13 @@ class Settings(BaseSettings):
         default=256, ge=1, le=65536, description="megabytes kept for takeovers, over all streams; clouds go first"
     )
     stale_s: float = Field(default=2.0, gt=0, description="a stream without a frame for this long is logged as stale")
+    stuck_s: float = Field(
+        default=5.0,
+        ge=1,
+        le=600,
+        description="a tracking thread at one piece of work for this long is stuck, and so is a worker that gives no"
+        " sign: the process is not healthy, a worker is ended and replaced",
+    )
     grace_s: float = Field(default=1.0, ge=0, le=60, description="at the end, time for the frames already received")
     http: Annotated[str, AfterValidator(_address)] = Field(
         default="",

@@ -29,6 +29,8 @@ VICTIMS = {worker_of(f"kill/{name}/lidar", 2): f"kill/{name}/lidar" for name in 
 FRAMES = 12
 DEADLINE_S = 60.0
 END_S = 4.0
+LONGEST_SILENCE_S = 15.0
+"""Three times the default of `stuck_s`."""
 OPTIONS = ("--workers", "2", "--instance", "pair")
 
 
@@ -45,7 +47,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess
         assert wait_until_ended(children, 0.0) == set()
         assert (status, process.output) == (0, [])
         assert seconds < END_S
-        assert "worker_killed" not in process.errors
+        assert process.errors.count("worker_killed") == process.errors.count("worker_stuck")
 
 
 def status_when(node: Node, reached: Callable[[ServiceStatus], bool], instance: str = "pair") -> ServiceStatus:
@@ -127,6 +129,27 @@ def test_a_killed_worker_comes_back(service: ServiceProcess) -> None:
         assert newest[-1] == alone(sensors[1], 2)[1]
         shares = workers_of(node.ask(KEYS.status("pair"), ServiceStatus))
         assert all(shares[stream] == worker for worker, stream in VICTIMS.items())
+
+
+def test_a_stopped_worker_is_replaced(service: ServiceProcess) -> None:
+    """After SIGSTOP of a worker it is killed and started again, and its streams go on; the other never stops."""
+    sensors = {worker_of(f"stop/{name}/lidar", 2): Sensor(stream=f"stop/{name}/lidar") for name in "abcd"}
+    with Node(service.endpoint) as node:
+        node.send(*(sensor.detections(0) for sensor in sensors.values()))
+        for sensor in sensors.values():
+            node.tracks(sensor.stream, 1)
+        stopped = pid_of(service, 1)
+        began = time.monotonic()
+        os.kill(stopped, signal.SIGSTOP)
+        service.wait_log("worker_stuck")
+        silent_s = time.monotonic() - began
+        node.send(sensors[0].detections(1))
+        node.tracks(sensors[0].stream, 2)
+        status_when(node, lambda status: status.state == "ready")
+        assert pid_of(service, 1) != stopped
+        node.send(sensors[1].detections(1))
+        arrived(node, sensors[1].stream, 1)
+    assert silent_s < LONGEST_SILENCE_S
 
 
 def test_a_stream_can_be_moved(service: ServiceProcess) -> None:

@@ -119,6 +119,11 @@ class AggregateView:
         """Tell whether streams are tracked, be it not all of them."""
         return self.state() in {"ready", "degraded"} and "ready" in self._workers.states
 
+    def failure(self) -> str:
+        """Return which workers are not ready; empty while all are."""
+        states = enumerate(self._workers.states)
+        return ", ".join(f"worker {index}: {state}" for index, state in states if state != "ready")
+
     def state(self) -> str:
         """Return the state of the whole: degraded when a worker is down."""
         if self._ending:

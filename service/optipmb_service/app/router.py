@@ -33,6 +33,8 @@ class _Routing:
     """What a router reports: that it routes."""
 
     state: str = "ready"
+    stuck: bool = False
+    failure: str = ""
 
     def status(self) -> None:
         """Return nothing: a router has no streams."""

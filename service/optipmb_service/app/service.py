@@ -89,7 +89,7 @@ class Service:
         self._metrics = metrics or Metrics()
         self._transport = Transport(settings)
         self._reporter = ProblemReporter(self._transport.publish_problem, _log_problem)
-        self._scheduler = Scheduler(settings.threads)
+        self._scheduler = Scheduler()
         self._coordinator = Coordinator(settings.instance, self._transport, settings.lease_s)
         self._persistence = open_persistence(settings, self._coordinator.may_write, self._unkept)
         self._registry = Registry(
@@ -149,6 +149,16 @@ class Service:
     def give_up(self, stream: str, then: Callable[[], None]) -> bool:
         """End the session of a stream after what was received, then call `then`; False when there can be none."""
         return self._registry.command(stream, lambda actor: actor.hand_over(then), urgent=False)
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the tracking thread has been at one piece of work for too long."""
+        return self._scheduler.busy_s > self._settings.stuck_s
+
+    @property
+    def failure(self) -> str:
+        """Why the state is `degraded`; empty while it is not."""
+        return self._persistence.failure
 
     @property
     def state(self) -> str:
@@ -247,6 +257,9 @@ class Parent(Protocol):
     def ready(self, service: Service) -> None:
         """Say that streams are served."""
 
+    def beat(self) -> None:
+        """Give a sign of life; called by the control loop about twice a second once streams are served."""
+
 
 class NoParent:
     """A process of its own: prints the ready line.
@@ -272,6 +285,9 @@ class NoParent:
         """Print the line that starters wait for."""
         del service
         say_ready(self._settings)
+
+    def beat(self) -> None:
+        """Do nothing: nobody waits for a sign."""
 
 
 async def run(settings: Settings, profiles: Profiles, parent: Parent | None = None) -> int:
@@ -333,6 +349,7 @@ async def _serve(
     while not asked.is_set():
         await asked.wait(HOUSEKEEPING_S)
         service.housekeeping()
+        parent.beat()
     health.ends()
     ended = await asyncio.to_thread(service.stop)
     log.info("stopped", drained=ended)

@@ -4,8 +4,8 @@ With a router, the router lives in the parent, and the workers connect to it ove
 no password. Else the workers connect where the parent does. To the network the workers are one instance: the parent
 holds its alive token and answers its queries; the owner tokens of streams carry the names of the workers.
 
-A worker that dies is started again at once; if it dies again soon, after a pause that doubles. It has the same share of
-the streams then. The others do not notice.
+A worker that gives no sign of life for `stuck_s` is killed. One that dies is started again at once; if it dies again
+soon, after a pause that doubles. It has the same share of the streams then. The others do not notice.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from optipmb_service.app.loops import StopRequest, beat, say_ready, unless
 from optipmb_service.app.monitoring import monitoring
 from optipmb_service.app.private_folder import private_folder
 from optipmb_service.app.worker_process import WorkerProcess
+from optipmb_service.observability.health import BEAT_S
 from optipmb_service.runtime.ports import HttpError, TransportError
 from optipmb_service.zenoh import Transport
 
@@ -38,6 +39,9 @@ FIRST_PAUSE_S: Final = 0.5
 LONGEST_PAUSE_S: Final = 30.0
 STEADY_S: Final = 60.0
 """A worker that has lived for so long is taken for sound: if it dies, it is started again at once."""
+
+LATE_S: Final = 2.0
+"""A control loop that turns so late was frozen, or starved, and knows nothing of its workers."""
 
 END_S: Final = 3.0
 """Beyond the grace, how long workers may take to end before they are killed."""
@@ -64,6 +68,7 @@ class Supervisor:
         self.count = settings.workers
         self.states: list[State] = ["down"] * self.count
         self.restarts = [0] * self.count
+        self._was_ready = [False] * self.count
         self.began = False
         """Whether all workers have been ready at once."""
         self.failed: int | None = None
@@ -73,6 +78,8 @@ class Supervisor:
         self._lock = lock
         self._children: list[WorkerProcess | None] = [None] * self.count
         self._tasks: list[asyncio.Task[None]] = []
+        self._watching: asyncio.Task[None] | None = None
+        self._heard = [0.0] * self.count
         self._changed = asyncio.Event()
         self._moved: dict[str, int] = {}
         self._orders: dict[int, asyncio.Future[None]] = {}
@@ -82,6 +89,7 @@ class Supervisor:
     async def start(self) -> bool:
         """Start the workers and wait until all are ready; False when that will not be."""
         self._tasks = [asyncio.create_task(self._kept(index)) for index in range(self.count)]
+        self._watching = asyncio.create_task(self._watch())
         stop = asyncio.create_task(self._asked.wait())
         while not self._over and any(state != "ready" for state in self.states):
             self._changed.clear()
@@ -94,6 +102,8 @@ class Supervisor:
 
     async def stop(self) -> bool:
         """End the workers; False when one had to be killed."""
+        if self._watching is not None:
+            self._watching.cancel()
         if not self._asked.is_set():
             self._asked.ask("failed start")
         for child in self._children:
@@ -141,6 +151,24 @@ class Supervisor:
             async with asyncio.timeout(ORDER_S):
                 await asyncio.gather(*waits)
 
+    async def _watch(self) -> None:
+        """Kill workers that give no sign of life; they are started again."""
+        turned = time.monotonic()
+        while not self._over:
+            await asyncio.sleep(BEAT_S)
+            now, before = time.monotonic(), turned
+            turned = now
+            if now - before > LATE_S:
+                # This process was frozen itself: what the workers said meanwhile is still to be read.
+                self._heard = [now] * self.count
+                continue
+            for index, child in enumerate(self._children):
+                silent_s = now - self._heard[index]
+                if child is not None and self.states[index] == "ready" and silent_s > self._settings.stuck_s:
+                    log.error("worker_stuck", worker=index, silent_s=round(silent_s, 3))
+                    self._set(index, "down")
+                    child.kill()
+
     @property
     def _over(self) -> bool:
         return self._asked.is_set() or self.failed is not None
@@ -155,10 +183,11 @@ class Supervisor:
         while not self._over:
             child = self._children[index] = WorkerProcess(index, lambda event: self._take_in(index, event))
             self._set(index, "starting")
+            self._was_ready[index] = False
             began = time.monotonic()
             status = await child.run(settings, self.count, self._moved, self._lock)
             lived_s = time.monotonic() - began
-            never_ready = self.states[index] != "ready"
+            never_ready = not self._was_ready[index]
             self._set(index, "down")
             if self._asked.is_set():
                 return
@@ -174,8 +203,10 @@ class Supervisor:
                 await self._asked.wait(again_s)
 
     def _take_in(self, index: int, event: dict[str, Any]) -> None:
+        self._heard[index] = time.monotonic()
         match event:
             case {"event": "ready"}:
+                self._was_ready[index] = True
                 self._set(index, "ready")
             case {"event": "done", "order": int(number)} if (waits := self._orders.pop(number, None)) is not None:
                 if not waits.done():

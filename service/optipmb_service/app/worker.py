@@ -2,7 +2,8 @@
 
 Parent and worker talk in lines of JSON. The parent writes to the worker's stdin: first what it is to run with, then
 orders, and when stdin ends, so does the worker: the parent wants it, or is dead. The worker writes events to its
-stdout: `ready`, and the number of every order it has carried out. Logs go to stderr, which both share.
+stdout: `ready`, a beat twice a second, and the number of every order it has carried out. Logs go to stderr, which both
+share.
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ class SupervisingParent:
         self._lock = lock
         self._settings = settings
         self._service: Service | None = None
+        self._writing = threading.Lock()
 
     def begin(self, asked: StopRequest) -> None:
         """Follow the orders that come, and end with them."""
@@ -71,6 +73,11 @@ class SupervisingParent:
         """Say that streams are served."""
         self._service = service
         self._say(event="ready")
+
+    def beat(self) -> None:
+        """Give a sign of life, unless the tracking thread is stuck: then the parent is to replace this process."""
+        if self._service is not None and not self._service.stuck:
+            self._say(event="beat")
 
     def _listen(self, asked: StopRequest) -> None:
         for line in sys.stdin:
@@ -96,7 +103,8 @@ class SupervisingParent:
 
     def _say(self, **event: object) -> None:
         try:
-            print(json.dumps(event), flush=True)  # noqa: T201 - the parent reads it
+            with self._writing:
+                print(json.dumps(event), flush=True)  # noqa: T201 - the parent reads it
         except BrokenPipeError:
             log.warning("parent_gone")  # stdin has ended too, or will
 

@@ -50,9 +50,6 @@ class Store(Protocol):
     def load(self, stream: str) -> bytes | None:
         """Return the newest checkpoint of a stream, None without one."""
 
-    def load_all(self) -> Iterator[tuple[str, bytes]]:
-        """Iterate over the streams, by name, with the newest checkpoint of each."""
-
     def streams(self) -> tuple[str, ...]:
         """Return the streams that have a checkpoint, by name."""
 
@@ -139,12 +136,6 @@ class SqliteStore:
         with self._use() as connection:
             row = connection.execute(_NEWEST, (stream,)).fetchone()
         return None if row is None else bytes(row[0])
-
-    def load_all(self) -> Iterator[tuple[str, bytes]]:
-        """Iterate over the streams, by name, with the newest checkpoint of each."""
-        for stream in self.streams():
-            if (data := self.load(stream)) is not None:
-                yield stream, data
 
     def streams(self) -> tuple[str, ...]:
         """Return the streams that have a checkpoint, by name."""
@@ -237,10 +228,6 @@ class MemoryStore:
         """Return the newest checkpoint of a stream."""
         kept = self._kept.get(stream)
         return kept[-1] if kept else None
-
-    def load_all(self) -> Iterator[tuple[str, bytes]]:
-        """Iterate over the streams with their newest checkpoints."""
-        yield from [(stream, self._kept[stream][-1]) for stream in self.streams()]
 
     def streams(self) -> tuple[str, ...]:
         """Return the streams that have a checkpoint."""

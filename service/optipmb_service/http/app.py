@@ -38,6 +38,9 @@ class Source(Protocol):
     def state(self) -> str:
         """Return the state of the process."""
 
+    def failure(self) -> str:
+        """Return why the state is degraded; empty while it is not."""
+
     def status(self) -> schemas.ServiceStatus | None:
         """Return the service's own report; None while it starts."""
 
@@ -68,7 +71,10 @@ def _health(source: Source) -> Response:
 
 def _readiness(source: Source) -> Response:
     ready = source.ready()
-    return JSONResponse({"ready": ready, "state": source.state()}, status_code=200 if ready else UNAVAILABLE)
+    body: dict[str, object] = {"ready": ready, "state": source.state()}
+    if failure := source.failure():
+        body["failure"] = failure
+    return JSONResponse(body, status_code=200 if ready else UNAVAILABLE)
 
 
 def _answer(make: Callable[[], Response]) -> Callable[[Request], Response]:

@@ -33,6 +33,14 @@ class StatusSource(Protocol):
     def state(self) -> str:
         """How it is, as in the status."""
 
+    @property
+    def stuck(self) -> bool:
+        """Whether the thread that works has stopped working."""
+
+    @property
+    def failure(self) -> str:
+        """Why it is degraded; empty while it is not."""
+
     def status(self) -> schemas.ServiceStatus | None:
         """Return its report; None when it makes none."""
 
@@ -78,8 +86,14 @@ class ProcessHealth:
         return (time.monotonic_ns() - self._beat_ns) / 1e9
 
     def alive(self) -> bool:
-        """Tell whether the control loop turns."""
-        return self.beat_age_s() < STUCK_S
+        """Tell whether the control loop turns and the tracking thread works."""
+        service = self._service
+        return self.beat_age_s() < STUCK_S and not (service is not None and service.stuck)
+
+    def failure(self) -> str:
+        """Return why the service is degraded; empty while it is not."""
+        service = self._service
+        return "" if service is None else service.failure
 
     def state(self) -> str:
         """Return the state of the process."""
@@ -88,7 +102,7 @@ class ProcessHealth:
 
     def ready(self) -> bool:
         """Tell whether the service can be used."""
-        return self.state() in USABLE
+        return self.state() in USABLE and self.alive()
 
     def status(self) -> schemas.ServiceStatus | None:
         """Return the service's own report; None while it starts."""

@@ -58,7 +58,8 @@ EVENTS: Final = {
     "worker_started": "The parent has started a worker process.",
     "worker_ended": "A worker process has ended by itself, with this status (below 0: killed by this signal). It is"
     " started again after `again_s`, and its streams come back; until then the state is `degraded`.",
-    "worker_killed": "A worker process did not end in time.",
+    "worker_stuck": "A worker has given no sign of life for `silent_s`; it is killed and started again.",
+    "worker_killed": "A worker process did not end, or answer, in time.",
     "parent_gone": "A worker noticed that its parent has died, and ends.",
     "stream_moved": "An operator gave the stream to another worker.",
     "stop_asked": "SIGINT or SIGTERM came, or the parent ends its worker; it ends within two seconds.",

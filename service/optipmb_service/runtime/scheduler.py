@@ -1,48 +1,54 @@
-"""The threads that run the actors: one at a time per stream, streams in turn."""
+"""The thread that runs the actors: one at a time, streams in turn."""
 
 from __future__ import annotations
 
 import queue
 import threading
+import time
 from typing import Final, Protocol
 
 
 class Runnable(Protocol):
-    """What workers work on."""
+    """What the scheduler runs."""
 
     def work(self) -> bool:
         """Do a bounded piece of work; True: there is more."""
 
 
 class Scheduler:
-    """A few threads that work on whatever was submitted, first come first served.
+    """A thread that works on whatever was submitted, first come first served.
 
-    They are daemons: a step that does not end must not keep the process.
+    One is enough: most of a frame is under the interpreter's lock. It is a daemon: a step that does not end must not
+    keep the process.
     """
 
     _END: Final = None
 
-    def __init__(self, threads: int) -> None:
+    def __init__(self) -> None:
         self._queue: queue.SimpleQueue[Runnable | None] = queue.SimpleQueue()
-        self._threads = [
-            threading.Thread(target=self._run, name=f"worker-{number}", daemon=True) for number in range(threads)
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._began_ns: int | None = None
+        self._thread = threading.Thread(target=self._run, name="tracking", daemon=True)
+        self._thread.start()
 
-    def submit(self, worked: Runnable) -> None:
-        """Have a thread call `work`; what is being worked on must not be submitted."""
-        self._queue.put(worked)
+    def submit(self, runnable: Runnable) -> None:
+        """Have the thread call `work`; what is being worked on must not be submitted."""
+        self._queue.put(runnable)
+
+    @property
+    def busy_s(self) -> float:
+        """For how long the thread has been at its present piece of work; 0 while it waits."""
+        began_ns = self._began_ns
+        return 0.0 if began_ns is None else (time.monotonic_ns() - began_ns) / 1e9
 
     def close(self, timeout: float) -> bool:
-        """End the threads after what was submitted; False when some did not end in time (s)."""
-        for _ in self._threads:
-            self._queue.put(self._END)
-        for thread in self._threads:
-            thread.join(timeout / len(self._threads))
-        return not any(thread.is_alive() for thread in self._threads)
+        """End the thread after what was submitted; False when it did not end in time (s)."""
+        self._queue.put(self._END)
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
-        while (worked := self._queue.get()) is not self._END:
-            if worked.work():
-                self._queue.put(worked)
+        while (runnable := self._queue.get()) is not self._END:
+            self._began_ns = time.monotonic_ns()
+            if runnable.work():
+                self._queue.put(runnable)
+            self._began_ns = None

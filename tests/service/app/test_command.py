@@ -183,16 +183,18 @@ def test_json_logs_and_an_own_profile(tmp_path: Path) -> None:
 def test_settings_have_an_order(tmp_path: Path) -> None:
     """An option is above the environment, the environment above the file, and `config` says which it was."""
     file = tmp_path / "settings.toml"
-    file.write_text("instance = 'file'\nprefix = 'file/v1'\nthreads = 3\n[limits]\nmax_points = 10\nmax_bytes = 5000\n")
+    file.write_text(
+        "instance = 'file'\nprefix = 'file/v1'\nmax_sessions = 3\n[limits]\nmax_points = 10\nmax_bytes = 5000\n"
+    )
     environment = {"OPTIPMB_INSTANCE": "environment", "OPTIPMB_PREFIX": "env/v1", "OPTIPMB_LIMITS__MAX_POINTS": "20"}
     options = ("config", "--json", "--settings", str(file), "--instance", "option")
     with ServiceProcess(*options, environment=environment, listen=False) as service:
         assert service.wait_end(60) == 0
         printed = json.loads("\n".join(service.output))
     values, sources = printed["settings"], printed["sources"]
-    assert (values["instance"], values["prefix"], values["threads"]) == ("option", "env/v1", 3)
+    assert (values["instance"], values["prefix"], values["max_sessions"]) == ("option", "env/v1", 3)
     assert (values["limits"]["max_points"], values["limits"]["max_bytes"]) == (20, 5000)
-    assert [sources[name] for name in ("instance", "prefix", "threads", "listen")] == [
+    assert [sources[name] for name in ("instance", "prefix", "max_sessions", "listen")] == [
         "option",
         "environment",
         "file",

@@ -45,6 +45,11 @@ class Said:
 
     age_s: float = 0.1
     now: str = "ready"
+    why: str = ""
+
+    def failure(self) -> str:
+        """As told."""
+        return self.why
 
     def alive(self) -> bool:
         """Turns or not."""
@@ -126,6 +131,9 @@ def test_readiness_follows_the_state(state: str) -> None:
     source = Said()
     with served(source) as address:
         assert get(address, "/readyz") == (200, '{"ready":true,"state":"ready"}')
+        source.why = "disk full"
+        assert get(address, "/readyz") == (200, '{"ready":true,"state":"ready","failure":"disk full"}')
+        source.why = ""
         source.now = state
         assert get(address, "/readyz") == (503, f'{{"ready":false,"state":"{state}"}}')
         assert get(address, "/healthz")[0] == 200

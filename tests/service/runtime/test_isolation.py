@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -9,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from optipmb_schemas import Detections, Keys, ServiceStatus, SessionState
 from optipmb_service.cluster.store import MemoryStore, SqliteStore
+from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime import persistence
 from optipmb_service.runtime.persistence import STORE_FILE, CheckpointWriter
 from optipmb_service.session.session import Session
+from optipmb_service.session.values import MAX_COUNT
 from router import Node, Sensor, until
 
 import optipmb
@@ -43,8 +46,8 @@ def test_no_sequence_number_overflows_a_counter(start: Callable[..., Any], tmp_p
         status = node.ask(KEYS.status("test"), ServiceStatus)
         assert b"optipmb_gaps_total" in node.query(KEYS.metrics("test"))[0][2]
         until(lambda: set(SqliteStore(tmp_path / STORE_FILE).streams()) == {CAREFUL.stream, CARELESS.stream}, "kept")
-    assert state.gaps == LAST
-    assert {one.stream: one.gaps for one in status.sessions} == {CAREFUL.stream: 0, CARELESS.stream: LAST}
+    assert state.gaps == MAX_COUNT
+    assert {one.stream: one.gaps for one in status.sessions} == {CAREFUL.stream: 0, CARELESS.stream: MAX_COUNT}
     assert (status.state, service.state) == ("ready", "ready")
 
 
@@ -104,6 +107,30 @@ def test_a_stream_that_takes_too_long_rests(start: Callable[..., Any]) -> None:
         until(lambda: {one.state for one in service.status().sessions} == {"running"}, "the rest ends")
         node.send(CARELESS.detections(2))
         assert [one.seq for one in node.tracks(CARELESS.stream, 2)] == [0, 2]
+
+
+def test_a_tracking_thread_that_is_stuck_is_not_healthy(start: Callable[..., Any]) -> None:
+    """A step that does not end is seen from outside: neither alive nor ready, until it ends."""
+    gate = threading.Event()
+
+    class Stuck:
+        def __init__(self, parameters: optipmb.Parameters) -> None:
+            self._tracker = optipmb.Tracker(parameters)
+
+        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+            gate.wait(20)
+            return self._tracker.step(density, frame)
+
+    service, endpoint = start(tracker=Stuck, stuck_s=1.0)
+    health = ProcessHealth("test")
+    health.report(service)
+    with Node(endpoint) as node:
+        node.send(CARELESS.detections(0))
+        until(lambda: not health.alive(), "the thread is seen to be stuck")
+        assert not health.ready()
+        gate.set()
+        node.tracks(CARELESS.stream, 1)
+        until(lambda: health.beat() is None and health.alive() and health.ready(), "it works again")
 
 
 def test_a_checkpoint_that_cannot_be_made_is_its_streams_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -105,7 +105,7 @@ def test_workers_take_turns() -> None:
                 done.set()
             return self.left > 0
 
-    scheduler = Scheduler(1)
+    scheduler = Scheduler()
     gate = threading.Event()
 
     class Gate:
@@ -130,7 +130,7 @@ def test_a_stuck_worker_does_not_keep_the_scheduler() -> None:
             entered.set()
             return gate.wait(20) and False
 
-    scheduler = Scheduler(1)
+    scheduler = Scheduler()
     scheduler.submit(Stuck())
     assert entered.wait(20)
     assert not scheduler.close(0.05)
