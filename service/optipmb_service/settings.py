@@ -87,8 +87,9 @@ class LimitSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     max_bytes: int = Field(default=DEFAULT.max_bytes, ge=1024, le=2**30, description="bytes of a msgpack payload")
-    max_json_bytes: int = Field(
-        default=DEFAULT.max_json_bytes, ge=1024, le=2**30, description="bytes of a JSON payload"
+    max_json_bytes: int = Field(default=2**21, ge=1024, le=2**30, description="bytes of a JSON payload")
+    max_values: int = Field(
+        default=2**17, ge=64, description="values of one message; a number of a plain list counts as one"
     )
     max_points: int = Field(default=DEFAULT.max_points, ge=0, description="points of one cloud")
     max_detections: int = Field(default=DEFAULT.max_detections, ge=1, description="detections of one frame")
@@ -188,6 +189,20 @@ class Settings(BaseSettings):
         le=60,
         description="processor time that one message may take; a stream that takes more is degraded: its messages are"
         " refused for nine times as long",
+    )
+    stream_mb: int = Field(
+        default=128,
+        ge=4,
+        le=65536,
+        description="megabytes of messages that a stream may keep: a quarter each for those that wait, clouds, frames"
+        " held, and the window; the oldest go beyond it",
+    )
+    memory_mb: int = Field(
+        default=1024,
+        ge=16,
+        le=1_048_576,
+        description="megabytes of messages that all streams of a process keep, half of it for those that wait; beyond"
+        " it messages are shed, and the least recently used sessions are closed",
     )
     max_sessions: int = Field(
         default=1000, ge=1, le=100_000, description="streams tracked at once; further ones are refused"

@@ -33,6 +33,9 @@ log = structlog.get_logger("optipmb_service")
 class _Gateway:
     """What a gateway reports: whether it can be used."""
 
+    stuck: Final = False
+    failure: Final = ""
+
     def __init__(self, client: Client) -> None:
         self._client = client
 

@@ -91,7 +91,9 @@ class Service:
         self._reporter = ProblemReporter(self._transport.publish_problem, _log_problem)
         self._scheduler = Scheduler()
         self._coordinator = Coordinator(settings.instance, self._transport, settings.lease_s)
-        self._persistence = open_persistence(settings, self._coordinator.may_write, self._unkept)
+        self._persistence = open_persistence(
+            settings, self._coordinator.may_write, self._unkept, self._coordinator.owns
+        )
         self._registry = Registry(
             settings,
             profiles,

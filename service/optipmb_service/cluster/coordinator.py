@@ -104,6 +104,10 @@ class Coordinator:
         """Whether this instance may publish and store for a stream now."""
         return self._table.role(stream) is Role.OWNER and self._write_lease.valid(time.monotonic_ns())
 
+    def owns(self, stream: str) -> bool:
+        """Whether this instance owns a stream, also while its write lease has lapsed."""
+        return self._table.role(stream) is Role.OWNER
+
     def elsewhere(self, stream: str) -> bool:
         """Whether another instance tracks a stream."""
         return self._table.elsewhere(stream)

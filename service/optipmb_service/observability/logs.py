@@ -36,8 +36,8 @@ EVENTS: Final = {
     "session_quarantined": "Tracking a stream raised `error`: its frames are refused until a reset or another start of "
     "the publisher. Its last frames are saved; report them.",
     "stream_degraded": "A message took `took_s` of processor time; the stream's messages are refused for `refused_s`.",
-    "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` to another worker, or `superseded` "
-    "by another instance.",
+    "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` elsewhere, lacking `memory`, or "
+    "`superseded` by another instance.",
     "checkpoint_torn": "A checkpoint cannot be read; it is set aside and the one before it is used.",
     "checkpoint_refused": "Another instance has taken the stream over; this one's checkpoint was not written.",
     "checkpoint_failed": "The checkpoint of one stream cannot be made: a fault of the service, report it."

@@ -14,10 +14,9 @@ if TYPE_CHECKING:
     from optipmb_service.cluster.ownership import Role
     from optipmb_service.observability.metrics import Metrics
     from optipmb_service.observability.problem_reporter import ProblemReporter
+    from optipmb_service.runtime.byte_budget import ByteBudget
     from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.ports import MessageSink
-    from optipmb_service.runtime.takeover_buffer import ByteBudget
-    from optipmb_service.session.session import Session
     from optipmb_service.session.values import Lineage, Policy
 
 
@@ -64,6 +63,8 @@ class ActorContext:
         policy: waiting and restarting of sessions.
         queue_frames: most frames waiting per stream.
         queue_clouds: most clouds waiting per stream.
+        mailbox_bytes: most bytes waiting per stream.
+        mailboxes: bytes that may wait, over all streams.
         step_limit_ns: processor time that one message may take.
         outlet: where results go.
         problem reporter: where problems go.
@@ -75,7 +76,7 @@ class ActorContext:
         dump: saves what is needed to see an error of a session again; returns the file.
         room: whether a further session has room.
         admit: asked before a session begins; returns what the stream had before, None when there is no room.
-        release: called when a session has ended.
+        release: called when a session has ended, or was not begun, with what a later one has to know.
         discard: called when an actor without a session has nothing left to do.
         submit: sends a worker to an actor.
         arm: has `wake` of an actor called at a monotonic time (ns).
@@ -88,6 +89,8 @@ class ActorContext:
     policy: Policy
     queue_frames: int
     queue_clouds: int
+    mailbox_bytes: int
+    mailboxes: ByteBudget
     step_limit_ns: int
     sink: MessageSink
     reporter: ProblemReporter
@@ -99,7 +102,7 @@ class ActorContext:
     dump: Callable[[str, bytes], str]
     room: Callable[[], bool]
     admit: Callable[[str], Lineage | None]
-    release: Callable[[Session], None]
+    release: Callable[[str, Lineage], None]
     discard: Callable[[Actor], None]
     submit: Callable[[Actor], None]
     arm: Callable[[Actor, int], None]

@@ -1,15 +1,17 @@
 """A stream's bounded mailbox.
 
 Readers put in, one worker thread takes out. What is not urgent keeps its order. Point clouds go before frames, so that
-no frame goes on without a cloud that has long arrived; when too many wait, the oldest is shed and counted.
+no frame goes on without a cloud that has long arrived; when too many wait, or too many bytes, the oldest is shed and
+counted.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.ports import Packet
 
 if TYPE_CHECKING:
@@ -18,15 +20,23 @@ if TYPE_CHECKING:
     Command = Callable[[], None]
 
 
+UNLIMITED: Final = 2**62
+
+
 class Mailbox:
     """What waits for a stream's worker.
 
     Args:
         frames: most frames waiting.
         clouds: most point clouds waiting.
+        most_bytes: most bytes of messages waiting.
+        budget: bytes that wait in the mailboxes of all streams.
     """
 
-    def __init__(self, frames: int, clouds: int) -> None:
+    def __init__(self, frames: int, clouds: int, most_bytes: int = UNLIMITED, budget: ByteBudget | None = None) -> None:
+        self._most_bytes = most_bytes
+        self._budget = budget or ByteBudget(UNLIMITED)
+        self._bytes = 0
         self._lock = threading.Lock()
         self._urgent: deque[Command] = deque()
         self._clouds: deque[Packet] = deque()
@@ -61,9 +71,12 @@ class Mailbox:
             if self._closed:
                 return None
             if self._waiting >= self._most_frames:
-                self._shed()
-            self._frames.append(packet)
-            self._waiting += 1
+                self._shed_frame()
+            if self._fits(packet):
+                self._frames.append(packet)
+                self._waiting += 1
+            else:
+                self.shed_frames += 1
             return self._schedule()
 
     def offer_cloud(self, packet: Packet) -> bool | None:
@@ -72,9 +85,11 @@ class Mailbox:
             if self._closed:
                 return None
             if len(self._clouds) >= self._most_clouds:
-                self._clouds.popleft()
+                self._shed_cloud()
+            if self._fits(packet):
+                self._clouds.append(packet)
+            else:
                 self.shed_clouds += 1
-            self._clouds.append(packet)
             return self._schedule()
 
     def offer_command(self, command: Command, *, urgent: bool) -> bool | None:
@@ -105,14 +120,14 @@ class Mailbox:
             if urgent:
                 return None
             if self._clouds:
-                return "cloud", self._clouds.popleft()
+                return "cloud", self._taken(self._clouds.popleft())
             if not self._frames:
                 return None
             item = self._frames.popleft()
             if not isinstance(item, Packet):
                 return "command", item
             self._waiting -= 1
-            return "frame", item
+            return "frame", self._taken(item)
 
     @property
     def clouds_waiting(self) -> int:
@@ -136,11 +151,34 @@ class Mailbox:
         first, self._scheduled = not self._scheduled, True
         return first
 
-    def _shed(self) -> None:
-        """Drop the oldest frame; commands between the frames stay."""
+    def _fits(self, packet: Packet) -> bool:
+        """Make room for a message, by what is older; False when there is none even so, and it is not to be kept."""
+        while self._bytes + packet.held > self._most_bytes or not self._budget.take(packet.held):
+            if not (self._shed_cloud() or self._shed_frame()):
+                return False
+        self._bytes += packet.held
+        return True
+
+    def _taken(self, packet: Packet) -> Packet:
+        self._bytes -= packet.held
+        self._budget.add(-packet.held)
+        return packet
+
+    def _shed_cloud(self) -> bool:
+        """Drop the oldest cloud; False when there is none."""
+        if not self._clouds:
+            return False
+        self._taken(self._clouds.popleft())
+        self.shed_clouds += 1
+        return True
+
+    def _shed_frame(self) -> bool:
+        """Drop the oldest frame; commands between the frames stay. False when there is none."""
         for index, item in enumerate(self._frames):
             if isinstance(item, Packet):
                 del self._frames[index]
+                self._taken(item)
                 self._waiting -= 1
                 self.shed_frames += 1
-                return
+                return True
+        return False

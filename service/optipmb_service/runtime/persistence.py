@@ -12,8 +12,10 @@ service is `degraded`, and every interval tries again with the newest state.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
 import structlog
@@ -74,8 +76,11 @@ class Persistence(Protocol):
     def put(self, checkpoint: Checkpoint, then: Callable[[], None] | None = None) -> None:
         """Have a checkpoint written, and `then` called when that was tried."""
 
-    def recall(self, stream: str, restore: Callable[[Checkpoint], _T]) -> _T | None:
-        """Return what `restore` makes of the newest checkpoint of a stream, None without one."""
+    def recall(self, stream: str, restore: Callable[[Checkpoint], _T], then: Callable[[_T | None], None]) -> None:
+        """Call `then` with what `restore` makes of the newest checkpoint of a stream, None without one.
+
+        Both are called on another thread, soon: whoever tracks does not wait for the store.
+        """
 
     def close(self, timeout: float) -> None:
         """Write what is pending and end."""
@@ -104,9 +109,10 @@ class NoPersistence:
         if then is not None:
             then()
 
-    def recall(self, stream: str, restore: Callable[[Checkpoint], _T]) -> _T | None:  # noqa: ARG002 - see Persistence
+    def recall(self, stream: str, restore: Callable[[Checkpoint], _T], then: Callable[[_T | None], None]) -> None:
         """Remember nothing."""
-        return None
+        del stream, restore
+        then(None)
 
     def close(self, timeout: float) -> None:
         """Nothing is open."""
@@ -118,7 +124,8 @@ class CheckpointWriter:
     Args:
         store: where they go.
         interval_s: time between two rounds.
-        may_write: whether this process owns a stream.
+        may_write: whether this process owns a stream and may write for it now.
+        owns: whether it owns it, perhaps with a write lease that has lapsed.
         report: called with a stream whose checkpoint cannot be made, and why.
     """
 
@@ -130,7 +137,9 @@ class CheckpointWriter:
         interval_s: float,
         may_write: Callable[[str], bool],
         report: Callable[[str, str], None] = lambda *_: None,
+        owns: Callable[[str], bool] = lambda _: False,
     ) -> None:
+        self._owns = owns
         self._report = report
         self._store = store
         self._interval_s = interval_s
@@ -138,7 +147,8 @@ class CheckpointWriter:
         self._may_write = may_write
         self._lock = threading.Lock()
         self._pending: dict[str, Checkpoint] = {}
-        self._thens: list[Callable[[], None]] = []
+        self._thens: list[tuple[str, Callable[[], None]]] = []
+        self._reading = ThreadPoolExecutor(1, "restore")
         self._hurry = threading.Event()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="checkpoints", daemon=True)
@@ -172,11 +182,25 @@ class CheckpointWriter:
         with self._lock:
             self._pending[checkpoint.stream] = checkpoint
             if then is not None:
-                self._thens.append(then)
+                self._thens.append((checkpoint.stream, then))
         if then is not None:
             self._hurry.set()
 
-    def recall(self, stream: str, restore: Callable[[Checkpoint], _T]) -> _T | None:
+    def recall(self, stream: str, restore: Callable[[Checkpoint], _T], then: Callable[[_T | None], None]) -> None:
+        """Read the newest checkpoint of a stream on the thread that does so, and go on there with `then`."""
+
+        def read() -> None:
+            restored = None
+            try:
+                restored = self._recalled(stream, restore)
+            except Exception:
+                log.exception("internal_error", stream=stream)  # the stream begins anew
+            then(restored)
+
+        with contextlib.suppress(RuntimeError):  # at the end: it has closed
+            self._reading.submit(read)
+
+    def _recalled(self, stream: str, restore: Callable[[Checkpoint], _T]) -> _T | None:
         """Make a stream this process's own in the store; return what `restore` makes of its newest whole checkpoint.
 
         None when there is none, and also when the store fails: then the stream begins anew.
@@ -202,6 +226,7 @@ class CheckpointWriter:
         """Write what is pending and end; to be called when nothing is tracked any more."""
         self._ended.set()
         self._hurry.set()
+        self._reading.shutdown(wait=False, cancel_futures=True)
         if self._thread.is_alive():
             self._thread.join(timeout)
         self._write()
@@ -216,11 +241,17 @@ class CheckpointWriter:
                 self._write()
 
     def _write(self) -> None:
-        """Write all that is pending; what the store refuses stays pending."""
+        """Write all that is pending; what the store refuses, and what must wait for a write lease, stays pending."""
         with self._lock:
             taken, self._pending = self._pending, {}
             thens, self._thens = self._thens, []
         mine = {stream: checkpoint for stream, checkpoint in taken.items() if self._may_write(stream)}
+        # A lease that lapsed is renewed, or the stream is lost: until that is known its newest state is kept.
+        later = {
+            stream: checkpoint
+            for stream, checkpoint in taken.items()
+            if stream not in mine and self._owns(stream) and not self._ended.is_set()
+        }
         try:
             encoded = self._encoded(mine) if mine else {}
             lost = self._store.save(encoded) if encoded else ()
@@ -241,8 +272,12 @@ class CheckpointWriter:
                 self.complete_ns = time.monotonic_ns()
             for stream in lost:
                 log.warning("checkpoint_refused", stream=stream)
-        for then in thens:
-            then()
+        with self._lock:
+            self._pending = later | self._pending
+            self._thens += [one for one in thens if one[0] in later]
+        for stream, then in thens:
+            if stream not in later:
+                then()
 
     def _encoded(self, checkpoints: Mapping[str, Checkpoint]) -> dict[str, bytes]:
         """Encode one after the other, with pauses between them.
@@ -277,7 +312,10 @@ class CheckpointWriter:
 
 
 def open_persistence(
-    settings: Settings, may_write: Callable[[str], bool], report: Callable[[str, str], None]
+    settings: Settings,
+    may_write: Callable[[str], bool],
+    report: Callable[[str, str], None],
+    owns: Callable[[str], bool],
 ) -> Persistence:
     """Return the checkpoint writer; where its store cannot be opened, one that keeps nothing and says why."""
     folder = settings.folder
@@ -290,4 +328,4 @@ def open_persistence(
         # Tracking without memory is better than none; the status says that it is so.
         log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
         return NoPersistence(str(error))
-    return CheckpointWriter(store, settings.checkpoint_s, may_write, report)
+    return CheckpointWriter(store, settings.checkpoint_s, may_write, report, owns)

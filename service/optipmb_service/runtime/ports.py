@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas
+
+
+PACKET_BYTES: Final = 512
+"""What a message takes beside its payload, nearly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +32,11 @@ class Packet:
     encoding: str
     wall_ns: int
     now_ns: int
+
+    @property
+    def held(self) -> int:
+        """Bytes that it takes while it waits."""
+        return PACKET_BYTES + (0 if self.payload is None else self.size)
 
 
 class Publisher(Protocol):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import optipmb_schemas as schemas
@@ -16,6 +17,7 @@ import structlog
 
 import optipmb
 from optipmb_service.runtime.ports import TransportError
+from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.convert import density_of
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import RefusedError
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.ports import Request
     from optipmb_service.runtime.registry import Registry
     from optipmb_service.runtime.stream_actor import StreamActor
+    from optipmb_service.session.checkpoint import Checkpoint
 
 log = structlog.get_logger("optipmb_service")
 
@@ -54,6 +57,7 @@ class Queries:
         self._status = status
         self._metrics = metrics
         self._keys = registry.keys
+        self._digests = ThreadPoolExecutor(1, "digest")
 
     def about_service(self, request: Request) -> None:
         """Answer with the status of the service, its metrics, or both when the key has a `*`."""
@@ -83,7 +87,7 @@ class Queries:
             request.finish()  # another process has the stream, and answers
             return
         commands: dict[str, tuple[Callable[[StreamActor, Request], None], bool]] = {
-            "state": (self._state, True),
+            "state": (lambda *_: None, True),
             "density": (self._density, True),
             "reset": (self._reset, False),
             "parameters": (self._parameters, False),
@@ -95,6 +99,9 @@ class Queries:
         command, urgent = commands[name]
 
         def answer(actor: StreamActor) -> None:
+            if name == "state" and not actor.elsewhere:
+                self._later(self._state(actor), lambda state: _guarded(request, lambda: self._say(request, state)))
+                return
             # Where several instances run, the one that tracks the stream answers.
             _guarded(request, lambda: None if actor.elsewhere else command(actor, request))
 
@@ -134,19 +141,39 @@ class Queries:
 
     def _one_of_many(self, request: Request, left: _Countdown) -> Callable[[StreamActor], None]:
         def command(actor: StreamActor) -> None:
-            try:
-                self._state(actor, request)
-            except TransportError as error:
-                log.warning("reply_failed", key=request.key, error=str(error))
-            finally:
-                left.one()
+            def say(state: schemas.SessionState) -> None:
+                try:
+                    self._say(request, state)
+                except TransportError as error:
+                    log.warning("reply_failed", key=request.key, error=str(error))
+                finally:
+                    left.one()
+
+            self._later(self._state(actor), say)
 
         return command
 
-    # Run by the workers
+    def _say(self, request: Request, state: schemas.SessionState) -> None:
+        request.answer(self._keys.query(state.stream, "state"), state)
 
-    def _state(self, actor: StreamActor, request: Request) -> None:
-        request.answer(self._keys.query(actor.stream, "state"), actor.state() or self._nothing(actor.stream, "new"))
+    def _later(
+        self, state: tuple[schemas.SessionState, Checkpoint | None], then: Callable[[schemas.SessionState], None]
+    ) -> None:
+        """Go on with a state that has its digest, on the thread that makes digests: it encodes a whole checkpoint."""
+
+        def work() -> None:
+            said, checkpoint = state
+            then(said if checkpoint is None else said.model_copy(update={"digest": digest_of(checkpoint)}))
+
+        self._digests.submit(work)
+
+    # Run by the tracking thread
+
+    def _state(self, actor: StreamActor) -> tuple[schemas.SessionState, Checkpoint | None]:
+        state = actor.state()
+        if state is None or actor.session is None:
+            return self._nothing(actor.stream, "new"), None
+        return state, actor.session.snapshot()
 
     def _density(self, actor: StreamActor, request: Request) -> None:
         session = actor.session
@@ -169,7 +196,9 @@ class Queries:
             state = session.state(closed=True)
         elif session is not None:
             actor.deliver(session.reset())
-            state = actor.state() or state
+            state, checkpoint = self._state(actor)
+            if checkpoint is not None:
+                state = state.model_copy(update={"digest": digest_of(checkpoint)})
         request.answer(self._keys.query(actor.stream, "reset"), state)
 
     def _parameters(self, actor: StreamActor, request: Request) -> None:

@@ -18,9 +18,9 @@ import optipmb
 from optipmb_service.cluster.assignment import Assignment
 from optipmb_service.cluster.ownership import RoleChange
 from optipmb_service.runtime import dumps
+from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.context import Actor, ActorContext, Ownership
 from optipmb_service.runtime.stream_actor import StreamActor
-from optipmb_service.runtime.takeover_buffer import ByteBudget
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import SECOND, Lineage, MessageCounters, Policy
 
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.ports import MessageSink, Packet
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.runtime.scheduler import Scheduler
-    from optipmb_service.session.session import Session
     from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
@@ -49,6 +48,9 @@ DUMPS: Final = "quarantine"
 MAX_DUMPS: Final = 32
 
 MEGABYTE: Final = 2**20
+
+PARTS: Final = 4
+"""What a stream's memory is divided into: mailbox, clouds, frames held, window."""
 
 MAX_KEYS: Final = 8192
 """Keys whose stream is remembered."""
@@ -102,6 +104,7 @@ class Registry:
         self._streams: dict[str, str] = {}
         self._past = MessageCounters()
         self._metrics = metrics
+        self._mailboxes = ByteBudget(settings.memory_mb * MEGABYTE // 2)
         self._context = ActorContext(
             instance=settings.instance,
             limits=self.limits,
@@ -110,6 +113,9 @@ class Registry:
                 cloud_wait_ns=round(settings.cloud_wait_s * SECOND),
                 cloud_memory_ns=round(settings.cloud_memory_s * SECOND),
                 clouds=settings.queue_clouds,
+                cloud_bytes=settings.stream_mb * MEGABYTE // PARTS,
+                held_bytes=settings.stream_mb * MEGABYTE // PARTS,
+                rewind_bytes=settings.stream_mb * MEGABYTE // PARTS,
                 rewind_ns=round(settings.rewind_s * SECOND),
                 late_clouds=settings.late_clouds,
                 recovery_wait_ns=round(settings.recovery_wait_s * SECOND),
@@ -117,6 +123,8 @@ class Registry:
             ),
             queue_frames=settings.queue_frames,
             queue_clouds=settings.queue_clouds,
+            mailbox_bytes=settings.stream_mb * MEGABYTE // PARTS,
+            mailboxes=self._mailboxes,
             step_limit_ns=round(settings.step_limit_s * SECOND),
             sink=sink,
             reporter=reporter,
@@ -214,10 +222,22 @@ class Registry:
                 log.warning("stream_stale", stream=actor.stream, age_s=round(age_s, 3))
             if now_ns - actor.meter.active_ns > self._settings.idle_s * SECOND:
                 self.command(actor.stream, self._close_idle, urgent=False)
+        self._evict()
         with self._lock:
             waiting = [actor for actor in self._actors.values() if actor.buffers_for_takeover]
         for actor in waiting:
             actor.tell(StreamActor.trim)
+
+    def _evict(self) -> None:
+        """Close sessions, the least recently used first, while all together keep more than the process may."""
+        held = [(actor.meter.active_ns, actor.held_bytes, actor) for actor in self.actors()]
+        excess = sum(size for _, size, _ in held) - self._settings.memory_mb * MEGABYTE // 2
+        for _, size, actor in sorted(held, key=lambda one: one[0]):
+            if excess <= 0:
+                return
+            excess -= size
+            self._report("refused", actor.stream, f"messages of at most {self._settings.memory_mb} MB", "more, in all")
+            self.command(actor.stream, lambda one: one.close_session("memory"), urgent=False)
 
     def changed(self, stream: str, change: RoleChange) -> None:
         """Tell a stream's worker that this instance owns the stream now, or does not."""
@@ -293,10 +313,10 @@ class Registry:
             self._sessions += 1
             return self._lives.pop(stream, Lineage())
 
-    def _release(self, session: Session) -> None:
+    def _release(self, stream: str, lineage: Lineage) -> None:
         with self._lock:
             self._sessions -= 1
-            self._lives[session.stream] = session.life
+            self._lives[stream] = lineage
             if len(self._lives) > MAX_LIVES:
                 self._lives.popitem(last=False)
 

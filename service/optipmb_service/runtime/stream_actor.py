@@ -22,7 +22,7 @@ from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.stream_counters import StreamCounters
 from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 from optipmb_service.runtime.track_publisher import Arrival, TrackPublisher
-from optipmb_service.session.checkpoint import Checkpoint, digest_of, forgotten
+from optipmb_service.session.checkpoint import Checkpoint, forgotten
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Begun, Output, Quarantined, Tracked
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from optipmb_service.runtime.context import ActorContext
-    from optipmb_service.session.values import MessageCounters
+    from optipmb_service.session.values import Lineage, MessageCounters
 
 log = structlog.get_logger("optipmb_service")
 
@@ -39,7 +39,10 @@ REST: Final = 9
 """How many times as long as a message took beyond its limit a stream rests: it has a tenth of the time at most."""
 
 BATCH: Final = 8
-"""Items that a worker takes before the other streams have their turn."""
+"""Items that the thread takes before the other streams have their turn."""
+
+TURN_NS: Final = 5_000_000
+"""Processor time after which they have it in any case."""
 
 
 class StreamActor:
@@ -52,7 +55,7 @@ class StreamActor:
 
     def __init__(self, stream: str, context: ActorContext) -> None:
         self.stream = stream
-        self.mailbox = Mailbox(context.queue_frames, context.queue_clouds)
+        self.mailbox = Mailbox(context.queue_frames, context.queue_clouds, context.mailbox_bytes, context.mailboxes)
         self.meter = StreamMeter(time.monotonic_ns())
         self.session: Session | None = None
         self.stale = False
@@ -66,6 +69,8 @@ class StreamActor:
         self._changed = False
         self._armed_ns: int | None = None
         self._degraded_ns = 0
+        self._opening: Lineage | None = None
+        self._grant = 0
 
     def wake(self) -> None:
         """Send a worker though nothing came: frames have waited long enough."""
@@ -81,11 +86,14 @@ class StreamActor:
 
     def work(self) -> bool:
         """Take some of what waits; True: come again."""
+        ends_ns = time.thread_time_ns() + TURN_NS
         for _ in range(BATCH):
             taken = self.mailbox.take(urgent=self._paused)
             if taken is None:
                 break
             self._guard(self._handle, *taken)
+            if time.thread_time_ns() >= ends_ns:
+                break
         paused = self._paused
         if not paused:
             self._out.flush()
@@ -122,7 +130,13 @@ class StreamActor:
     @property
     def buffers_for_takeover(self) -> bool:
         """Whether packets wait here for a takeover; may be called by any thread."""
-        return self.session is None and bool(self._takeover)
+        return self.session is None and self._opening is None and bool(self._takeover)
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of messages that the session keeps; may be called by any thread."""
+        session = self.session
+        return 0 if session is None else session.held_bytes
 
     def _guard(self, work: Callable[..., None], *arguments: Any, **named: Any) -> None:
         """Do a piece of work; whatever it raises, the stream and its worker go on."""
@@ -252,7 +266,15 @@ class StreamActor:
 
     def _buffer(self, packet: Packet, *, frame: bool) -> None:
         """Keep a packet for the moment when this instance owns the stream, and ask for it if nobody does."""
-        if self._context.coordinator.role(self.stream) is Role.NONE:
+        coordinator = self._context.coordinator
+        if coordinator.role(self.stream) is Role.NONE:
+            if coordinator.elsewhere(self.stream):
+                # Another instance tracks it, which decodes and complains; here it is kept for a takeover, if there is
+                # room for one.
+                if self._context.room():
+                    coordinator.request(self.stream)
+                    self._takeover.add(packet, frame=frame)
+                return
             if self._read(packet, frame=frame) is None or not self._admitted(frame=frame):
                 return
             self._context.coordinator.request(self.stream)
@@ -274,8 +296,20 @@ class StreamActor:
         """This instance owns the stream: go on where its last owner was, with all that came since."""
         if self._context.coordinator.role(self.stream) is not Role.OWNER:
             return  # given up meanwhile, or lost again, which will be told too
-        if self.session is None and self._open() is None:
+        self._grant += 1
+        if self.session is not None:
+            self._resume()
+        elif self._opening is None:
+            self._opening = self._context.admit(self.stream)
+            if self._opening is not None:
+                self._load()
+                return
+            self._admitted(frame=True)
             self._context.coordinator.release(self.stream)
+            self._resume()
+
+    def _resume(self) -> None:
+        """Go on with what came while nobody tracked the stream here."""
         for packet, frame in self._takeover.take():
             if self.session is not None:
                 self._guard(self._receive, packet, frame=frame)
@@ -323,14 +357,9 @@ class StreamActor:
         )
         return False
 
-    def _open(self) -> Session | None:
-        """Begin a session, or go on with the one that was kept; None when the service has no room for another."""
-        life = self._context.admit(self.stream)
-        if life is None:
-            self._admitted(frame=True)
-            return None
-        self._out.open()
-        context = self._context
+    def _load(self) -> None:
+        """Have the session restored on the thread of the store; packets wait meanwhile."""
+        context, grant = self._context, self._grant
 
         def restore(checkpoint: Checkpoint) -> Session:
             now_ns = time.monotonic_ns()
@@ -338,21 +367,48 @@ class StreamActor:
                 checkpoint, now_ns, context.policy, instance=context.instance, tracker=context.tracker
             )
 
-        session = context.persistence.recall(self.stream, restore)
-        if session is None:
-            parameters = context.parameters_of(self.stream)
+        context.persistence.recall(
+            self.stream, restore, lambda restored: self.tell(lambda actor: actor.on_loaded(restored, grant))
+        )
+
+    def on_loaded(self, restored: Session | None, grant: int) -> None:
+        """Begin a session, or go on with the one that was kept; unless the stream was lost meanwhile."""
+        lineage, self._opening = self._opening, None
+        if lineage is None:
+            return
+        if self._context.coordinator.role(self.stream) is not Role.OWNER:
+            self._context.release(self.stream, lineage)
+            self._answer()
+            return
+        if grant != self._grant:
+            # Lost and granted again: another instance may have gone on in between.
+            self._opening = lineage
+            self._load()
+            return
+        self._begin(restored, lineage)
+        self._resume()
+
+    def _begin(self, restored: Session | None, lineage: Lineage) -> None:
+        context = self._context
+        self._out.open()
+        if restored is None:
             session = Session(
-                self.stream, parameters, context.policy, instance=context.instance, life=life, tracker=context.tracker
+                self.stream,
+                context.parameters_of(self.stream),
+                context.policy,
+                instance=context.instance,
+                life=lineage,
+                tracker=context.tracker,
             )
             log.info("session_opened", stream=self.stream, profile=session.parameters.name)
         else:
-            self._context.metrics.restored()
+            session = restored
+            context.metrics.restored()
             log.info("session_restored", stream=self.stream, session=session.session, frames=session.counters.frames)
             # Its run has a new number: written soon, so that a crash just now does not give the next run the same one.
             context.persistence.put(session.snapshot(), lambda: None)
         self.session, self._changed = session, False
         self._accounts.open(session)
-        return session
 
     def close_session(self, reason: str, then: Callable[[], None] = lambda: None) -> None:
         """End the session and free what it holds; the next valid message of the stream begins another, or goes on.
@@ -390,7 +446,7 @@ class StreamActor:
         self.session, self._armed_ns = None, None
         self._out.close()
         self._accounts.close(session)
-        self._context.release(session)
+        self._context.release(self.stream, session.life)
         log.info(
             "session_closed", stream=self.stream, session=session.session, reason=reason, frames=session.counters.frames
         )
@@ -400,11 +456,8 @@ class StreamActor:
         self._deliver(outputs)
 
     def state(self) -> schemas.SessionState | None:
-        """Return the state of the session, None without one."""
-        session = self.session
-        if session is None:
-            return None
-        return self._accounts.state(session).model_copy(update={"digest": digest_of(session.snapshot())})
+        """Return the state of the session without its digest, None without a session."""
+        return None if self.session is None else self._accounts.state(self.session)
 
     def totals(self) -> MessageCounters:
         """Return what became of messages since the actor is there; may be called by any thread."""

@@ -8,31 +8,12 @@ instance, by bytes.
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from optipmb_service.runtime.byte_budget import ByteBudget
     from optipmb_service.runtime.ports import Packet
-
-
-class ByteBudget:
-    """Bytes that all streams share.
-
-    Args:
-        most: how many there are.
-    """
-
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._lock = threading.Lock()
-        self.used = 0
-
-    def add(self, size: int) -> bool:
-        """Take bytes, or give back with a negative size; False when more are taken than there are."""
-        with self._lock:
-            self.used += size
-            return self.used <= self._most
 
 
 class TakeoverBuffer:

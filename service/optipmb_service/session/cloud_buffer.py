@@ -19,10 +19,14 @@ class CloudBuffer:
 
     Args:
         most: number of clouds kept.
+        most_bytes: bytes of points kept.
     """
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, most_bytes: int = 2**62) -> None:
         self._most = most
+        self._most_bytes = most_bytes
+        self.bytes = 0
+        """Bytes of points kept now."""
         self._kept: dict[tuple[bytes, int], schemas.Points] = {}
         self.newest_ns: int | None = None
         """Stamp of the cloud that arrived last."""
@@ -33,11 +37,13 @@ class CloudBuffer:
     def add(self, cloud: schemas.Points) -> None:
         """Keep a cloud."""
         key = cloud.epoch, cloud.stamp_ns
-        self._kept.pop(key, None)
+        if key in self._kept:
+            self._drop(key)
         self._kept[key] = cloud
+        self.bytes += cloud.xyz.nbytes
         self.newest_ns = cloud.stamp_ns
-        while len(self._kept) > self._most:
-            del self._kept[next(iter(self._kept))]
+        while len(self._kept) > self._most or (self.bytes > self._most_bytes and len(self._kept) > 1):
+            self._drop(next(iter(self._kept)))
 
     def get(self, epoch: bytes, stamp_ns: int, publishers: Callable[[bytes], bool]) -> schemas.Points | None:
         """Return the cloud of a frame, None when it is not there; what another publisher of detections sent is not.
@@ -55,10 +61,14 @@ class CloudBuffer:
 
     def full_behind(self, stamp_ns: int) -> bool:
         """Whether the shelf is full of clouds for frames later than a stamp: the next would push one of them off."""
-        return len(self._kept) >= self._most and all(stamp > stamp_ns for _, stamp in self._kept)
+        full = len(self._kept) >= self._most or self.bytes >= self._most_bytes
+        return full and all(stamp > stamp_ns for _, stamp in self._kept)
 
     def forget_before(self, stamp_ns: int, reach_ns: int) -> None:
         """Drop the clouds before a stamp; those further back than `reach_ns` belong to frames after a jump."""
         gone = [key for key in self._kept if 0 < stamp_ns - key[1] <= reach_ns]
         for key in gone:
-            del self._kept[key]
+            self._drop(key)
+
+    def _drop(self, key: tuple[bytes, int]) -> None:
+        self.bytes -= self._kept.pop(key).xyz.nbytes

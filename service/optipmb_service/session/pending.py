@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from optipmb_service.session.cloud_buffer import CloudBuffer
+from optipmb_service.session.state import size_of
 from optipmb_service.session.timeline import FrameId, hold_until
 
 if TYPE_CHECKING:
@@ -75,8 +76,10 @@ class PendingFrames:
     def __init__(self, policy: Policy, timeline: Timeline) -> None:
         self.policy = policy
         self.timeline = timeline
-        self.clouds = CloudBuffer(policy.clouds)
+        self.clouds = CloudBuffer(policy.clouds, policy.cloud_bytes)
         self._held: list[Held] = []
+        self.held_bytes = 0
+        """Bytes of the frames held, nearly."""
         self.recovery_ns: int | None = None
         """Until when frames behind a gap are held for those missing (monotonic); None: they are not."""
 
@@ -102,6 +105,7 @@ class PendingFrames:
             cloud_wait_ns=self.policy.cloud_wait_ns,
             cloud_memory_ns=self.policy.cloud_memory_ns,
         )
+        self.held_bytes += size_of(message, None)
         insort(
             self._held, Held(message, frame_id, order, frame, ignored, deadline_ns, ticket), key=lambda one: one.order
         )
@@ -125,6 +129,7 @@ class PendingFrames:
         """Drop all; returns how many there were."""
         count = len(self._held)
         self._held.clear()
+        self.held_bytes = 0
         return count
 
     def deadline_ns(self, complete: Callable[[FrameId], bool]) -> int | None:
@@ -154,14 +159,17 @@ class PendingFrames:
         if not self._held:
             return None
         head = self._held[0]
-        if now_ns is not None and len(self._held) <= MAX_RECOVERING and self._behind_gap(head, complete):
+        much = self.held_bytes > self.policy.held_bytes
+        few = len(self._held) <= MAX_RECOVERING and not much
+        if now_ns is not None and few and self._behind_gap(head, complete):
             return None
         points = self._cloud(head)
         missed = points is None and head.deadline_ns is not None
-        many = len(self._held) > MAX_HELD and self.recovery_ns is None
+        many = much or (len(self._held) > MAX_HELD and self.recovery_ns is None)
         if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not (many or self._crowded(head)):
             return None
         del self._held[0]
+        self.held_bytes -= size_of(head.message, None)
         return Ready(head, points, missed)
 
     def _cloud(self, held: Held) -> schemas.Points | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from optipmb_service.session.checkpoint import Recorded
 from optipmb_service.session.reorder_window import ReorderWindow
 from optipmb_service.session.restored_window import window_of
-from optipmb_service.session.state import Entry, weigh
+from optipmb_service.session.state import Entry, size_of
 from optipmb_service.session.timeline import Timeline
 from optipmb_service.session.transition import Transition, empty
 
@@ -72,7 +72,7 @@ class ProcessedFrames:
             timeline: with it.
         """
         frame_id, message, points = ready.held.frame_id, ready.held.message, ready.points
-        frame, ignored, weight = ready.held.frame, ready.held.ignored, weigh(message, points)
+        frame, ignored, weight = ready.held.frame, ready.held.ignored, size_of(message, points)
         entry = Entry(frame_id, decision.place, message, points, ready.missed, 0, frame, ignored, weight)
         return [*self.entries, entry] if decision.last else self._history.inserted(entry, timeline.places())
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import optipmb
 from optipmb_service.session import convert
 from optipmb_service.session.checkpoint import CheckpointError
-from optipmb_service.session.state import Entry, weigh
+from optipmb_service.session.state import Entry, size_of
 from optipmb_service.session.timeline import Timeline
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def window_of(checkpoint: Checkpoint, gap_limit_ns: int) -> tuple[Timeline, list
             frame, ignored = convert.frame_of(checkpoint.parameters, one.message)
         except optipmb.FrameError as error:
             raise CheckpointError(f"window: {error}") from error
-        weight = weigh(one.message, one.points)
+        weight = size_of(one.message, one.points)
         entries.append(
             Entry(frame_id, places[frame_id], one.message, one.points, one.missed, one.revision, frame, ignored, weight)
         )

@@ -77,8 +77,8 @@ class Session:
         self._reporting = SessionReporting(stream, instance, self._policy)
         self._clock = clock
         self._make = tracker
-        self._past = ProcessedFrames(self._transition(parameters), self._policy, life or Lineage())
-        self._waiting = PendingFrames(self._policy, self._past.timeline)
+        self._processed = ProcessedFrames(self._transition(parameters), self._policy, life or Lineage())
+        self._pending = PendingFrames(self._policy, self._processed.timeline)
         self._quarantine = ""
         self._run = 0
 
@@ -98,23 +98,23 @@ class Session:
         frame_id = FrameId(message.epoch, message.seq, message.stamp_ns)
         outputs: list[Output] = []
         if self._quarantine:
-            if self._past.timeline.knows(frame_id.epoch):
+            if self._processed.timeline.knows(frame_id.epoch):
                 self._reporting.deliveries.refused += 1
                 return [self._reporting.complain.quarantined(frame_id, self._quarantine)]
             outputs += self.reset("quarantine")
-        decision, arrived = self._waiting.timeline.judge(frame_id)
+        decision, arrived = self._pending.timeline.judge(frame_id)
         if not decision.verdict.admitted:
             return [*outputs, *self._reporting.refused(frame_id, decision)]
         try:
             frame, ignored = convert.frame_of(self.parameters, message)
         except optipmb.FrameError as error:
             self._reporting.deliveries.refused += 1
-            self._past.note(frame_id)
-            self._waiting.timeline = self._waiting.timeline.note(frame_id)
+            self._processed.note(frame_id)
+            self._pending.timeline = self._pending.timeline.note(frame_id)
             return [*outputs, self._reporting.complain.invalid(frame_id, error)]
-        self._waiting.timeline = arrived
+        self._pending.timeline = arrived
         since_ns = now_ns if arrived_ns is None else arrived_ns
-        self._waiting.add(message, decision.place.order(frame_id), frame, ignored, since_ns, ticket)
+        self._pending.add(message, decision.place.order(frame_id), frame, ignored, since_ns, ticket)
         return [*outputs, *self._advance(now_ns)]
 
     def on_points(self, message: schemas.Points, now_ns: int, *, ticket: Any = None) -> list[Output]:
@@ -129,7 +129,7 @@ class Session:
             convert.cloud_of(message)
         except optipmb.FrameError as error:
             return [self._reporting.complain.invalid(FrameId(message.epoch, message.seq, message.stamp_ns), error)]
-        self._waiting.clouds.add(message)
+        self._pending.clouds.add(message)
         outputs = self._amend(message, ticket) if self._policy.late_clouds and not self._quarantine else []
         return [*outputs, *self._advance(now_ns)]
 
@@ -140,7 +140,7 @@ class Session:
     @property
     def deadline_ns(self) -> int | None:
         """When `on_tick` is due (monotonic, ns); None while nothing is held."""
-        return self._waiting.deadline_ns(self._past.complete_until)
+        return self._pending.deadline_ns(self._processed.complete_until)
 
     def refuse(self) -> None:
         """Count a message of the stream that was none."""
@@ -156,12 +156,12 @@ class Session:
         """Forget the density and begin anew; frames seen before stay seen, track ids go on, a quarantine ends."""
         outputs = self.flush()
         self._quarantine = ""
-        head, starts = self._past.head, self._past.head.starts + 1
+        head, starts = self._processed.head, self._processed.head.starts + 1
         self._begin(
             replace(
                 head,
                 density=optipmb.Density.empty(head.density.next_id),
-                session=self._past.transition.name(head.last, starts),
+                session=self._processed.transition.name(head.last, starts),
                 starts=starts,
                 tracks=0,
                 reported=frozenset(),
@@ -193,12 +193,12 @@ class Session:
             self._wait(round(cloud_wait_s * SECOND))
         if parameters is not None and changes:
             # Frames are given to the tracker by the classes of the old profile: they cannot be gone over again.
-            self._begin(self._past.head, self._transition(parameters))
+            self._begin(self._processed.head, self._transition(parameters))
         if restart:
             outputs += self.reset("parameters")
         elif changes:
-            head = self._past.head
-            self._begin(replace(head, session=self._past.transition.name(None, head.starts)))
+            head = self._processed.head
+            self._begin(replace(head, session=self._processed.transition.name(None, head.starts)))
         return outputs
 
     # To be written down and taken up again
@@ -208,18 +208,18 @@ class Session:
 
         It refers to values that never change: cheap, to be encoded later.
         """
-        base, window = self._past.portable()
+        base, window = self._processed.portable()
         return Checkpoint(
             stream=self.stream,
             parameters=self.parameters,
             cloud_wait_ns=self._cloud_wait_ns,
             quarantine=self._quarantine,
-            epochs=self._past.timeline.epochs,
+            epochs=self._processed.timeline.epochs,
             base=base,
             window=window,
-            head=self._past.head,
+            head=self._processed.head,
             deliveries=replace(self._reporting.deliveries),
-            newest_cloud_ns=self._waiting.clouds.newest_ns,
+            newest_cloud_ns=self._pending.clouds.newest_ns,
             run=self._run,
         )
 
@@ -257,11 +257,11 @@ class Session:
     @property
     def recovering(self) -> bool:
         """Whether frames behind a gap are held, because those missing may still come from the publisher's cache."""
-        return self._waiting.recovery_ns is not None
+        return self._pending.recovery_ns is not None
 
     def recovered(self, now_ns: int) -> list[Output]:
         """End the waiting: all that the caches have is here. Returns what was held for it."""
-        self._waiting.recovery_ns = None
+        self._pending.recovery_ns = None
         return self._advance(now_ns)
 
     # What it is
@@ -269,22 +269,22 @@ class Session:
     @property
     def parameters(self) -> optipmb.Parameters:
         """The profile."""
-        return self._past.transition.parameters
+        return self._processed.transition.parameters
 
     @property
     def session(self) -> str:
         """The id of the present life of the density."""
-        return self._past.head.session
+        return self._processed.head.session
 
     @property
     def density(self) -> optipmb.Density:
         """The density after the last frame."""
-        return self._past.head.density
+        return self._processed.head.density
 
     @property
     def counters(self) -> Counters:
         """What happened to the messages so far."""
-        return self._reporting.counters(self._past.head)
+        return self._reporting.counters(self._processed.head)
 
     @property
     def run(self) -> int:
@@ -294,6 +294,12 @@ class Session:
         and nobody knows any more under which revision it was published. What a later run publishes of a frame holds.
         """
         return self._run
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of the messages that are kept: frames that wait, clouds, and the window; nearly, for any thread."""
+        window = sum(entry.weight for entry in self._processed.entries)
+        return window + self._pending.held_bytes + self._pending.clouds.bytes
 
     @property
     def quarantine(self) -> str:
@@ -308,17 +314,17 @@ class Session:
     @property
     def life(self) -> Lineage:
         """What a later session of the stream has to know."""
-        head = self._past.head
+        head = self._processed.head
         return Lineage(head.starts, head.density.next_id)
 
     def state(self, *, shed: int = 0, queue: int = 0, closed: bool = False) -> schemas.SessionState:
         """Return the state as the message that answers a query."""
         return self._reporting.state(
             self.parameters.name,
-            self._past.head,
+            self._processed.head,
             condition="closed" if closed else self._condition,
             shed=shed,
-            queue=queue + len(self._waiting),
+            queue=queue + len(self._pending),
         )
 
     @property
@@ -334,24 +340,28 @@ class Session:
     def _advance(self, now_ns: int | None) -> list[Output]:
         """Process the frames that are ready, in order; None: all of them."""
         outputs: list[Output] = []
-        while ready := self._waiting.take(now_ns, self._past.complete_until):
+        while ready := self._pending.take(now_ns, self._processed.complete_until):
             outputs += self._process(ready)
         return outputs
 
     def _process(self, ready: Ready) -> list[Output]:
         """Put a frame in its place."""
         began_ns, frame_id = self._clock(), ready.held.frame_id
-        decision, timeline = self._past.timeline.judge(frame_id)
+        decision, timeline = self._processed.timeline.judge(frame_id)
         if not decision.verdict.admitted:
             return self._reporting.refused(frame_id, decision)
-        placed = self._past.placed(ready, decision, timeline)
+        placed = self._processed.placed(ready, decision, timeline)
         return self._go(placed, timeline, frame_id, ready.held.ticket, began_ns, behind=decision.last)
 
     def _amend(self, message: schemas.Points, ticket: Any) -> list[Output]:
         """Put a cloud that came after its frame into the window."""
         began_ns, frame_id = self._clock(), FrameId(message.epoch, message.seq, message.stamp_ns)
-        placed = self._past.amended(message)
-        return [] if placed is None else self._go(placed, self._past.timeline, frame_id, ticket, began_ns, behind=False)
+        placed = self._processed.amended(message)
+        return (
+            []
+            if placed is None
+            else self._go(placed, self._processed.timeline, frame_id, ticket, began_ns, behind=False)
+        )
 
     def _go(
         self, placed: list[Entry], timeline: Timeline, frame_id: FrameId, ticket: Any, began_ns: int, *, behind: bool
@@ -359,11 +369,11 @@ class Session:
         """Go through frames with what is new among them; when a step raises, the session is quarantined as it was."""
         before = self.session
         try:
-            outcomes = self._past.go(placed, behind=behind)
+            outcomes = self._processed.go(placed, behind=behind)
         except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
             return self._fail(error, placed, frame_id)
-        gone = self._past.settle(timeline)
-        self._waiting.follow(self._past.timeline, self._past.base, gone)
+        gone = self._processed.settle(timeline)
+        self._pending.follow(self._processed.timeline, self._processed.base, gone)
         self._reporting.deliveries.inserted += not behind
         begun = self._reporting.begun(outcomes, before, self.session)
         took_ns = self._clock() - began_ns
@@ -372,31 +382,31 @@ class Session:
     def _fail(self, error: Exception, placed: list[Entry], frame_id: FrameId) -> list[Output]:
         """Take no more frames; the one that failed and what is held go, unprocessed."""
         self._quarantine = f"{type(error).__name__}: {error}"[:MAX_ERROR]
-        self._reporting.deliveries.refused += 1 + self._waiting.clear()
-        self._past.note(frame_id)
-        self._waiting.timeline = self._past.timeline
-        dump = dump_of(self._past.transition, self._past.base, placed, error)
+        self._reporting.deliveries.refused += 1 + self._pending.clear()
+        self._processed.note(frame_id)
+        self._pending.timeline = self._processed.timeline
+        dump = dump_of(self._processed.transition, self._processed.base, placed, error)
         return [self._reporting.complain.failed(frame_id, self._quarantine), Quarantined(self._quarantine, dump)]
 
     def _begin(self, state: FilterState, transition: Transition | None = None) -> None:
         """Go on from a moment without a way back behind it."""
-        self._past.begin(state, transition)
-        self._waiting.timeline = self._past.timeline
+        self._processed.begin(state, transition)
+        self._pending.timeline = self._processed.timeline
 
     def _resume(self, checkpoint: Checkpoint, now_ns: int) -> None:
         if checkpoint.cloud_wait_ns is not None:
             self._wait(checkpoint.cloud_wait_ns)
         self._quarantine = checkpoint.quarantine
         self._reporting.deliveries = replace(checkpoint.deliveries)
-        self._waiting.clouds.newest_ns = checkpoint.newest_cloud_ns
-        self._waiting.recovery_ns = now_ns + self._policy.recovery_wait_ns
+        self._pending.clouds.newest_ns = checkpoint.newest_cloud_ns
+        self._pending.recovery_ns = now_ns + self._policy.recovery_wait_ns
         self._run = checkpoint.run + 1
-        self._past.resume(checkpoint)
-        self._waiting.timeline = self._past.timeline
+        self._processed.resume(checkpoint)
+        self._pending.timeline = self._processed.timeline
 
     def _wait(self, cloud_wait_ns: int) -> None:
         self._cloud_wait_ns = cloud_wait_ns
-        self._policy = self._waiting.policy = replace(self._policy, cloud_wait_ns=cloud_wait_ns)
+        self._policy = self._pending.policy = replace(self._policy, cloud_wait_ns=cloud_wait_ns)
 
     def _transition(self, parameters: optipmb.Parameters) -> Transition:
         return Transition(self.stream, parameters, self._make(parameters), self._policy)

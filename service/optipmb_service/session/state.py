@@ -126,7 +126,7 @@ class Entry:
         return self.place.order(self.frame_id)
 
 
-def weigh(message: schemas.Detections, points: schemas.Points | None) -> int:
+def size_of(message: schemas.Detections, points: schemas.Points | None) -> int:
     """Return the bytes that the inputs of a frame take, nearly."""
     arrays = (message.label, message.center, message.size, message.yaw, message.score, message.velocity)
     size = 256 + sum(array.nbytes for array in arrays if array is not None)

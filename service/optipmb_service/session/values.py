@@ -49,6 +49,8 @@ class Policy:
         cloud_wait_ns: longest wait of a frame for its cloud.
         cloud_memory_ns: how lately a cloud must have come for a frame that does not say whether it has one.
         clouds: number of clouds kept.
+        cloud_bytes: most bytes of these.
+        held_bytes: most bytes of frames held for clouds or for missed frames.
         rewind_ns: sensor time within which a late frame is put in its place; 0: late frames are refused.
         rewind_frames: most frames kept for it.
         rewind_bytes: most bytes of messages kept for it.
@@ -65,6 +67,8 @@ class Policy:
     cloud_wait_ns: int = SECOND // 10
     cloud_memory_ns: int = 2 * SECOND
     clouds: int = 16
+    cloud_bytes: int = 32 * 2**20
+    held_bytes: int = 32 * 2**20
     rewind_ns: int = SECOND
     rewind_frames: int = 64
     rewind_bytes: int = 32 * 2**20

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.cluster.ownership import OwnershipTable, Role, RoleChange, WriteLease
+from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.ports import Packet
-from optipmb_service.runtime.takeover_buffer import ByteBudget, TakeoverBuffer
+from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 
 SECOND = 1_000_000_000
 TICK = SECOND // 20

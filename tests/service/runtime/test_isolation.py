@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from optipmb_schemas import Detections, Keys, ServiceStatus, SessionState
+import pytest
+from optipmb_schemas import Detections, Keys, MessageError, ServiceStatus, SessionState, decode
 from optipmb_service.cluster.store import MemoryStore, SqliteStore
 from optipmb_service.observability.health import ProcessHealth
-from optipmb_service.runtime import persistence
+from optipmb_service.runtime import persistence, queries
+from optipmb_service.runtime.byte_budget import ByteBudget
+from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.persistence import STORE_FILE, CheckpointWriter
+from optipmb_service.runtime.ports import PACKET_BYTES, Packet
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import MAX_COUNT
+from optipmb_service.settings import LimitSettings
 from router import Node, Sensor, until
 
 import optipmb
@@ -23,7 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    import pytest
 
 KEYS = Keys()
 CAREFUL = Sensor("site/careful/lidar")
@@ -163,3 +168,141 @@ def test_a_checkpoint_that_cannot_be_made_is_its_streams_alone(monkeypatch: pyte
     until(lambda: writer.failure == "", "the failure ends")
     assert store.streams() == (CAREFUL.stream, CARELESS.stream)
     writer.close(5)
+
+
+def test_a_checkpoint_waits_for_a_write_lease_that_lapsed() -> None:
+    """What is put while the lease has lapsed is written when it holds again, and only then it is done."""
+    holds, done = threading.Event(), threading.Event()
+    store = MemoryStore()
+    writer = CheckpointWriter(store, 0.05, lambda _: holds.is_set(), owns=lambda _: True)
+    rounds = [0]
+
+    def gather() -> None:
+        rounds[0] += 1
+
+    writer.start(gather)
+    writer.put(Session(CAREFUL.stream, optipmb.load_profile("nuscenes")).snapshot(), done.set)
+    until(lambda: rounds[0] > 4, "rounds")
+    assert (store.streams(), done.is_set()) == ((), False)
+    holds.set()
+    until(done.is_set, "it is written")
+    assert store.streams() == (CAREFUL.stream,)
+    writer.close(5)
+
+
+def test_a_question_about_the_state_keeps_no_frame_waiting(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The digest of a state is made on a thread of its own: frames are tracked meanwhile."""
+    gate, asked = threading.Event(), threading.Event()
+    digest = queries.digest_of
+
+    def slow(checkpoint: Any) -> str:
+        asked.set()
+        assert gate.wait(20)
+        return digest(checkpoint)
+
+    monkeypatch.setattr(queries, "digest_of", slow)
+    _, endpoint = start()
+    with Node(endpoint) as node, ThreadPoolExecutor(1) as asking:
+        node.send(CAREFUL.detections(0))
+        node.tracks(CAREFUL.stream, 1)
+        answer = asking.submit(node.query, KEYS.query(CAREFUL.stream, "state"), None, 30.0)
+        assert asked.wait(20)
+        node.send(CAREFUL.detections(1))
+        node.tracks(CAREFUL.stream, 2)
+        gate.set()
+        assert decode(answer.result()[0][2], SessionState).frames == 1  # the state at the question
+
+
+def test_a_stream_that_opens_keeps_no_other_waiting(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The store is slow: other streams are tracked meanwhile, and what the new one sent comes after."""
+    gate, load = threading.Event(), SqliteStore.load
+
+    def slow(store: SqliteStore, stream: str) -> bytes | None:
+        assert stream != CARELESS.stream or gate.wait(20)
+        return load(store, stream)
+
+    monkeypatch.setattr(SqliteStore, "load", slow)
+    _, endpoint = start(store=str(tmp_path))
+    with Node(endpoint) as node:
+        node.send(CAREFUL.detections(0))
+        node.tracks(CAREFUL.stream, 1)
+        node.send(*(CARELESS.detections(seq) for seq in range(3)))
+        node.send(CAREFUL.detections(1))
+        node.tracks(CAREFUL.stream, 2)
+        gate.set()
+        assert [one.seq for one in node.tracks(CARELESS.stream, 3)] == [0, 1, 2]
+
+
+def test_many_small_values_are_refused_by_their_claim() -> None:
+    """Half a megabyte of nils is refused where the list begins, not where it ends."""
+    payload = b"\x81\xa6labels\xdd" + (500_000).to_bytes(4, "big") + 500_000 * b"\xc0"
+    with pytest.raises(MessageError, match="at most 131072 values") as refused:
+        decode(payload, Detections, limits=LimitSettings().limits())
+    assert refused.value.code == "too_large"
+
+
+def test_a_full_instance_leaves_alone_what_another_one_tracks(start: Callable[..., Any]) -> None:
+    """One instance has no room: it neither decodes nor refuses the stream that the other one tracks."""
+    full, endpoint = start(instance="a", max_sessions=1)
+    with Node(endpoint) as node:
+        node.send(CAREFUL.detections(0))
+        node.tracks(CAREFUL.stream, 1)
+        other, _ = start(instance="b", listen=[], connect=[endpoint])
+        node.send(CARELESS.detections(0))
+        node.tracks(CARELESS.stream, 1)
+        until(lambda: full._coordinator.elsewhere(CARELESS.stream), "the owner is known")
+        refused = full.status().refused
+        node.send(*(CARELESS.detections(seq) for seq in range(1, 11)))
+        node.tracks(CARELESS.stream, 11)
+        node.send(CAREFUL.detections(1))
+        node.tracks(CAREFUL.stream, 2)
+        assert full.status().refused == refused
+        assert [one.stream for one in other.status().sessions] == [CARELESS.stream]
+
+
+def test_messages_that_wait_are_bounded_in_bytes(start: Callable[..., Any]) -> None:
+    """A hundred messages of 1 MB while a step does not end: the mailbox keeps what it may, the rest is shed."""
+    gate, entered = threading.Event(), threading.Event()
+
+    class Waits:
+        def __init__(self, parameters: optipmb.Parameters) -> None:
+            self._tracker = optipmb.Tracker(parameters)
+
+        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+            entered.set()
+            gate.wait(20)
+            return self._tracker.step(density, frame)
+
+    service, endpoint = start(tracker=Waits, stream_mb=16, memory_mb=16)
+    mailboxes = service._registry._mailboxes
+    with Node(endpoint) as node:
+        node.send(CARELESS.detections(0))
+        assert entered.wait(20)
+        for number in range(100):
+            node.send_raw(KEYS.detections(CARELESS.stream), bytes([number]) * 2**20)
+        until(lambda: mailboxes.used > 2 * 2**20, "they came")
+        node.send(CARELESS.detections(1))
+        assert mailboxes.used <= 4 * 2**20
+        gate.set()
+        node.tracks(CARELESS.stream, 2)
+        until(lambda: mailboxes.used == 0, "all is worked off")
+    assert service.status().shed > 0
+
+
+def test_a_mailbox_gives_back_what_it_took() -> None:
+    """Frames and clouds beyond the bytes go, the oldest clouds first; what is larger than all is not taken."""
+    budget = ByteBudget(10 * PACKET_BYTES)
+    mailbox = Mailbox(100, 100, 6 * PACKET_BYTES, budget)
+    for number in range(4):
+        mailbox.offer_cloud(Packet("key", b"", 0, "", number, 0))
+    for number in range(4):
+        mailbox.offer_frame(Packet("key", b"", 0, "", number, 0))
+    assert (mailbox.shed_clouds, mailbox.shed_frames, budget.used) == (2, 0, 6 * PACKET_BYTES)
+    large = bytes(7 * PACKET_BYTES)
+    mailbox.offer_frame(Packet("key", large, len(large), "", 9, 0))
+    assert (mailbox.shed_clouds, mailbox.shed_frames, budget.used) == (4, 5, 0)
+    assert mailbox.take() is None
