@@ -39,6 +39,8 @@ def bare(
     label: Index,
     dt: float,
     process_noise: Array,
+    acceleration_time: Array,
+    constant_velocity: NDArray[np.bool_],
     row: Index,
     measurement: Index,
     existence: Array,
@@ -64,6 +66,8 @@ def bare(
             covariance[n],
             dt,
             process_noise[label[n]],
+            acceleration_time[label[n]],
+            constant_velocity[label[n]],
             root,
             points,
             mean_predicted[n],
@@ -101,7 +105,7 @@ def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: o
     measurements, _, _ = preprocess(frame, table)
     old, undetected = predicted.bernoulli, predicted.poisson
     p_d, p_d_poisson = table.detection[old.label], table.detection[undetected.label]
-    found = enumerate_hypotheses(old, p_d, undetected, p_d_poisson, measurements, table)
+    found = enumerate_hypotheses(old, p_d, undetected, p_d_poisson, measurements, table.period, table)
     assigned = associate(found, len(old))
     before, waiting = density.bernoulli, density.poisson
     count = len(before) + len(waiting)
@@ -119,6 +123,8 @@ def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: o
         np.concatenate([before.label, waiting.label]),
         (frame.stamp_ns - density.stamp_ns) * 1e-9,
         table.process_noise,
+        table.acceleration_time,
+        table.constant_velocity,
         np.concatenate([found.row, found.component + len(before)]),
         np.concatenate([found.measurement, found.announced]),
         np.concatenate([old.existence, undetected.weight]),

@@ -8,8 +8,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from numba.core.errors import NumbaError
 
-from optipmb.density import NO_FRAME, Bernoullis, Density, Poissons
+from optipmb.compiled import kernel
+from optipmb.density import NO_FRAME, STATE, Bernoullis, Density, Poissons
 from optipmb.errors import DensityError
 
 if TYPE_CHECKING:
@@ -20,32 +22,74 @@ if TYPE_CHECKING:
 _Rows = TypeVar("_Rows", Bernoullis, Poissons)
 
 
+def fitting(density: Density, classes: int) -> bool:
+    """Tell whether the columns of a density fit together, so that kernels stay within them.
+
+    What `density_of` and the tracker make does; somebody else's arrays may not.
+    """
+    b, p = density.bernoulli, density.poisson
+    try:
+        return bool(
+            rows_fit(b.mean, b.covariance, b.label, b.auxiliary, classes)
+            and rows_fit(p.mean, p.covariance, p.label, p.auxiliary, classes)
+            and b.existence.shape == b.id.shape == b.born_ns.shape == b.seen_ns.shape == b.label.shape
+            and b.score.shape
+            == b.evidence.shape
+            == b.heading_odds.shape
+            == b.extracted.shape
+            == b.confirmed.shape
+            == b.label.shape
+            and p.weight.shape == p.born_ns.shape == p.label.shape
+        )
+    except (AttributeError, TypeError, NumbaError):
+        return False
+
+
+@kernel
+def rows_fit(
+    mean: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    label: NDArray[np.int64],
+    auxiliary: NDArray[np.float64],
+    classes: int,
+) -> bool:
+    """Tell whether (N, 6) means, (N, 6, 6) covariances, (N,) classes and (N, 4) boxes are so, and the classes exist."""
+    count = label.shape[0]
+    good = mean.shape == (count, STATE) and covariance.shape == (count, STATE, STATE) and auxiliary.shape == (count, 4)
+    for c in label:
+        good &= 0 <= c < classes
+    return good
+
+
 def columns_of(density: Density) -> dict[str, NDArray[Any]]:
     """Return the arrays of a density by name, always in the same order."""
     parts = (("bernoulli", density.bernoulli), ("poisson", density.poisson))
     return {f"{part}.{name}": column for part, rows in parts for name, column in rows.columns()}
 
 
-def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], classes: int) -> Density:
+def density_of(
+    stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: tuple[str, ...], *, earlier: bool = False
+) -> Density:
     """Return the density of named arrays.
 
     Args:
         stamp_ns: stamp of its last frame.
         next_id: id of the next new track.
         columns: what `columns_of` gave.
-        classes: number of classes of the parameters that it belongs to.
+        labels: names of the classes of the parameters that it belongs to.
+        earlier: whether an earlier version may have stored it; columns that it lacks are then filled with zeros.
 
     Raises:
         DensityError: a column is missing, has another shape or type, or holds values that no density has.
     """
     if not NO_FRAME <= stamp_ns < 2**63:
         raise DensityError("stamp_ns", "a stamp", str(stamp_ns))
-    bernoulli = _rows("bernoulli", Bernoullis, columns)
-    poisson = _rows("poisson", Poissons, columns)
+    bernoulli = _rows("bernoulli", Bernoullis, columns, earlier=earlier)
+    poisson = _rows("poisson", Poissons, columns, earlier=earlier)
     for part, rows in (("bernoulli", bernoulli), ("poisson", poisson)):
         label = rows.label
-        if label.size and not (label.min() >= 0 and label.max() < classes):
-            raise DensityError(f"{part}.label", f"indices below {classes}", f"{label.min()} to {label.max()}")
+        if label.size and not (label.min() >= 0 and label.max() < len(labels)):
+            raise DensityError(f"{part}.label", f"indices below {len(labels)}", f"{label.min()} to {label.max()}")
         if label.size and not 0 <= rows.born_ns.min() <= rows.born_ns.max() <= stamp_ns:
             raise DensityError(f"{part}.born_ns", f"stamps up to {stamp_ns}", "others")
     if len(bernoulli) and not (bernoulli.born_ns <= bernoulli.seen_ns).all() & (bernoulli.seen_ns <= stamp_ns).all():
@@ -62,15 +106,19 @@ def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], classes:
         raise DensityError("bernoulli.id", "ascending ids", "others")
     if not 0 <= int(ids.max(initial=0)) < next_id < 2**63:
         raise DensityError("next_id", f"an id above {ids.max(initial=0)}", str(next_id))
-    return Density(stamp_ns=stamp_ns, next_id=next_id, bernoulli=bernoulli, poisson=poisson)
+    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels))
 
 
-def _rows(part: str, kind: type[_Rows], columns: Mapping[str, Any]) -> _Rows:
+def _rows(part: str, kind: type[_Rows], columns: Mapping[str, Any], *, earlier: bool) -> _Rows:
     found: dict[str, Any] = {}
     count: int | None = None
-    for name, like in kind.empty().columns():
+    wanted: dict[str, NDArray[Any]] = dict(kind.empty().columns())
+    for name, empty in wanted.items():
+        like: NDArray[Any] = empty
         path = f"{part}.{name}"
-        column = columns.get(path)
+        column: Any = columns.get(path)
+        if column is None and earlier and count is not None:
+            column = np.zeros((count, *like.shape[1:]), like.dtype)
         if not isinstance(column, np.ndarray) or column.dtype != like.dtype or column.shape[1:] != like.shape[1:]:
             raise DensityError(path, f"(N, {', '.join(map(str, like.shape[1:]))}) {like.dtype}", _shown(column))
         count = len(column) if count is None else count

@@ -69,6 +69,7 @@ class Bernoullis(_Rows):
         evidence: (N,) mean log odds of the latest detections (`optipmb.calibration`).
         heading_odds: (N,) log odds that the object faces along phi and not the other way (`optipmb.heading`).
         extracted: (N,) bool, whether the track was ever extracted (t in T).
+        confirmed: (N,) bool, whether the track was confirmed when it was last extracted (`optipmb.extract`).
     """
 
     mean: NDArray[np.float64]
@@ -83,6 +84,7 @@ class Bernoullis(_Rows):
     evidence: NDArray[np.float64]
     heading_odds: NDArray[np.float64]
     extracted: NDArray[np.bool_]
+    confirmed: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.existence)
@@ -103,6 +105,7 @@ class Bernoullis(_Rows):
             evidence=np.zeros(0),
             heading_odds=np.zeros(0),
             extracted=np.zeros(0, np.bool_),
+            confirmed=np.zeros(0, np.bool_),
         )
 
 
@@ -157,17 +160,19 @@ class Density:
         next_id: the id of the next new track; ids are never reused.
         bernoulli: detected potential objects.
         poisson: undetected potential objects.
+        labels: names of the classes that the labels point into, those of the parameters.
     """
 
     stamp_ns: int
     next_id: int
     bernoulli: Bernoullis
     poisson: Poissons
+    labels: tuple[str, ...]
 
     @classmethod
-    def empty(cls, next_id: int = 1) -> Density:
+    def empty(cls, labels: tuple[str, ...], next_id: int = 1) -> Density:
         """Return the density before the first frame; `next_id` lets a restarted session go on with fresh ids."""
-        return cls(stamp_ns=NO_FRAME, next_id=next_id, bernoulli=Bernoullis.empty(), poisson=Poissons.empty())
+        return cls(NO_FRAME, next_id, Bernoullis.empty(), Poissons.empty(), labels)
 
 
 @kernel

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+LEAST_SHARE: Final = 0.02
+"""Least share of the nominal period that a look counts for."""
+
 
 def detection_probability(
     mean: Array, auxiliary: Array, label: NDArray[np.int64], cloud: PointCloud | None, table: ClassTable
@@ -24,7 +27,8 @@ def detection_probability(
     """Compute p_d(x_+) of each predicted object.
 
     ``p_d = p_d0 min[1, (1 - s_d) PTS / PTS_0 + s_d]`` with the points PTS counted in the predicted box: position and
-    heading from the motion state, size and height from the auxiliary state. Without a cloud p_d = p_d0; a frame says
+    heading from the motion state, size and height from the auxiliary state; points up to `ground_clearance` above the
+    bottom of the box are returns of the ground and do not count. Without a cloud p_d = p_d0; a frame says
     whether it had one.
 
     Args:
@@ -40,8 +44,25 @@ def detection_probability(
     p_d0 = table.detection[label]
     if cloud is None or not label.size:
         return p_d0
-    center = np.column_stack((mean[:, :2], auxiliary[:, 3]))
-    points = points_in_boxes(cloud, center, auxiliary[:, :3].copy(), mean[:, PHI].copy())
+    cut = np.minimum(table.ground_clearance[label], auxiliary[:, 2])
+    center = np.column_stack((mean[:, :2], auxiliary[:, 3] + 0.5 * cut))
+    size = auxiliary[:, :3].copy()
+    size[:, 2] -= cut
+    points = points_in_boxes(cloud, center, size, mean[:, PHI].copy())
     s_d = table.detection_floor[label]
     scaled: Array = p_d0 * np.minimum(1.0, (1.0 - s_d) * points / table.expected_points[label] + s_d)
     return scaled
+
+
+def over_time(p_d: Array, share: float) -> Array:
+    """Return the probability of a detection within a share of the nominal period, ``1 - (1 - p_d)^share``.
+
+    A detector that looks twice as often does not see twice as much: what hides an object hides it in the next look as
+    well. So p_d holds per nominal period, and a miss weighs by the time that it lasts. Looks farther apart than a
+    period are independent: the share is at most one. It is at least `LEAST_SHARE`, so that frames of equal stamps can
+    be associated.
+    """
+    if share >= 1.0:
+        return p_d
+    kept: Array = 1.0 - (1.0 - p_d) ** max(share, LEAST_SHARE)
+    return kept

@@ -8,6 +8,7 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.errors import EffortError
+from optipmb.gating import gate_radii
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ UNLIMITED: Final = 2**62
 
 
 def check_effort(
-    bernoulli: Bernoullis, poisson: Poissons, measurements: Measurements, table: ClassTable, most: int
+    bernoulli: Bernoullis, poisson: Poissons, measurements: Measurements, dt: float, table: ClassTable, most: int
 ) -> None:
     """Refuse a frame with too many pairs in the gates.
 
@@ -35,6 +36,7 @@ def check_effort(
         bernoulli: predicted detected objects.
         poisson: predicted Poisson components.
         measurements: Z_k.
+        dt: s since the last frame.
         table: parameters as columns.
         most: pairs that are allowed.
 
@@ -46,31 +48,43 @@ def check_effort(
         return
     positions = np.concatenate((bernoulli.mean[:, :2], poisson.mean[:, :2], measurements.position))
     labels = np.concatenate((bernoulli.label, poisson.label, measurements.label))
-    if count_pairs(positions, labels, measurements.position, measurements.label, table.gate, most) > most:
+    gates = table.period, table.gate, table.gate_growth, table.gate_deviations
+    radius = np.concatenate(
+        (
+            gate_radii(bernoulli.covariance, bernoulli.label, dt, *gates),
+            gate_radii(poisson.covariance, poisson.label, dt, *gates),
+            table.gate[measurements.label],
+        )
+    )
+    if count_pairs(positions, labels, radius, measurements.position, measurements.label, len(table.gate), most) > most:
         raise EffortError("center", f"at most {most} pairs of an object and a detection in its gate", "more")
 
 
 @kernel
 def count_pairs(
-    center: Array, label: Index, position: Array, measured_label: Index, gate_distance: Array, most: int
+    center: Array, label: Index, radius: Array, position: Array, measured_label: Index, classes: int, most: int
 ) -> int:
     """Count the measurements of an object's class within its gate, over all objects; no further than `most` + 1.
 
     Args:
         center: (N, 2) positions of the objects, m.
         label: (N,) their classes.
+        radius: (N,) gating distances, m.
         position: (M, 2) z_xy, m.
         measured_label: (M,) z_c.
-        gate_distance: (C,) eta_dist, m.
+        classes: C.
         most: where counting ends.
     """
+    widest = np.zeros(classes)
+    for n in range(center.shape[0]):
+        widest[label[n]] = max(widest[label[n]], radius[n])
     head, following, side = empty_torus(position.shape[0])
     for m in range(position.shape[0]):
-        insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * gate_distance[measured_label[m]])
+        insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * widest[measured_label[m]])
     count = 0
     for n in range(center.shape[0]):
-        eta = gate_distance[label[n]]
-        first_x, last_x, first_y, last_y = block(center[n, 0], center[n, 1], eta, 2.0 * eta)
+        eta = radius[n]
+        first_x, last_x, first_y, last_y = block(center[n, 0], center[n, 1], eta, 2.0 * widest[label[n]])
         for i in range(first_x, last_x + 1):
             for j in range(first_y, last_y + 1):
                 m = head[(i & (side - 1)) * side + (j & (side - 1))]

@@ -45,6 +45,8 @@ class Tracks:
         age: (N,) s since the first detection.
         time_since_detection: (N,) s since the last one.
         detection: (N,) int64, index of this frame's detection in the caller's arrays, -1 while missed.
+        confirmed: (N,) bool: the existence reached `confirm_from` and has not fallen below `confirm_until` since.
+            People and planners look at confirmed tracks; the others may be of nothing.
     """
 
     id: NDArray[np.int64]
@@ -62,6 +64,7 @@ class Tracks:
     age: Array
     time_since_detection: Array
     detection: NDArray[np.int64]
+    confirmed: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.id)
@@ -76,7 +79,7 @@ def extract(
     *,
     two_thresholds: bool,
 ) -> Tracks:
-    """Extract the tracks, and mark in `bernoulli.extracted` the objects that were extracted for the first time.
+    """Extract the tracks, and mark in `bernoulli` the objects that were extracted, and those that are confirmed.
 
     A track that never was: from ``r >= eta_ext1``. A known one: while ``r >= eta_ext2`` and ``x_cnt < eta_cnt``. The
     baseline of the ablation has the first threshold alone.
@@ -119,6 +122,7 @@ def extract(
         np.empty(count),  # age
         np.empty(count),  # time_since_detection
         np.empty(count, np.int64),  # detection
+        np.empty(count, np.bool_),  # confirmed
     )
     read_tracks(
         rows,
@@ -159,7 +163,44 @@ def extract(
         tracks.time_since_detection,
         tracks.detection,
     )
+    confirm(
+        rows,
+        bernoulli.label,
+        tracks.existence,
+        table.confirm_from,
+        table.confirm_until,
+        bernoulli.confirmed,
+        tracks.confirmed,
+    )
     return tracks
+
+
+@kernel
+def confirm(
+    rows: Index,
+    label: Index,
+    existence: Array,
+    confirm_from: Array,
+    confirm_until: Array,
+    confirmed: NDArray[np.bool_],
+    confirmed_out: NDArray[np.bool_],
+) -> None:
+    """Confirm tracks with hysteresis: from one existence on, and until it falls below another.
+
+    Args:
+        rows: (>= K,) objects, in front.
+        label: (N,) classes.
+        existence: (K,) of the tracks, as they are told.
+        confirm_from: (C,) existence from which a track is confirmed.
+        confirm_until: (C,) existence below which it is so no longer.
+        confirmed: (N,) whether they were; is written.
+        confirmed_out: (K,) receives whether they are.
+    """
+    for k in range(existence.shape[0]):
+        n = rows[k]
+        c = label[n]
+        confirmed[n] = existence[k] >= (confirm_until[c] if confirmed[n] else confirm_from[c])
+        confirmed_out[k] = confirmed[n]
 
 
 @kernel

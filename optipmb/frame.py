@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -117,7 +117,13 @@ class Frame:
         score: (M,) in (0, 1].
         label: (M,) int64, index into the classes of the parameters.
         source: (M,) int64, index of the object in the arrays that the caller gave.
+        labels: names of the classes that `label` points into, those of the parameters.
         cloud: the scan of the same stamp, or None.
+
+    The arrays are copied and cannot be written to, so that what was checked stays as it was.
+
+    Raises:
+        FrameError: wrong shapes, types or values.
     """
 
     stamp_ns: int
@@ -128,7 +134,33 @@ class Frame:
     score: NDArray[np.float64]
     label: NDArray[np.int64]
     source: NDArray[np.int64]
+    labels: tuple[str, ...]
     cloud: PointCloud | None = None
+
+    def __post_init__(self) -> None:
+        count = np.shape(self.score)[0] if np.ndim(self.score) == 1 else 0
+        for name, shape in _COLUMNS:
+            column = _shaped(name, getattr(self, name), (count, *shape))
+            object.__setattr__(self, name, _sealed(column))
+        for name in ("label", "source"):
+            index = _integers(name, getattr(self, name))
+            if index.shape != (count,):
+                raise FrameError(name, f"shape ({count},)", str(index.shape))
+            object.__setattr__(self, name, _sealed(index))
+        if not 0 <= self.stamp_ns < 2**63:
+            raise FrameError("stamp_ns", "whole nanoseconds in [0, 2^63)", repr(self.stamp_ns))
+        given = self.label, len(self.labels), self.center, self.size, self.yaw, self.score, self.velocity
+        if not allowed(*given):
+            _refuse(*given)
+
+
+_COLUMNS: Final[tuple[tuple[str, tuple[int, ...]], ...]] = (
+    ("center", (3,)),
+    ("size", (3,)),
+    ("yaw", ()),
+    ("velocity", (2,)),
+    ("score", ()),
+)
 
 
 def make_frame(
@@ -155,29 +187,28 @@ def make_frame(
         center: (M, 3) geometric centres, m, in the world frame, or in the sensor frame when `pose` is given.
         size: (M, 3) length, width, height, m, all positive.
         yaw: (M,) rad, in the same frame.
-        score: (M,) in (0, 1].
+        score: (M,) in [0, 1]; an object of score 0 is left out, for its detector says that there is none.
         velocity: (M, 2) over ground along the axes of the same frame, m/s; None, or rows of NaN, where unknown.
         pose: world from sensor, or None when the arrays are in the world frame already.
         cloud: the scan of the same stamp.
 
     Returns:
-        The frame, and how many objects were left out because their class is not in the parameters.
+        The frame, and how many objects were left out: their class is not in the parameters, or their score is 0.
 
     Raises:
         FrameError: wrong shapes or values; `path` names the field and the element.
     """
     if not isinstance(stamp_ns, (int, np.integer)) or not 0 <= stamp_ns < 2**63:
         raise FrameError("stamp_ns", "whole nanoseconds in [0, 2^63)", repr(stamp_ns))
-    which = _array("label", label, None)
-    if which.ndim != 1 or (which.size and which.dtype.kind not in "iu"):
-        raise FrameError("label", "(M,) integers", f"{which.shape} {which.dtype}")
-    which = which.astype(np.int64)
+    which = _integers("label", label)
     m = which.shape[0]
     center, size = _shaped("center", center, (m, 3)), _shaped("size", size, (m, 3))
     yaw, score = _shaped("yaw", yaw, (m,)), _shaped("score", score, (m,))
     velocity = np.full((m, 2), np.nan) if velocity is None else _shaped("velocity", velocity, (m, 2))
-    if not allowed(which, len(labels), center, size, yaw, score, velocity):
-        _refuse(which, len(labels), center, size, yaw, score, velocity)
+    scored = score.copy()
+    scored[score == 0.0] = 1.0  # those are left out, whatever they are
+    if not allowed(which, len(labels), center, size, yaw, scored, velocity):
+        _refuse(which, len(labels), center, size, yaw, scored, velocity)
 
     if pose is not None:
         rotation = pose.rotation
@@ -190,11 +221,11 @@ def make_frame(
 
     index = {name: i for i, name in enumerate(parameters.classes)}
     known = np.array([index.get(name, -1) for name in labels], dtype=np.int64)[which] if m else which
-    source = (known >= 0).nonzero()[0]
+    source = ((known >= 0) & (score > 0.0)).nonzero()[0]
     if source.shape[0] < m:
         center, size, yaw, velocity = center[source], size[source], yaw[source], velocity[source]
         score, known = score[source], known[source]
-    frame = Frame(int(stamp_ns), center, size, yaw, velocity, score, known, source, cloud)
+    frame = Frame(int(stamp_ns), center, size, yaw, velocity, score, known, source, parameters.labels, cloud)
     return frame, m - source.shape[0]
 
 
@@ -250,6 +281,19 @@ def _shaped(path: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.
         if array.size or 0 not in shape:
             raise FrameError(path, f"shape {shape}", str(array.shape))
         array = array.reshape(shape)
+    return array
+
+
+def _integers(path: str, values: ArrayLike) -> NDArray[np.int64]:
+    """Return a copy as int64 of one dimension."""
+    array = _array(path, values, None)
+    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
+        raise FrameError(path, "(M,) integers", f"{array.shape} {array.dtype}")
+    return array.astype(np.int64)
+
+
+def _sealed(array: NDArray[Any]) -> NDArray[Any]:
+    array.flags.writeable = False
     return array
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optipmb.compiled import kernel
+from optipmb.errors import FrameError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -117,17 +118,29 @@ def iou_exceeds(first: Array, second: Array, threshold: float) -> bool:
     return box_iou(first, second) > threshold
 
 
-@kernel
 def bev_iou(first: Array, second: Array) -> Array:
     """Rotated intersection over union on the ground plane.
 
     Args:
-        first: (N, 5) boxes [x, y, length, width, yaw], float64.
+        first: (N, 5) boxes [x, y, length, width, yaw].
         second: (M, 5) boxes.
 
     Returns:
         (N, M) in [0, 1].
+
+    Raises:
+        FrameError: other shapes.
     """
+    for path, boxes in (("first", first), ("second", second)):
+        if np.ndim(boxes) != 2 or np.shape(boxes)[1] != 5:  # noqa: PLR2004 - x, y, length, width, yaw
+            raise FrameError(path, "(N, 5)", str(np.shape(boxes)))
+    result: Array = overlaps(np.array(first, np.float64), np.array(second, np.float64))
+    return result
+
+
+@kernel
+def overlaps(first: Array, second: Array) -> Array:
+    """Compute `bev_iou` of checked boxes."""
     result = np.empty((first.shape[0], second.shape[0]))
     for n in range(first.shape[0]):
         for m in range(second.shape[0]):

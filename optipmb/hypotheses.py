@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.neighbours import NOBODY, block, empty_torus, insert
+from optipmb.gating import gate, gate_radii
 from optipmb.records import record
 
 if TYPE_CHECKING:
@@ -32,9 +32,6 @@ CLUTTER: Final = 1
 """No component, low score: taken for clutter now, and announced as a Poisson component for later (M_low)."""
 NEWBORN: Final = 2
 """No component, high score: a newborn object (M_high)."""
-
-FEW: Final = 256
-"""Up to so many measurements it is faster to look at all of them than to find the neighbours among them."""
 
 
 @record
@@ -72,6 +69,7 @@ def enumerate_hypotheses(
     poisson: Poissons,
     p_d_poisson: Array,
     measurements: Measurements,
+    dt: float,
     table: ClassTable,
 ) -> Hypotheses:
     """Enumerate the hypotheses that pass the class gate and the distance gate, with their costs.
@@ -85,6 +83,7 @@ def enumerate_hypotheses(
         poisson: predicted Poisson components.
         p_d_poisson: (J,) theirs.
         measurements: Z_k.
+        dt: s since the last frame.
         table: parameters as columns.
     """
     count = len(measurements)
@@ -101,14 +100,32 @@ def enumerate_hypotheses(
         poisson.label,
         poisson.weight,
         p_d_poisson,
+        gate_radii(
+            bernoulli.covariance,
+            bernoulli.label,
+            dt,
+            table.period,
+            table.gate,
+            table.gate_growth,
+            table.gate_deviations,
+        ),
+        gate_radii(
+            poisson.covariance,
+            poisson.label,
+            dt,
+            table.period,
+            table.gate,
+            table.gate_growth,
+            table.gate_deviations,
+        ),
         measurements.position,
         measurements.label,
         measurements.score,
-        table.gate,
         table.noise_position,
         table.clutter_intensity,
         table.birth_intensity,
         table.birth_score,
+        table.birth_over_clutter,
         first_kind,
         first_cost,
         first_existence,
@@ -129,26 +146,26 @@ def local_hypotheses(
     label_poisson: Index,
     weight: Array,
     p_d_poisson: Array,
+    radius: Array,
+    radius_poisson: Array,
     position: Array,
     measured_label: Index,
     score: Array,
-    gate_distance: Array,
     noise_position: Array,
     clutter_intensity: Array,
     birth_intensity: Array,
     birth_score: Array,
+    birth_over_clutter: NDArray[np.bool_],
     first_kind: Index,
     first_cost: Array,
     first_existence: Array,
     association: Array,
 ) -> tuple[Index, Index, Array, Index, Index, Array]:
     """Enumerate the local hypotheses: return the columns of `Hypotheses` over pairs, write those over measurements."""
-    row, measurement, log_likelihood = gate(
-        mean, covariance, label, position, measured_label, gate_distance, noise_position
-    )
+    row, measurement, log_likelihood = gate(mean, covariance, label, radius, position, measured_label, noise_position)
     detection_cost = detection_costs(row, measurement, log_likelihood, existence, p_d, association)
     component, announced, log_e = gate(
-        mean_poisson, covariance_poisson, label_poisson, position, measured_label, gate_distance, noise_position
+        mean_poisson, covariance_poisson, label_poisson, radius_poisson, position, measured_label, noise_position
     )
     for k in range(component.shape[0]):
         j = component[k]
@@ -162,137 +179,12 @@ def local_hypotheses(
         clutter_intensity,
         birth_intensity,
         birth_score,
+        birth_over_clutter,
         first_kind,
         first_cost,
         first_existence,
     )
     return row, measurement, detection_cost, component, announced, log_e
-
-
-@kernel
-def gate(
-    mean: Array,
-    covariance: Array,
-    label: Index,
-    position: Array,
-    measured_label: Index,
-    gate_distance: Array,
-    noise_position: Array,
-) -> tuple[Index, Index, Array]:
-    """Find the measurements of an object's class within its gate and their position likelihoods.
-
-    Args:
-        mean: (N, 6) predicted means.
-        covariance: (N, 6, 6) predicted covariances.
-        label: (N,) classes.
-        position: (M, 2) z_xy.
-        measured_label: (M,) z_c.
-        gate_distance: (C,) eta_dist.
-        noise_position: (C,) standard deviation of z_x and z_y; R_xy = sigma^2 I.
-
-    Returns:
-        Objects, measurements and log-likelihoods ln N(z_xy; z_hat, S) of the pairs (eq. Predicted Measurement),
-        ordered by object, then measurement.
-    """
-    if position.shape[0] <= FEW:
-        row, measurement = pairs_of_few(mean, label, position, measured_label, gate_distance)
-    else:
-        row, measurement = pairs_of_many(mean, label, position, measured_label, gate_distance)
-    log_likelihood = np.empty(row.shape[0])
-    before = -1
-    s_xx = s_xy = s_yy = determinant = constant = 0.0
-    for k in range(row.shape[0]):
-        n, m = row[k], measurement[k]
-        if n != before:  # what the pairs of an object share
-            before = n
-            r_xy = noise_position[label[n]] ** 2
-            s_xx, s_xy, s_yy = covariance[n, 0, 0] + r_xy, covariance[n, 0, 1], covariance[n, 1, 1] + r_xy
-            determinant = s_xx * s_yy - s_xy * s_xy
-            constant = -math.log(2.0 * math.pi) - 0.5 * math.log(determinant)
-        dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
-        squared = (s_yy * dx * dx - 2.0 * s_xy * dx * dy + s_xx * dy * dy) / determinant
-        log_likelihood[k] = constant - 0.5 * squared
-    return row, measurement, log_likelihood
-
-
-@kernel
-def pairs_of_few(
-    mean: Array, label: Index, position: Array, measured_label: Index, gate_distance: Array
-) -> tuple[Index, Index]:
-    """Find the pairs within the gates by looking at every measurement of a class; arguments and order as in `gate`."""
-    n_measurements = position.shape[0]
-    capacity = 2 * (mean.shape[0] + n_measurements) + 16 if mean.shape[0] else 0
-    row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
-    # The measurements, class after class.
-    start = np.zeros(gate_distance.shape[0] + 2, np.int64)
-    for c in measured_label:
-        start[c + 2] += 1
-    for c in range(gate_distance.shape[0]):
-        start[c + 2] += start[c + 1]
-    x, y, which = np.empty(n_measurements), np.empty(n_measurements), np.empty(n_measurements, np.int64)
-    for m in range(n_measurements):
-        k = start[measured_label[m] + 1]
-        x[k], y[k], which[k] = position[m, 0], position[m, 1], m
-        start[measured_label[m] + 1] += 1  # in the end where the next class starts
-
-    count = 0
-    for n in range(mean.shape[0]):
-        if count + n_measurements > capacity:
-            capacity = 2 * (count + n_measurements)
-            row, measurement = _grown(row, capacity), _grown(measurement, capacity)
-        eta, x_n, y_n = gate_distance[label[n]], mean[n, 0], mean[n, 1]
-        for k in range(start[label[n]], start[label[n] + 1]):
-            dx, dy = x[k] - x_n, y[k] - y_n
-            if abs(dx) <= eta and dx * dx + dy * dy <= eta * eta:  # most are too far along x already
-                row[count], measurement[count] = n, which[k]
-                count += 1
-    return row[:count], measurement[:count]
-
-
-@kernel
-def pairs_of_many(
-    mean: Array, label: Index, position: Array, measured_label: Index, gate_distance: Array
-) -> tuple[Index, Index]:
-    """Find the pairs within the gates by looking at neighbours; arguments and order as in `gate`.
-
-    The measurements stand in a torus of cells twice as wide as the gate of their class, so that a gate touches two or
-    three cells along each axis.
-    """
-    capacity = 2 * (mean.shape[0] + position.shape[0]) + 16 if mean.shape[0] else 0
-    row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
-    head, following, side = empty_torus(position.shape[0])
-    for m in range(position.shape[0]):
-        insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * gate_distance[measured_label[m]])
-    count = 0
-    for n in range(mean.shape[0]):
-        eta = gate_distance[label[n]]
-        begin = count
-        first_x, last_x, first_y, last_y = block(mean[n, 0], mean[n, 1], eta, 2.0 * eta)
-        for i in range(first_x, last_x + 1):
-            for j in range(first_y, last_y + 1):
-                m = head[(i & (side - 1)) * side + (j & (side - 1))]
-                while m != NOBODY:
-                    dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
-                    if dx * dx + dy * dy <= eta * eta and measured_label[m] == label[n]:
-                        if count == capacity:
-                            capacity *= 2
-                            row, measurement = _grown(row, capacity), _grown(measurement, capacity)
-                        slot = count  # keep the measurements of this object in ascending order
-                        while slot > begin and measurement[slot - 1] > m:
-                            measurement[slot] = measurement[slot - 1]
-                            slot -= 1
-                        measurement[slot] = m
-                        row[count] = n
-                        count += 1
-                    m = following[m]
-    return row[:count], measurement[:count]
-
-
-@kernel
-def _grown(array: Index, capacity: int) -> Index:
-    larger = np.empty(capacity, array.dtype)
-    larger[: array.shape[0]] = array
-    return larger
 
 
 @kernel
@@ -340,6 +232,7 @@ def first_detections(
     clutter_intensity: Array,
     birth_intensity: Array,
     birth_score: Array,
+    birth_over_clutter: NDArray[np.bool_],
     kind: Index,
     cost: Array,
     existence: Array,
@@ -351,6 +244,10 @@ def first_detections(
     ``w = -ln lambda_c``, ``r = 0``; a high score is newborn (eq. Newborn Hypothesis), ``w = -ln[mu_b0 (1 - p_a) / A
     + lambda_c]``, ``r = 1``.
 
+    Where `birth_over_clutter` is set, a component that explains a high score no better than clutter does, ``e <
+    lambda_c``, announces nothing: the measurement is newborn, and not lost between a component that it does not fit
+    and a birth that the component forbids.
+
     Args:
         measurement: (L,) measurement of each announced pair.
         log_e: (L,) ln e^j.
@@ -360,6 +257,7 @@ def first_detections(
         clutter_intensity: (C,) lambda_c.
         birth_intensity: (C,) mu_b0 / A.
         birth_score: (C,) eta_score.
+        birth_over_clutter: (C,) whether a high score needs a component that is likelier than clutter.
         kind: (M,) receives `FROM_POISSON`, `CLUTTER` or `NEWBORN`.
         cost: (M,) receives w.
         existence: (M,) receives r.
@@ -373,15 +271,17 @@ def first_detections(
         larger, smaller = max(log_sum[m], log_e[k]), min(log_sum[m], log_e[k])
         log_sum[m] = larger if smaller == -math.inf else larger + math.log1p(math.exp(smaller - larger))
     for m in range(n_measurements):
-        clutter = clutter_intensity[label[m]]
-        if kind[m] == FROM_POISSON:
+        c = label[m]
+        clutter = clutter_intensity[c]
+        shadowed = birth_over_clutter[c] and score[m] >= birth_score[c] and log_sum[m] < math.log(clutter)
+        if kind[m] == FROM_POISSON and not shadowed:
             ratio = math.exp(min(log_sum[m] - math.log(clutter), 700.0))  # e / lambda_c
             cost[m] = -math.log(clutter) - math.log1p(ratio)
             existence[m] = ratio / (1.0 + ratio)
-        elif score[m] < birth_score[label[m]]:
+        elif score[m] < birth_score[c]:
             cost[m] = -math.log(clutter)
             existence[m] = 0.0
         else:
             kind[m] = NEWBORN
-            cost[m] = -math.log(birth_intensity[label[m]] * (1.0 - association[m]) + clutter)
+            cost[m] = -math.log(birth_intensity[c] * (1.0 - association[m]) + clutter)
             existence[m] = 1.0

@@ -55,7 +55,9 @@ def light_weight_filter(
             detection by one nominal period.
         table: parameters as columns.
     """
-    count = len(survivors)
+    count, known = len(survivors), survivors.known
+    confirmed = np.zeros(count, np.bool_)
+    confirmed[:known] = bernoulli.confirmed[survivors.row[:known]]
     posterior = Bernoullis(
         mean,
         covariance,
@@ -69,6 +71,7 @@ def light_weight_filter(
         np.empty(count),  # evidence
         np.empty(count),  # heading_odds
         np.empty(count, np.bool_),  # extracted
+        confirmed,
     )
     update_light_weight(
         survivors.row,

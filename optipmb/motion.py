@@ -1,4 +1,8 @@
-"""The CTRA motion model and the unscented transform over it (Section IV.A, eq. Motion Predict).
+"""The motion models and the unscented transform over them (Section IV.A, eq. Motion Predict).
+
+A class moves by CTRA, the model of the paper, or at constant velocity: v and phi stay, omega and a are zero and take no
+part. In CTRA the acceleration may decay, ``a(t) = a e^(-t/tau)`` (Singer's model): a driver brakes for a while, not for
+ever, and not through a standstill. Without decay (tau infinite) the acceleration is constant, as in the paper.
 
 The unscented transform uses the symmetric set of 2n = 12 points at distance sqrt(n) along the columns of a matrix
 square root, all of weight 1/12 (kappa = 0): no weight is negative, so the transformed covariance is positive
@@ -36,6 +40,9 @@ ORDER = (2, 3, 4, 5, 0, 1)
 SMALL_TURN = 0.1
 """Turn angle (rad) below which the integrals of the motion are summed as series; the closed form divides by its
 square."""
+
+START = 5.0
+"""Where the acceleration decays, it carries a speed to at most so many times its own beyond it (`travel`)."""
 
 TINY_PIVOT = 1e-12
 """A pivot of the square root is lifted to this: a covariance that lost rank in rounding is repaired, and counted."""
@@ -78,6 +85,40 @@ def ctra_displacement(v: float, omega: float, a: float, dt: float) -> tuple[floa
 
 
 @kernel
+def travel(v: float, omega: float, a: float, dt: float, tau: float) -> tuple[float, float, float, float]:
+    """Move for dt under an acceleration that decays with time constant tau and never turns the speed round.
+
+    ``v(t) = v + a tau (1 - e^(-t/tau))``; the way is the integral of ``v(t) [cos(omega t), sin(omega t)]``, with
+    ``int e^(-t/tau) e^(i omega t) dt = (1 - e^(-dt/tau) e^(i omega dt)) / (1/tau - i omega)``.
+
+    Braking counts up to ``|v| / tau``, which ends at a standstill. So that the motion is continuous in v, an
+    acceleration counts up to `START` times as much: from a standstill objects start under the process noise.
+
+    Args:
+        v: speed, m/s.
+        omega: turn rate, rad/s.
+        a: acceleration, m/s^2.
+        dt: time, s, positive.
+        tau: time constant, s; infinite: the acceleration is constant and has no limit.
+
+    Returns:
+        The way along the starting heading and across it, m, the speed and the acceleration afterwards.
+    """
+    if tau == math.inf:
+        along, across = ctra_displacement(v, omega, a, dt)
+        return along, across, v + a * dt, a
+    limit = abs(v) / tau if v * a < 0.0 else START * abs(v) / tau
+    a = min(max(a, -limit), limit)
+    kept, u, beta = math.exp(-dt / tau), omega * dt, 1.0 / tau
+    along, across = ctra_displacement(v + a * tau, omega, 0.0, dt)
+    real, imaginary = 1.0 - kept * math.cos(u), -kept * math.sin(u)
+    scale = a * tau / (beta * beta + omega * omega)
+    along -= scale * (real * beta - imaginary * omega)
+    across -= scale * (real * omega + imaginary * beta)
+    return along, across, v + a * tau * (1.0 - kept), a * kept
+
+
+@kernel
 def square_root(covariance: Array, root: Array) -> int:
     """Factor a (6, 6) covariance, rows and columns in `ORDER`, into a lower `root`; return the pivots repaired."""
     repaired = 0
@@ -104,18 +145,22 @@ def predict_state(
     covariance: Array,
     dt: float,
     process_noise: Array,
+    tau: float,
+    straight: bool,
     root: Array,
     points: Array,
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
-    """Predict one state by the unscented transform of the CTRA model (eq. Motion Predict).
+    """Predict one state by the unscented transform of its motion model (eq. Motion Predict).
 
     Args:
         mean: (6,) posterior mean.
         covariance: (6, 6) posterior covariance.
         dt: time to predict over, s, positive.
         process_noise: (6,) standard deviations per square root of a second; ``Q = diag(q^2) dt``.
+        tau: time constant with which the acceleration decays, s.
+        straight: whether the model is that of constant velocity; else CTRA.
         root: (6, 6) buffer for the square root.
         points: (12, 6) buffer for the transformed points, as deviations from the transformed centre; the mean is
             added last, so that large world coordinates cost no digits.
@@ -126,8 +171,9 @@ def predict_state(
         Number of pivots that had to be repaired.
     """
     repaired = square_root(covariance, root)
-    v, phi, omega, a = mean[V], mean[PHI], mean[OMEGA], mean[A]
-    along0, across0 = ctra_displacement(v, omega, a, dt)
+    v, phi = mean[V], mean[PHI]
+    omega, a = (0.0, 0.0) if straight else (mean[OMEGA], mean[A])
+    along0, across0, v0, a0 = travel(v, omega, a, dt, tau)
     cos_phi, sin_phi = math.cos(phi), math.sin(phi)
     dx0 = cos_phi * along0 - sin_phi * across0
     dy0 = sin_phi * along0 + cos_phi * across0
@@ -138,19 +184,25 @@ def predict_state(
             for row in range(STATE):
                 point[ORDER[row]] = step * root[row, column]
             if column < STATE - 2:  # the columns of x and y leave the motion itself as it is at the centre
-                along, across = ctra_displacement(v + point[V], omega + point[OMEGA], a + point[A], dt)
+                if straight:
+                    along, across, speed, acceleration = (v + point[V]) * dt, 0.0, v + point[V], point[A]
+                else:
+                    along, across, speed, acceleration = travel(
+                        v + point[V], omega + point[OMEGA], a + point[A], dt, tau
+                    )
+                point[V], point[A] = speed - v0, acceleration - a0
                 cos_point, sin_point = cos_phi, sin_phi
                 if point[PHI] != 0.0:  # only the columns of v and phi turn the heading
                     cos_point, sin_point = math.cos(phi + point[PHI]), math.sin(phi + point[PHI])
                 point[X] += cos_point * along - sin_point * across - dx0
                 point[Y] += sin_point * along + cos_point * across - dy0
-                point[V] += point[A] * dt
-                point[PHI] += point[OMEGA] * dt
+                if not straight:
+                    point[PHI] += point[OMEGA] * dt
     mean_out[X], mean_out[Y] = mean[X] + (dx0 + centred(points, X)), mean[Y] + (dy0 + centred(points, Y))
-    mean_out[V] = v + a * dt + centred(points, V)
+    mean_out[V] = v0 + centred(points, V)
     mean_out[PHI] = wrap(phi + omega * dt + centred(points, PHI))
     mean_out[OMEGA] = omega + centred(points, OMEGA)
-    mean_out[A] = a + centred(points, A)
+    mean_out[A] = a0 + centred(points, A)
     for s in range(STATE):
         for t in range(s + 1):
             value = 0.0
@@ -158,7 +210,7 @@ def predict_state(
                 value += points[i, s] * points[i, t]
             value *= WEIGHT
             if s == t:
-                value += process_noise[s] ** 2 * dt
+                value += process_noise[s] ** 2 * dt if not (straight and s >= OMEGA) else 0.0
             covariance_out[s, t] = value
             covariance_out[t, s] = value
     return repaired

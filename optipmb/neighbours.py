@@ -57,5 +57,6 @@ def insert(head: Index, following: Index, side: int, number: int, x: float, y: f
 @kernel
 def block(x: float, y: float, reach: float, size: float) -> tuple[int, int, int, int]:
     """Return the first and the last cell along x, then along y, of what is within `reach` <= `size` of (x, y)."""
-    x_reach, y_reach = reach + SLACK * (1.0 + abs(x)), reach + SLACK * (1.0 + abs(y))
+    widest = max(size, SMALLEST_CELL)  # however far out, a search visits a few cells
+    x_reach, y_reach = reach + min(SLACK * (1.0 + abs(x)), widest), reach + min(SLACK * (1.0 + abs(y)), widest)
     return cell(x - x_reach, size), cell(x + x_reach, size), cell(y - y_reach, size), cell(y + y_reach, size)

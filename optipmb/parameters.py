@@ -13,7 +13,7 @@ from __future__ import annotations
 import tomllib
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -168,6 +168,40 @@ class ClassParameters(_Table):
     process_noise: ProcessNoise = Field(description="Q")
     measurement_noise: MeasurementNoise = Field(description="R")
     birth: BirthSpread = Field(description="P^0")
+    motion: Literal["ctra", "cv"] = Field(
+        default="ctra",
+        description="motion model: constant turn rate and acceleration (the paper's), or constant velocity",
+    )
+    acceleration_time: Positive | None = Field(
+        default=None,
+        description="time constant, s, with which the acceleration decays; none: it stays constant (the paper)",
+    )
+    gate_growth: NonNegative = Field(
+        default=0.0,
+        description="by how much of eta_dist the gate widens for every nominal period that a frame comes later than "
+        "one; the paper: 0",
+    )
+    gate_deviations: NonNegative = Field(
+        default=0.0,
+        description="the gate holds the way of so many standard deviations of the speed, or eta_dist where that is "
+        "more; the paper: 0",
+    )
+    birth_over_clutter: bool = Field(
+        default=False,
+        description="true: a detection from eta_score on is born unless a Poisson component explains it better than "
+        "clutter; false: any component in its gate forbids the birth (the paper)",
+    )
+    ground_clearance: NonNegative = Field(
+        default=0.0,
+        description="points so far above the bottom of a box, m, are of the ground and do not count in PTS; the "
+        "paper: 0",
+    )
+    confirm_from: Probability = Field(
+        default=0.0, description="existence from which a track is confirmed; 0: every extracted track is"
+    )
+    confirm_until: Probability = Field(
+        default=0.0, description="existence below which a confirmed track is so no longer, at most confirm_from"
+    )
     calibration: Calibration | None = Field(
         default=None, description="what tracks say of themselves; without it existence is r and the covariance is P"
     )
@@ -176,6 +210,8 @@ class ClassParameters(_Table):
     def _ordered(self) -> ClassParameters:
         if self.extract_new > self.extract_known:
             raise ValueError(f"extract_new <= extract_known, received {self.extract_new} > {self.extract_known}")
+        if self.confirm_until > self.confirm_from:
+            raise ValueError(f"confirm_until <= confirm_from, received {self.confirm_until} > {self.confirm_from}")
         return self
 
 
@@ -187,6 +223,11 @@ class Parameters(_Table):
     )
     nominal_period: Positive = Field(
         description="seconds between frames for which p_s and the counted limits hold; with another dt they are scaled"
+    )
+    detection_over_time: bool = Field(
+        default=False,
+        description="true: p_d holds per nominal period, and a miss weighs by its time where frames come faster; "
+        "false: per frame (the paper)",
     )
     provenance: str = Field(default="", max_length=10_000, description="where the values come from")
     classes: Annotated[dict[ClassName, ClassParameters], Field(min_length=1, max_length=256)] = Field(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from optipmb.compiled import kernel
+from optipmb.errors import FrameError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,9 +24,13 @@ if TYPE_CHECKING:
     Small = NDArray[np.int32]
 
 CELLS: Final = 128
-"""Cells along one side of the grid; around it lies a border of empty ones, for the points outside."""
+"""Cells along one side of the grid; around it lies a border, for what is outside."""
 
 SIDE: Final = CELLS + 2
+
+RANGE: Final = 250.0
+"""Along each axis the grid reaches at most so far from the sensor, m. Boxes and points beyond share the border: they
+are rare, and a box far away must not make the cells so wide that every point falls into one of boxes."""
 
 BLOCK: Final = 512
 """Points that are looked at together; what is noted of them stays in the fastest cache."""
@@ -42,11 +47,18 @@ def points_in_boxes(cloud: PointCloud, center: Array, size: Array, yaw: Array) -
 
     Returns:
         (N,) int64; faces belong to the box.
+
+    Raises:
+        FrameError: other shapes.
     """
-    counts = np.zeros(center.shape[0], np.int64)
+    boxes = np.shape(center)[0] if np.ndim(center) else 0
+    for path, values, shape in (("center", center, (boxes, 3)), ("size", size, (boxes, 3)), ("yaw", yaw, (boxes,))):
+        if np.shape(values) != shape:
+            raise FrameError(path, f"shape {shape}", str(np.shape(values)))
+    counts = np.zeros(boxes, np.int64)
     if counts.size and cloud.xyz.shape[0]:
         local = (center - cloud.pose.translation) @ cloud.pose.rotation
-        count_points(cloud.xyz, local, 0.5 * size, yaw, cloud.pose.rotation, counts)
+        count_points(cloud.xyz, local, 0.5 * size, np.array(yaw, np.float64), cloud.pose.rotation, counts)
     return counts
 
 
@@ -65,9 +77,9 @@ def count_points(
         counts: (N,) is added to.
     """
     axes, low, high = boxes_in_sensor(center, half, yaw, rotation)
-    x0, y0, z0 = low[:, 0].min(), low[:, 1].min(), low[:, 2].min()
-    z1 = high[:, 2].max()
-    per_x, per_y = CELLS / max(high[:, 0].max() - x0, 1e-6), CELLS / max(high[:, 1].max() - y0, 1e-6)
+    x0, y0, z0 = max(low[:, 0].min(), -RANGE), max(low[:, 1].min(), -RANGE), low[:, 2].min()
+    x1, y1, z1 = min(high[:, 0].max(), RANGE), min(high[:, 1].max(), RANGE), high[:, 2].max()
+    per_x, per_y = CELLS / max(x1 - x0, 1e-6), CELLS / max(y1 - y0, 1e-6)
     boxes, start, occupied = boxes_of_cells(low, high, x0, y0, per_x, per_y)
 
     near, cell_of = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)

@@ -22,10 +22,12 @@ if TYPE_CHECKING:
 def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density, int]:
     """Carry the density from its stamp to `stamp_ns`.
 
-    Means and covariances follow the CTRA model. The survival probability p_s holds for one nominal period of the
-    stream: over dt it is ``p_s ** (dt / period)``, so that a stream at twice the rate does not forget twice as fast.
+    Means and covariances follow the motion model of the class. The survival probability p_s holds for one nominal
+    period of the stream: over dt it is ``p_s ** (dt / period)``, so that a stream at twice the rate does not forget
+    twice as fast.
     Components that a silent stream has carried past their limits (`max_misses`, `poisson_steps`) are removed before
-    they could be associated.
+    they could be associated, but for those that the last frame has seen: however slow a stream is, what it sees lives
+    until it has looked once more.
 
     Args:
         density: posterior of the last frame.
@@ -38,11 +40,12 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     bernoulli, poisson = density.bernoulli, density.poisson
     dt = 0.0 if density.stamp_ns == NO_FRAME else (stamp_ns - density.stamp_ns) * 1e-9
     if dt == 0.0:
-        return Density(stamp_ns, density.next_id, bernoulli, poisson), 0
+        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels), 0
     survival = table.survival ** (dt / table.period)
 
+    before_ns = density.stamp_ns
     kept, mean, covariance, existence, repaired_mb = _carry(
-        bernoulli, bernoulli.existence, bernoulli.seen_ns, table.max_misses, survival, dt, stamp_ns, table
+        bernoulli, bernoulli.existence, bernoulli.seen_ns, table.max_misses, survival, dt, before_ns, stamp_ns, table
     )
     if kept.shape[0] < len(bernoulli):
         bernoulli = bernoulli.take(kept)
@@ -59,16 +62,17 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
         bernoulli.evidence,
         bernoulli.heading_odds,
         bernoulli.extracted,
+        bernoulli.confirmed,
     )
     if not len(poisson):
-        return Density(stamp_ns, density.next_id, bernoulli, poisson), repaired_mb
+        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels), repaired_mb
     kept, mean, covariance, weight, repaired_ppp = _carry(
-        poisson, poisson.weight, poisson.born_ns, table.poisson_steps, survival, dt, stamp_ns, table
+        poisson, poisson.weight, poisson.born_ns, table.poisson_steps, survival, dt, before_ns, stamp_ns, table
     )
     if kept.shape[0] < len(poisson):
         poisson = poisson.take(kept)
     poisson = Poissons(mean, covariance, weight, poisson.label, poisson.auxiliary, poisson.born_ns)
-    return Density(stamp_ns, density.next_id, bernoulli, poisson), repaired_mb + repaired_ppp
+    return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels), repaired_mb + repaired_ppp
 
 
 def _carry(
@@ -78,6 +82,7 @@ def _carry(
     limit: Index,
     survival: Array,
     dt: float,
+    before_ns: int,
     stamp_ns: int,
     table: ClassTable,
 ) -> tuple[Index, Array, Array, Array, int]:
@@ -94,9 +99,12 @@ def _carry(
         limit,
         survival,
         dt,
+        before_ns,
         stamp_ns,
         table.period,
         table.process_noise,
+        table.acceleration_time,
+        table.constant_velocity,
         kept,
         mean,
         covariance,
@@ -117,9 +125,12 @@ def predict_components(
     limit: Index,
     survival: Array,
     dt: float,
+    before_ns: int,
     stamp_ns: int,
     period: float,
     process_noise: Array,
+    acceleration_time: Array,
+    constant_velocity: NDArray[np.bool_],
     kept: Index,
     mean_out: Array,
     covariance_out: Array,
@@ -136,9 +147,12 @@ def predict_components(
         limit: (C,) periods after which a component goes.
         survival: (C,) p_s over dt.
         dt: time to predict over, s, positive.
+        before_ns: stamp of the last frame.
         stamp_ns: stamp of the new frame.
         period: nominal period, s.
         process_noise: (C, 6) standard deviations per square root of a second.
+        acceleration_time: (C,) time constant of the acceleration, s.
+        constant_velocity: (C,) whether a class moves at constant velocity.
         kept: (N,) receives the rows that stay, in front.
         mean_out: (N, 6) receives m_+ of those.
         covariance_out: (N, 6, 6) receives P_+.
@@ -152,12 +166,21 @@ def predict_components(
     for n in range(mean.shape[0]):
         c = label[n]
         # The frame at hand may still bring the detection that is missing, hence one period less.
-        if whole_periods(since_ns[n], stamp_ns, period) - 1 > limit[c]:
+        if since_ns[n] < before_ns and whole_periods(since_ns[n], stamp_ns, period) - 1 > limit[c]:
             continue
         kept[count] = n
         weight_out[count] = weight[n] * survival[c]
         if predict_state(
-            mean[n], covariance[n], dt, process_noise[c], root, points, mean_out[count], covariance_out[count]
+            mean[n],
+            covariance[n],
+            dt,
+            process_noise[c],
+            acceleration_time[c],
+            constant_velocity[c],
+            root,
+            points,
+            mean_out[count],
+            covariance_out[count],
         ):
             repaired += 1
         count += 1

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from optipmb.compiled import kernel
+from optipmb.density import STATE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,12 +33,35 @@ MAX_AGE: Final = 1e12
 """Longest age, s."""
 
 
+_SHAPES: Final[tuple[tuple[str, tuple[int, ...]], ...]] = (
+    ("id", ()),
+    ("label", ()),
+    ("center", (3,)),
+    ("size", (3,)),
+    ("yaw", ()),
+    ("heading_confidence", ()),
+    ("velocity", (2,)),
+    ("yaw_rate", ()),
+    ("acceleration", ()),
+    ("existence", ()),
+    ("score", ()),
+    ("covariance", (STATE, STATE)),
+    ("age", ()),
+    ("time_since_detection", ()),
+    ("detection", ()),
+    ("confirmed", ()),
+)
+
+
 def sound(tracks: Tracks) -> bool:
-    """Tell whether all numbers of the tracks are finite and within bounds, and the ids ascend.
+    """Tell whether all numbers of the tracks are finite and within bounds, the ids ascend, and the columns fit.
 
     Existence, score and heading confidence lie in [0, 1], sizes are positive, ages are not negative, coordinates are at
     most `MAX_PLACE`, covariances `MAX_COVARIANCE`, ages `MAX_AGE`, all others `MAX_VALUE`.
     """
+    count = tracks.id.shape[0]
+    if any(getattr(tracks, name).shape != (count, *shape) for name, shape in _SHAPES):
+        return False
     return bool(
         all_within(
             tracks.id,

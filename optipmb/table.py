@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,8 @@ class ClassTable:
         noise_position: (C,) standard deviation of z_x and z_y.
         noise_velocity: (C,) of z_vx and z_vy.
         noise_heading: (C,) of z_phi.
+        acceleration_time: (C,) time constant of the acceleration, s, infinite where it is constant.
+        constant_velocity: (C,) whether the motion model is that of constant velocity.
         birth_known: (C, 6) standard deviations of P^0 when the detection brings a velocity.
         birth_unknown: (C, 6) when it does not.
         sign_known: (C,) whether the sign of the heading is followed; the next four are zero where not.
@@ -43,6 +46,7 @@ class ClassTable:
     """
 
     period: float
+    detection_over_time: bool
     score_filter: Array
     nms_iou: Array
     survival: Array
@@ -61,6 +65,14 @@ class ClassTable:
     max_misses: NDArray[np.int64]
     min_existence: Array
     birth_heading_speed: Array
+    acceleration_time: Array
+    constant_velocity: NDArray[np.bool_]
+    gate_growth: Array
+    gate_deviations: Array
+    birth_over_clutter: NDArray[np.bool_]
+    ground_clearance: Array
+    confirm_from: Array
+    confirm_until: Array
     process_noise: Array
     noise_position: Array
     noise_velocity: Array
@@ -121,6 +133,7 @@ class ClassTable:
         signs = [p.heading_sign for p in rows]
         return cls(
             period=parameters.nominal_period,
+            detection_over_time=parameters.detection_over_time,
             score_filter=column(lambda p: p.score_filter),
             nms_iou=column(lambda p: p.nms_iou),
             survival=column(lambda p: p.survival),
@@ -139,6 +152,14 @@ class ClassTable:
             max_misses=count(lambda p: p.max_misses),
             min_existence=column(lambda p: p.min_existence),
             birth_heading_speed=column(lambda p: p.birth_heading_speed),
+            acceleration_time=column(lambda p: math.inf if p.acceleration_time is None else p.acceleration_time),
+            constant_velocity=np.array([p.motion == "cv" for p in rows], dtype=np.bool_),
+            gate_growth=column(lambda p: p.gate_growth),
+            gate_deviations=column(lambda p: p.gate_deviations),
+            birth_over_clutter=np.array([p.birth_over_clutter for p in rows], dtype=np.bool_),
+            ground_clearance=column(lambda p: p.ground_clearance),
+            confirm_from=column(lambda p: p.confirm_from),
+            confirm_until=column(lambda p: p.confirm_until),
             process_noise=np.array(
                 [[q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration] for q in noise]
             ),

@@ -10,10 +10,11 @@ import numpy as np
 
 from optipmb.association import associate
 from optipmb.birth import first_detected_states
+from optipmb.columns import columns_of, density_of, fitting
 from optipmb.density import NO_FRAME, STATE, Density, Poissons
-from optipmb.detection_probability import detection_probability
+from optipmb.detection_probability import detection_probability, over_time
 from optipmb.effort import UNLIMITED, check_effort
-from optipmb.errors import FrameError
+from optipmb.errors import DensityError, FrameError
 from optipmb.extract import extract
 from optipmb.hypotheses import enumerate_hypotheses
 from optipmb.lightweight import light_weight_filter
@@ -148,10 +149,9 @@ class Tracker:
         self._clock = clock
         self._table = ClassTable.of(parameters)
 
-    @staticmethod
-    def initial(next_id: int = 1) -> Density:
+    def initial(self, next_id: int = 1) -> Density:
         """Return the density before the first frame."""
-        return Density.empty(next_id)
+        return Density.empty(self.parameters.labels, next_id)
 
     def step(self, density: Density, frame: Frame) -> StepResult:
         """Run one recursion of Algorithm 1.
@@ -164,12 +164,16 @@ class Tracker:
             The posterior, the tracks and diagnostics. The same arguments give the same bytes.
 
         Raises:
-            FrameError: the stamp of the frame is before that of the density.
+            FrameError: the stamp of the frame is before that of the density, or the classes of the frame or of the
+                density are not those of the parameters.
+            DensityError: the columns of the density do not fit together.
             EffortError: the frame needs more than `max_pairs` pairs looked at; nothing costly was done yet.
         """
+        self._check(density, frame)
         if density.stamp_ns != NO_FRAME and frame.stamp_ns < density.stamp_ns:
             raise FrameError("stamp_ns", f"a stamp from {density.stamp_ns} on", str(frame.stamp_ns))
         now, table, modules, clock = frame.stamp_ns, self._table, self.modules, self._clock
+        dt = table.period if density.stamp_ns == NO_FRAME else (now - density.stamp_ns) * 1e-9
         times = [clock()]
 
         # PMB prediction
@@ -179,15 +183,15 @@ class Tracker:
 
         # PMB update: measurements, detection probabilities, local hypotheses
         measurements, below_score, suppressed = preprocess(frame, table, self._max_pairs)
-        check_effort(bernoulli, poisson, measurements, table, self._max_pairs)
+        check_effort(bernoulli, poisson, measurements, dt, table, self._max_pairs)
         n_predicted = len(poisson)
         if not modules.habm:
             poisson = with_measurement_births(poisson, measurements, now, table)
         times.append(clock())
         cloud = frame.cloud if modules.adp else None
-        p_d, p_d_poisson = self._detection_probabilities(bernoulli, poisson, cloud)
+        p_d, p_d_poisson = self._detection_probabilities(bernoulli, poisson, cloud, dt)
         times.append(clock())
-        hypotheses = enumerate_hypotheses(bernoulli, p_d, poisson, p_d_poisson, measurements, table)
+        hypotheses = enumerate_hypotheses(bernoulli, p_d, poisson, p_d_poisson, measurements, dt, table)
         times.append(clock())
 
         # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
@@ -217,7 +221,7 @@ class Tracker:
         times.append(clock())
 
         born = len(survivors) - survivors.known
-        posterior = Density(now, predicted.next_id + born, objects, undetected)
+        posterior = Density(now, predicted.next_id + born, objects, undetected, density.labels)
         diagnostics = Diagnostics(
             cloud is not None,
             frame.score.shape[0],
@@ -230,12 +234,23 @@ class Tracker:
         )
         return StepResult(posterior, tracks, diagnostics)
 
+    def _check(self, density: Density, frame: Frame) -> None:
+        """Refuse what kernels would read or write out of bounds for."""
+        labels = self.parameters.labels
+        for path, given in (("labels", frame.labels), ("density.labels", density.labels)):
+            if given != labels:
+                raise FrameError(path, f"the classes of profile {self.parameters.name}, {labels}", str(given)[:200])
+        if not fitting(density, len(labels)):
+            density_of(density.stamp_ns, density.next_id, columns_of(density), labels)  # names the column
+            raise DensityError("density", "columns of equal length", "others")
+
     def _detection_probabilities(
-        self, bernoulli: Bernoullis, poisson: Poissons, cloud: PointCloud | None
+        self, bernoulli: Bernoullis, poisson: Poissons, cloud: PointCloud | None, dt: float
     ) -> tuple[Array, Array]:
         """Compute p_d(x_+) of objects and of Poisson components, in one pass over the cloud if there is one."""
+        share = dt / self._table.period if self._table.detection_over_time else 1.0
         if cloud is None:
-            p_d0 = self._table.detection
+            p_d0 = over_time(self._table.detection, share)
             return p_d0[bernoulli.label], p_d0[poisson.label]
         p_d = detection_probability(
             np.concatenate((bernoulli.mean, poisson.mean)),
@@ -244,6 +259,7 @@ class Tracker:
             cloud,
             self._table,
         )
+        p_d = over_time(p_d, share)
         return p_d[: len(bernoulli)], p_d[len(bernoulli) :]
 
     def _update_states(

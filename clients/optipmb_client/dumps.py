@@ -70,14 +70,14 @@ def replay(dump: Dump, tracker: Callable[[optipmb.Parameters], _Steps] = optipmb
     """
     try:
         parameters = optipmb.parse_parameters(dump.parameters)
-        density = optipmb.density_of(dump.stamp_ns, dump.next_id, dump.density, len(parameters.classes))
+        density = optipmb.density_of(dump.stamp_ns, dump.next_id, dump.density, parameters.labels)
     except optipmb.OptipmbError as error:
         raise UsageError(f"dump of {dump.stream}: {error}") from error
     steps = tracker(parameters)
     result = Replayed(dump.stream, len(dump.frames), dump.error)
     for frame in dump.frames:
         if frame.anew:
-            density = optipmb.Density.empty(density.next_id)
+            density = optipmb.Density.empty(parameters.labels, density.next_id)
         try:
             density = _step(steps, parameters, density, frame)
         except Exception as error:  # noqa: BLE001  it is what was asked for

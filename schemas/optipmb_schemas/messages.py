@@ -81,8 +81,9 @@ class Detections(SensorMessage):
     yaw: Annotated[NDArray[np.float64], Array("f8", ("M",), -1e4, 1e4)] = Field(
         description="Heading in radians, counter-clockwise about z from the x axis of `frame`."
     )
-    score: Annotated[NDArray[np.float64], Array("f8", ("M",), 0, 1, above=True)] = Field(
-        description="Confidence of the detector. Logits must be passed through a sigmoid first."
+    score: Annotated[NDArray[np.float64], Array("f8", ("M",), 0, 1)] = Field(
+        description="Confidence of the detector. Logits must be passed through a sigmoid first. An object of score 0 "
+        "is left out and counted in `Tracks.ignored`."
     )
     velocity: Annotated[NDArray[np.float64], Array("f8", ("M", 2), -1e3, 1e3, unknown=True)] | None = Field(
         default=None,
@@ -140,7 +141,9 @@ class Tracks(Header):
     profile: Name = Field(description="Name of the parameters in force.")
     cloud_used: Flag = Field(description="Whether a point cloud took part in this frame.")
     gap: Count = Field(default=0, description="Number of frames known to be missing directly before this one.")
-    ignored: Count = Field(default=0, description="Number of detections whose class the profile does not have.")
+    ignored: Count = Field(
+        default=0, description="Number of detections left out: their class is not in the profile, or their score is 0."
+    )
     labels: Labels = Field(description="Names of the classes that `label` counts.")
     id: Annotated[NDArray[np.int64], Array("i8", ("N",), 0, INT64)] = Field(
         description="Identity of the track: unique in the stream, never used again. Ascending."

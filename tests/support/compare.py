@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-9
 BERNOULLI = ["mean", "covariance", "existence", "label", "auxiliary", "id", "born_ns", "seen_ns", "score", "evidence"]
-BERNOULLI += ["heading_odds", "extracted"]
+BERNOULLI += ["heading_odds", "extracted", "confirmed"]
 POISSON = ["mean", "covariance", "weight", "label", "auxiliary", "born_ns"]
 TRACKS = ["id", "label", "center", "size", "yaw", "velocity", "yaw_rate", "acceleration", "existence", "score"]
-TRACKS += ["heading_confidence", "covariance", "age", "time_since_detection", "detection"]
+TRACKS += ["heading_confidence", "covariance", "age", "time_since_detection", "detection", "confirmed"]
 
 
 def assert_close(found: np.ndarray[Any, Any], wanted: np.ndarray[Any, Any], what: str) -> None:

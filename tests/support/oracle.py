@@ -47,6 +47,7 @@ class Bernoulli:
     heading_odds: float = 0.0
     id: int = 0
     extracted: bool = False
+    confirmed: bool = False
     detection: int = -1
 
 
@@ -87,6 +88,8 @@ class Oracle:
     def __init__(self, parameters: Any, modules: Any) -> None:
         self.classes = list(parameters.classes.values())
         self.nominal: float = parameters.nominal_period
+        self.over_time: bool = parameters.detection_over_time
+        self.dt = self.nominal
         self.modules = modules
         self.bernoulli: list[Bernoulli] = []
         self.poisson: list[Poisson] = []
@@ -98,7 +101,9 @@ class Oracle:
         """One frame: predict, preprocess, update, associate, prune, light-weight filter, extract."""
         now = int(frame.stamp_ns)
         since = (now - self.stamp_ns) * 1e-9 / self.nominal  # periods since the last frame
+        self.dt = self.nominal
         if self.stamp_ns >= 0:
+            self.dt = (now - self.stamp_ns) * 1e-9
             self._predict(now)
         self.stamp_ns = now
         measurements = self._preprocess(frame)
@@ -124,20 +129,30 @@ class Oracle:
         return self._extract(now)
 
     def _predict(self, now: int) -> None:
-        """Eqs. (PPP_prediction), (MB_prediction); first goes what the silence of the stream put past its limit."""
-        dt = (now - self.stamp_ns) * 1e-9
+        """Eqs. (PPP_prediction), (MB_prediction); first goes what the silence of the stream put past its limit.
+
+        What the last frame has seen stays for one more.
+        """
+        dt, last = self.dt, self.stamp_ns
         self.bernoulli = [
-            b for b in self.bernoulli if periods(b.seen_ns, now, self.nominal) - 1 <= self.classes[b.label].max_misses
+            b
+            for b in self.bernoulli
+            if periods(b.seen_ns, now, self.nominal) - 1 <= self.classes[b.label].max_misses or b.seen_ns == last
         ]
         self.poisson = [
-            u for u in self.poisson if periods(u.born_ns, now, self.nominal) - 1 <= self.classes[u.label].poisson_steps
+            u
+            for u in self.poisson
+            if periods(u.born_ns, now, self.nominal) - 1 <= self.classes[u.label].poisson_steps or u.born_ns == last
         ]
         components: list[Bernoulli | Poisson] = [*self.bernoulli, *self.poisson]
         for component in components:
             c = self.classes[component.label]
             q = c.process_noise
             Q = np.diag(np.square([q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration]))
-            component.mean, component.covariance = predict(component.mean, component.covariance, Q, dt)
+            tau, straight = c.acceleration_time or math.inf, c.motion == "cv"
+            component.mean, component.covariance = predict(
+                component.mean, component.covariance, Q, dt, tau, straight=straight
+            )
             survival = c.survival ** (dt / self.nominal)
             if isinstance(component, Bernoulli):
                 component.existence *= survival
@@ -169,18 +184,25 @@ class Oracle:
         return kept
 
     def _detection_probability(self, component: Bernoulli | Poisson, world: Array | None) -> float:
-        """ADP: p_d = p_d0 min[1, (1 - s_d) PTS / PTS_0 + s_d]."""
+        """ADP: p_d = p_d0 min[1, (1 - s_d) PTS / PTS_0 + s_d], without the points of the ground; over dt, if asked."""
         c = self.classes[component.label]
-        if world is None:
-            return float(c.detection)
-        points = count_inside(world, component.mean[:2], component.mean[3], component.auxiliary)
-        scale = (1 - c.detection_floor) * points / c.expected_points + c.detection_floor
-        return float(c.detection * min(1.0, scale))
+        p_d = float(c.detection)
+        if world is not None:
+            box = component.auxiliary.copy()
+            cut = min(c.ground_clearance, box[2])
+            box[2:] += -cut, cut / 2
+            points = count_inside(world, component.mean[:2], component.mean[3], box)
+            scale = (1 - c.detection_floor) * points / c.expected_points + c.detection_floor
+            p_d *= min(1.0, scale)
+        share = self.dt / self.nominal
+        return float(1 - (1 - p_d) ** max(share, 0.02)) if self.over_time and share < 1 else p_d
 
     def _in_gate(self, component: Bernoulli | Poisson, z: Measurement) -> bool:
         """Class gate and distance gate."""
-        distance = math.hypot(*(component.mean[:2] - z.xy))
-        return component.label == z.label and distance <= self.classes[z.label].gate
+        distance, c = math.hypot(*(component.mean[:2] - z.xy)), self.classes[z.label]
+        eta = c.gate * (1 + c.gate_growth * max(0.0, self.dt / self.nominal - 1))
+        spread = math.sqrt(component.covariance[2, 2])
+        return component.label == z.label and distance <= max(eta, c.gate_deviations * spread * self.dt)
 
     def _log_likelihood(self, component: Bernoulli | Poisson, z: Measurement) -> float:
         position = self.classes[z.label].measurement_noise.position
@@ -203,6 +225,8 @@ class Oracle:
             log_total = np.logaddexp(log_sum, math.log(clutter))
             weights = [float(w) for w in np.exp(log_e - log_sum)]
             parts = [ukf_update(u.mean, u.covariance, z, c) for u in members]
+        shadowed = c.birth_over_clutter and z.score >= c.birth_score
+        if gate and not (shadowed and log_sum < math.log(clutter)):
             return NewObject(-log_total, math.exp(log_sum - log_total), *moment_match(weights, parts))
         if z.score < c.birth_score:
             return NewObject(-math.log(clutter), 0.0, low=True)
@@ -304,6 +328,7 @@ class Oracle:
             existence, score, covariance = calibrate(c, b)
             sign, doubt = confidence(c, b.heading_odds)
             covariance = covariance + np.diag([0.0, 0.0, 0.0, doubt, 0.0, 0.0])
+            b.confirmed = existence >= (c.confirm_until if b.confirmed else c.confirm_from)
             rows.append(
                 {
                     "id": b.id, "label": b.label, "center": [x, y, b.auxiliary[3]], "size": b.auxiliary[:3], "yaw": phi,
@@ -311,7 +336,7 @@ class Oracle:
                     "velocity": [v * math.cos(phi), v * math.sin(phi)], "yaw_rate": omega, "acceleration": a,
                     "existence": existence, "score": score, "covariance": covariance,
                     "age": (now - b.born_ns) * 1e-9, "time_since_detection": (now - b.seen_ns) * 1e-9,
-                    "detection": b.detection,
+                    "detection": b.detection, "confirmed": b.confirmed,
                 }
             )  # fmt: skip
         return OracleTracks({name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())})

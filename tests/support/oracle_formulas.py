@@ -54,15 +54,29 @@ def _nodes(count: int) -> tuple[Array, Array]:
     return nodes, weights
 
 
-def ctra(x: Array, dt: float) -> Array:
-    """Gamma_CTRA: the integral of constant omega and a over dt, by Gauss-Legendre quadrature."""
+def ctra(x: Array, dt: float, tau: float = math.inf) -> Array:
+    """Gamma_CTRA: the integral of constant omega and of a, or of a exp(-t / tau), by Gauss-Legendre quadrature.
+
+    Where a decays, it counts up to |v| / tau in braking, up to five times as much otherwise.
+    """
     px, py, v, phi, omega, a = x
-    nodes, weights = _nodes(24 + math.ceil(abs(omega) * dt))
+    if tau < math.inf:
+        a = math.copysign(min(abs(a), abs(v) / tau * (1 if v * a < 0 else 5)), a)
+    nodes, weights = _nodes(24 + math.ceil((abs(omega) + 1 / tau) * dt))
     t = 0.5 * dt * (nodes + 1.0)
-    speed = v + a * t
-    px += 0.5 * dt * np.sum(weights * speed * np.cos(phi + omega * t))
-    py += 0.5 * dt * np.sum(weights * speed * np.sin(phi + omega * t))
-    return np.array([px, py, v + a * dt, phi + omega * dt, omega, a])
+
+    def speed(t: Any) -> Any:
+        return v + (a * t if tau == math.inf else a * tau * (1 - np.exp(-t / tau)))
+
+    px += 0.5 * dt * np.sum(weights * speed(t) * np.cos(phi + omega * t))
+    py += 0.5 * dt * np.sum(weights * speed(t) * np.sin(phi + omega * t))
+    return np.array([px, py, speed(dt), phi + omega * dt, omega, a * math.exp(-dt / tau)])
+
+
+def constant_velocity(x: Array, dt: float) -> Array:
+    """Speed and heading stay; turn rate and acceleration play no part."""
+    px, py, v, phi, omega, a = x
+    return np.array([px + v * math.cos(phi) * dt, py + v * math.sin(phi) * dt, v, phi, omega, a])
 
 
 def sigma_points(m: Array, P: Array) -> list[Array]:
@@ -73,11 +87,15 @@ def sigma_points(m: Array, P: Array) -> list[Array]:
     return [m + sign * math.sqrt(n) * L[:, i] for sign in (1.0, -1.0) for i in range(n)]
 
 
-def predict(m: Array, P: Array, Q: Array, dt: float) -> tuple[Array, Array]:
-    """Eq. (Motion Predict): (m+, P+) by the unscented transform through the CTRA model, Q = diag(q)^2 dt."""
+def predict(
+    m: Array, P: Array, Q: Array, dt: float, tau: float = math.inf, *, straight: bool = False
+) -> tuple[Array, Array]:
+    """Eq. (Motion Predict): (m+, P+) by the unscented transform through the motion model, Q = diag(q)^2 dt."""
     if dt == 0.0:
         return m.copy(), P.copy()
-    points = [ctra(x, dt) for x in sigma_points(m, P)]
+    if straight:
+        m, Q = np.array([*m[:4], 0.0, 0.0]), np.diag([*np.diag(Q)[:4], 0.0, 0.0])
+    points = [constant_velocity(x, dt) if straight else ctra(x, dt, tau) for x in sigma_points(m, P)]
     mean = np.mean(points, axis=0)
     covariance = np.mean([np.outer(x - mean, x - mean) for x in points], axis=0) + Q * dt
     mean[3] = wrap(mean[3])

@@ -271,13 +271,18 @@ def random_parameters(
                 "heading": rng.uniform(0.05, 0.5), "turn_rate": rng.uniform(0.05, 0.4),
                 "acceleration": rng.uniform(0.2, 2),
             },
+            "motion": str(rng.choice(["ctra", "cv"])), "acceleration_time": rng.choice([None, 0.5, 2.0]),
+            "gate_growth": rng.choice([0.0, 0.5]), "gate_deviations": rng.choice([0.0, 2.0]),
+            "birth_over_clutter": bool(rng.random() < 0.5), "ground_clearance": rng.choice([0.0, 0.2]),
+            "confirm_from": rng.uniform(0.3, 0.9), "confirm_until": rng.uniform(0.0, 0.3),
         }  # fmt: skip
 
     classes = {label: one_class() for label in labels}
     if calibrated:
         for values in classes.values():
             values["calibration"] = _calibration(rng)
-    return {"name": f"random-{seed}", "nominal_period": 0.1, "classes": classes}
+    over_time = bool(rng.random() < 0.5)
+    return {"name": f"random-{seed}", "nominal_period": 0.1, "detection_over_time": over_time, "classes": classes}
 
 
 def _heading_sign(rng: np.random.Generator) -> dict[str, Any] | None:

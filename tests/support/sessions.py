@@ -89,7 +89,7 @@ class Failing:
 NOTHING = (
     optipmb.Tracker(optipmb.load_profile("nuscenes"))
     .step(
-        optipmb.Density.empty(),
+        optipmb.Tracker(optipmb.load_profile("nuscenes")).initial(),
         optipmb.make_frame(
             optipmb.load_profile("nuscenes"), stamp_ns=0, labels=(), label=[], center=[], size=[], yaw=[], score=[]
         )[0],
@@ -132,7 +132,7 @@ class Chained:
             born_ns=known.born_ns if len(known) else np.array([frame.stamp_ns]),
             seen_ns=np.array([frame.stamp_ns]),
         )
-        after = optipmb.Density(frame.stamp_ns, density.next_id + born, rows, density.poisson)
+        after = optipmb.Density(frame.stamp_ns, density.next_id + born, rows, density.poisson, density.labels)
         found = optipmb.Tracks(
             id=rows.id,
             label=rows.label,
@@ -149,6 +149,7 @@ class Chained:
             age=np.maximum(0.0, (frame.stamp_ns - rows.born_ns) * 1e-9),
             time_since_detection=np.zeros(1),
             detection=np.array([-1]),
+            confirmed=np.ones(1, np.bool_),
         )
         return optipmb.StepResult(after, found, replace(NOTHING, cloud_used=frame.cloud is not None, born=int(born)))
 

@@ -38,15 +38,15 @@ def test_pairs_are_counted_up_to_a_limit(seed: int) -> None:
     distance = np.linalg.norm(center[:, None] - position[None], axis=2)
     pairs = int(((distance <= gate[label][:, None]) & (label[:, None] == measured[None])).sum())
     assert pairs > 20
-    assert count_pairs(center, label, position, measured, gate, pairs) == pairs
-    assert count_pairs(center, label, position, measured, gate, pairs - 1) == pairs
-    assert count_pairs(center, label, position, measured, gate, 7) == 8
+    assert count_pairs(center, label, gate[label], position, measured, 2, pairs) == pairs
+    assert count_pairs(center, label, gate[label], position, measured, 2, pairs - 1) == pairs
+    assert count_pairs(center, label, gate[label], position, measured, 2, 7) == 8
 
 
 def test_a_crowd_beyond_the_bound_is_refused_before_it_costs_anything() -> None:
     """The same objects are tracked where they stand apart, and the density stays usable."""
     tracker = optipmb.Tracker(PARAMETERS, max_pairs=2000)
-    density = tracker.step(optipmb.Density.empty(), crowd(300, 300.0)).density
+    density = tracker.step(tracker.initial(), crowd(300, 300.0)).density
     with pytest.raises(optipmb.EffortError, match="center: expected at most 2000 pairs"):
         tracker.step(density, crowd(300, 1.0, stamp_ns=10**9))
     assert len(tracker.step(density, crowd(300, 300.0, stamp_ns=10**9)).density.bernoulli) > 0
@@ -54,7 +54,7 @@ def test_a_crowd_beyond_the_bound_is_refused_before_it_costs_anything() -> None:
 
 def test_what_is_within_the_bound_has_the_same_bytes() -> None:
     """A bound that is not reached changes nothing."""
-    density = bounded = optipmb.Density.empty()
+    density = bounded = optipmb.Tracker(PARAMETERS).initial()
     for number in range(3):
         frame = crowd(60, 40.0, stamp_ns=number * 10**8)
         density = optipmb.Tracker(PARAMETERS).step(density, frame).density

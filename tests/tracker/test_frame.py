@@ -51,7 +51,7 @@ BAD: dict[str, tuple[str, dict[str, Any]]] = {
     "size negative": ("size[1][0]", {"size": changed(np.ones((2, 3)), (1, 0), -1.0)}),
     "yaw NaN": ("yaw[1]", {"yaw": [0.0, np.nan]}),
     "yaw of wrong length": ("yaw", {"yaw": [0.0]}),
-    "score zero": ("score[1]", {"score": [0.5, 0.0]}),
+    "score below zero": ("score[1]", {"score": [0.5, -1e-9]}),
     "score above one": ("score[0]", {"score": [1.5, 0.5]}),
     "score a logit": ("score[0]", {"score": [-3.0, 0.5]}),
     "score NaN": ("score[0]", {"score": [np.nan, 0.5]}),

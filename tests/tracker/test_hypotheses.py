@@ -15,18 +15,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from optipmb.association import UNASSIGNED, associate
-from optipmb.hypotheses import (
-    CLUTTER,
-    FEW,
-    FROM_POISSON,
-    NEWBORN,
-    Hypotheses,
-    detection_costs,
-    first_detections,
-    gate,
-    pairs_of_few,
-    pairs_of_many,
-)
+from optipmb.gating import FEW, gate, gate_radii, pairs_of_few, pairs_of_many
+from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN, Hypotheses, detection_costs, first_detections
 
 Array = NDArray[np.float64]
 NOTHING = np.zeros(0)
@@ -50,26 +40,27 @@ def test_the_gate_holds_every_pair_of_a_class_within_the_distance(seed: int, cou
     position, measured = rng.normal(0, 4, (measurements, 2)), rng.integers(0, 2, measurements)
     position[:3] = position[:1]  # several at one place
     distance, noise = np.array([1.5, 5.0]), np.array([0.2, 0.7])
-    found = gate(mean, covariance, label, position, measured, distance, noise)
+    radius = distance[label] * rng.uniform(0.5, 1.5, count)
+    found = gate(mean, covariance, label, radius, position, measured, noise)
     wanted = [
         (n, m)
         for n in range(count)
         for m in range(measurements)
-        if label[n] == measured[m] and math.dist(mean[n, :2], position[m]) <= distance[label[n]]
+        if label[n] == measured[m] and math.dist(mean[n, :2], position[m]) <= radius[n]
     ]
     assert list(zip(found[0].tolist(), found[1].tolist(), strict=True)) == wanted
     likelihood = [textbook.log_likelihood(position[m], mean[n], covariance[n], noise[label[n]]) for n, m in wanted]
     np.testing.assert_allclose(found[2], likelihood, rtol=1e-10, atol=1e-10)
     for search in (pairs_of_few, pairs_of_many):
-        row, measurement = search(mean, label, position, measured, distance)
+        row, measurement = search(mean, label, radius, position, measured, 2)
         assert list(zip(row.tolist(), measurement.tolist(), strict=True)) == wanted
 
 
 def test_the_edge_of_the_gate_is_inside() -> None:
     """A measurement at exactly the gating distance passes, on all sides; one float farther does not."""
     position = np.array([[3.0, 0], [-3, 0], [0, 3], [0, -3], [np.nextafter(3, 4), 0], [-np.nextafter(3, 4), 0]])
-    arguments = np.zeros((1, 6)), np.eye(6)[None], np.zeros(1, np.int64), position, np.zeros(6, np.int64)
-    _, measurement, _ = gate(*arguments, np.array([3.0]), np.array([1.0]))
+    objects = np.zeros((1, 6)), np.eye(6)[None], np.zeros(1, np.int64), np.array([3.0])
+    _, measurement, _ = gate(*objects, position, np.zeros(6, np.int64), np.array([1.0]))
     np.testing.assert_array_equal(measurement, [0, 1, 2, 3])
 
 
@@ -105,15 +96,15 @@ def test_each_kind_of_first_detection_has_its_formula() -> None:
     log_e = np.log([0.2, 0.3, 0.05])
     clutter, birth = np.array([np.nan, 0.01]), np.array([np.nan, 0.002])
     kind, cost, existence = np.full(4, -1), np.empty(4), np.empty(4)
+    table = clutter, birth, np.array([np.nan, 0.5])
     first_detections(
         np.array([0, 0, 3]),
         log_e,
         np.array([0.9, 0.1, 0.5, 0.1]),
         np.array([0, 0, 0.25, 1.0]),
         np.ones(4, np.int64),
-        clutter,
-        birth,
-        np.array([np.nan, 0.5]),
+        *table,
+        np.zeros(2, np.bool_),
         kind,
         cost,
         existence,
@@ -124,12 +115,36 @@ def test_each_kind_of_first_detection_has_its_formula() -> None:
     np.testing.assert_allclose(existence, [0.5 / 0.51, 0, 1, 0.05 / 0.06], rtol=1e-12)
 
 
+@pytest.mark.parametrize("over_clutter", [False, True])
+def test_a_component_worse_than_clutter_takes_no_birth_from_a_high_score(*, over_clutter: bool) -> None:
+    """With e below lambda_c a high score is newborn where the profile says so; a low score stays with its component."""
+    kind, cost, existence = np.empty(3, np.int64), np.empty(3), np.empty(3)
+    log_e = np.log([0.001, 0.001, 0.1])
+    measured = np.array([0.9, 0.1, 0.9]), np.zeros(3), np.zeros(3, np.int64)
+    table = np.array([0.01]), np.array([0.002]), np.array([0.5]), np.array([over_clutter])
+    first_detections(np.arange(3), log_e, *measured, *table, kind, cost, existence)
+    np.testing.assert_array_equal(kind, [NEWBORN if over_clutter else FROM_POISSON, FROM_POISSON, FROM_POISSON])
+    r = 1.0 if over_clutter else 0.001 / 0.011
+    np.testing.assert_allclose(existence, [r, 0.001 / 0.011, 0.1 / 0.11])
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.05, 0.1, 0.5])
+def test_gates_widen_with_time_and_with_unknown_speed(dt: float) -> None:
+    """`eta [1 + g (dt / T - 1)]` beyond one period, at least k sd of v over dt; a NaN or an infinity widens none."""
+    covariance = np.zeros((4, 6, 6))
+    covariance[:, 2, 2] = [0.0, 100.0, np.nan, np.inf]
+    label, eta, growth, k = np.array([0, 0, 0, 1]), np.array([4.0, 1.0]), np.array([0.5, 0.0]), np.array([3.0, 0.0])
+    found = gate_radii(covariance, label, dt, 0.1, eta, growth, k)
+    wanted = eta * (1 + growth * max(0.0, dt / 0.1 - 1))
+    np.testing.assert_allclose(found, [wanted[0], max(wanted[0], 30.0 * dt), wanted[0], wanted[1]])
+
+
 @given(st.lists(st.floats(-4000, 600), min_size=1, max_size=6))
 @settings(deadline=None)  # the first call compiles
 def test_first_detections_hold_over_all_magnitudes(log_e: list[float]) -> None:
     """E is summed as logarithms: no overflow, no underflow, r in [0, 1]."""
     arguments = np.zeros(len(log_e), np.int64), np.array(log_e), np.array([0.5]), np.zeros(1)
-    table = np.array([1e-3]), np.array([1e-4]), np.array([0.5])
+    table = np.array([1e-3]), np.array([1e-4]), np.array([0.5]), np.zeros(1, np.bool_)
     kind, cost, existence = np.empty(1, np.int64), np.empty(1), np.empty(1)
     first_detections(*arguments, np.zeros(1, np.int64), *table, kind, cost, existence)
     total = np.logaddexp.reduce([*log_e, math.log(1e-3)])

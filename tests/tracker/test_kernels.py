@@ -133,18 +133,21 @@ def test_components_within_their_limit_are_predicted(seed: int) -> None:
     mean, covariance = rng.normal(0, 3, (30, 6)), root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6)
     label, weight, since = rng.integers(0, 2, 30), rng.uniform(0, 1, 30), stamps(rng, 30)
     limit, survival, noise = np.array([3, 6]), np.array([0.9, 0.99]), rng.uniform(0.1, 1, (2, 6))
+    tau, straight, before = np.array([np.inf, 0.5]), np.array([False, seed > 2]), NOW - 700_000_000
     kept, out, spread, carried = np.empty(30, np.int64), np.empty((30, 6)), np.empty((30, 6, 6)), np.empty(30)
     count, repaired = predict_components(
-        mean, covariance, label, weight, since, limit, survival, 0.2, NOW, PERIOD, noise, kept, out, spread, carried
+        *(mean, covariance, label, weight, since, limit, survival, 0.2, before, NOW, PERIOD, noise, tau, straight),
+        *(kept, out, spread, carried),
     )
-    wanted = np.flatnonzero(periods(since) - 1 <= limit[label])
+    wanted = np.flatnonzero((periods(since) - 1 <= limit[label]) | (since >= before))
     assert repaired == 0
     np.testing.assert_array_equal(kept[:count], wanted)
     np.testing.assert_array_equal(carried[:count], weight[wanted] * survival[label[wanted]])
     alone, alone_spread = np.empty(6), np.empty((6, 6))
     for k, n in enumerate(wanted):
         buffers = np.empty((6, 6)), np.empty((12, 6))
-        predict_state(mean[n], covariance[n], 0.2, noise[label[n]], *buffers, alone, alone_spread)
+        c = label[n]
+        predict_state(mean[n], covariance[n], 0.2, noise[c], tau[c], straight[c], *buffers, alone, alone_spread)
         np.testing.assert_array_equal(out[k], alone)
         np.testing.assert_array_equal(spread[k], alone_spread)
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
 
-from optipmb.motion import ORDER, TINY_PIVOT, ctra_displacement, predict_state, square_root, wrap
+from optipmb.motion import ORDER, TINY_PIVOT, ctra_displacement, predict_state, square_root, travel, wrap
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -108,17 +108,71 @@ def test_a_covariance_without_full_rank_is_repaired_and_counted() -> None:
     np.testing.assert_allclose(root @ root.T, np.diag([1.0, TINY_PIVOT, TINY_PIVOT, 1.0, 1.0, 1.0]), atol=1e-15)
 
 
-def predicted(mean: Array, covariance: Array, dt: float, noise: Array) -> tuple[Array, Array]:
+def predicted(
+    mean: Array, covariance: Array, dt: float, noise: Array, tau: float = math.inf, *, straight: bool = False
+) -> tuple[Array, Array]:
     """One state through the kernel, with buffers that hold rubbish."""
     root, points = np.full((6, 6), np.nan), np.full((12, 6), np.nan)
     out, spread = np.full(6, np.nan), np.full((6, 6), np.nan)
-    assert predict_state(mean, covariance, dt, noise, root, points, out, spread) == 0
+    assert predict_state(mean, covariance, dt, noise, tau, straight, root, points, out, spread) == 0
     return out, spread
 
 
+@COMPILING
+@given(
+    v=SPEEDS,
+    omega=TURNS,
+    a=st.floats(-10, 10).filter(lambda a: a == 0.0 or abs(a) > 1e-3),
+    dt=st.floats(1e-3, 10),
+    tau=st.floats(0.1, 10),
+)
+@example(v=2.0, omega=0.3, a=-5.0, dt=3.0, tau=1.0)  # would turn round
+@example(v=0.0, omega=0.0, a=-1.0, dt=3.0, tau=1.0)  # stands
+@example(v=1e-17, omega=0.0, a=-1.0, dt=3.0, tau=1.0)
+def test_the_way_under_a_decaying_acceleration_is_its_integral(
+    v: float, omega: float, a: float, dt: float, tau: float
+) -> None:
+    """Along and across agree with quadrature, and no speed changes its sign."""
+    along, across, speed, acceleration = travel(v, omega, a, dt, tau)
+    state = textbook.ctra(np.array([0.0, 0.0, v, 0.0, omega, a]), dt, tau)
+    scale = 1 + dt * (abs(v) + 10 * tau)
+    np.testing.assert_allclose([along, across], state[:2], rtol=1e-8, atol=1e-9 * scale)
+    np.testing.assert_allclose([speed, acceleration], state[[2, 5]], rtol=1e-9, atol=1e-9)
+    assert speed * v >= 0.0
+
+
+def test_a_way_in_two_parts_is_the_way() -> None:
+    """Half the time twice gives the state of the whole time: CTRA with decay is a model of continuous time."""
+    whole = travel(8.0, 0.4, -3.0, 1.2, 0.8)
+    along, across, speed, acceleration = travel(8.0, 0.4, -3.0, 0.6, 0.8)
+    more = travel(speed, 0.4, acceleration, 0.6, 0.8)
+    cos, sin = math.cos(0.24), math.sin(0.24)
+    parts = along + cos * more[0] - sin * more[1], across + sin * more[0] + cos * more[1], *more[2:]
+    np.testing.assert_allclose(parts, whole, rtol=1e-12)
+
+
+@pytest.mark.parametrize("dt", [0.1, 2.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_constant_velocity_keeps_speed_and_heading(seed: int, dt: float) -> None:
+    """The textbook transform of x + v dt along phi; turn rate and acceleration stay zero and gain no uncertainty."""
+    rng = np.random.default_rng(seed)
+    mean, covariance = random_state(rng)
+    mean[4:] = 0.0
+    covariance[4:] = covariance[:, 4:] = 0.0
+    covariance[4, 4], covariance[5, 5] = 0.04, 0.25
+    noise = rng.uniform(0.01, 1, 6)
+    found = predicted(mean, covariance, dt, noise, straight=True)
+    wanted = textbook.predict(mean, covariance, np.diag(noise**2), dt, straight=True)
+    np.testing.assert_allclose(np.exp(1j * found[0][3]), np.exp(1j * wanted[0][3]), atol=1e-10)
+    np.testing.assert_allclose(np.delete(found[0], 3), np.delete(wanted[0], 3), rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(found[1], wanted[1], rtol=1e-9, atol=1e-9 * np.abs(wanted[1]).max())
+    np.testing.assert_allclose(found[1][4:, 4:], np.diag([0.04, 0.25]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("tau", [math.inf, 0.7])
 @pytest.mark.parametrize("dt", [1e-3, 0.1, 0.5, 2.0])
 @pytest.mark.parametrize("seed", range(8))
-def test_the_prediction_is_the_textbook_unscented_transform(seed: int, dt: float) -> None:
+def test_the_prediction_is_the_textbook_unscented_transform(seed: int, dt: float, tau: float) -> None:
     """Mean and covariance equal the naive sums over twelve transformed points, plus Q dt."""
     rng = np.random.default_rng(seed)
     mean, covariance = random_state(rng)
@@ -126,8 +180,8 @@ def test_the_prediction_is_the_textbook_unscented_transform(seed: int, dt: float
         mean[4] = 0.0
         covariance *= 1e-6
     noise = rng.uniform(0.01, 1, 6)
-    found = predicted(mean, covariance, dt, noise)
-    wanted = textbook.predict(mean, covariance, np.diag(noise**2), dt)
+    found = predicted(mean, covariance, dt, noise, tau)
+    wanted = textbook.predict(mean, covariance, np.diag(noise**2), dt, tau)
     np.testing.assert_allclose(np.exp(1j * found[0][3]), np.exp(1j * wanted[0][3]), atol=1e-10)
     np.testing.assert_allclose(np.delete(found[0], 3), np.delete(wanted[0], 3), rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(found[1], wanted[1], rtol=1e-9, atol=1e-9 * np.abs(wanted[1]).max())

@@ -47,7 +47,7 @@ def test_bounds_are_kept_in_every_column(data: st.DataObject, count: int, odd: s
     identity = st.integers(-1, 3) if odd == "id" else st.just(0)
     columns["id"] = data.draw(arrays(np.int64, count, elements=identity)) + (0 if odd == "id" else np.arange(count))
     whole = np.zeros(count, np.int64)
-    tracks = optipmb.Tracks(label=whole, detection=whole, **columns)
+    tracks = optipmb.Tracks(label=whole, detection=whole, confirmed=whole > 0, **columns)
     assert optipmb.sound(tracks) == plain(tracks)
     if not odd:
         assert optipmb.sound(tracks)

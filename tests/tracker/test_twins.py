@@ -14,7 +14,8 @@ from hypothesis.extra.numpy import arrays
 from optipmb.calibration import SURE, calibrate_rows, log_odds
 from optipmb.errors import FrameError
 from optipmb.frame import MAX_COORDINATE, MAX_SPEED, _refuse, allowed
-from optipmb.hypotheses import detection_costs, first_detections, gate, local_hypotheses
+from optipmb.gating import gate
+from optipmb.hypotheses import detection_costs, first_detections, local_hypotheses
 from optipmb.preprocess import gather
 from optipmb.warm import kernels
 
@@ -27,12 +28,14 @@ TWINS = {
     "birth.first_states": "test_kernels.test_announced_objects_are_matched_mixtures",
     "calibration.calibrate_rows": "test_twins.test_rows_are_calibrated_as_numpy_interpolates",
     "calibration.log_odds": "test_twins.test_log_odds_are_bounded",
+    "columns.rows_fit": "test_safety.test_rows_fit_as_numpy_says",
     "density.copy_state": "test_update.test_states_without_a_measurement_stay_as_predicted",
     "density.whole_periods": "test_kernels.test_periods_are_counted_to_the_nearest",
+    "extract.confirm": "test_confirmed.test_confirmation_has_hysteresis",
     "extract.read_tracks": "test_kernels.test_tracks_are_read_off_the_states",
     "extract.select_tracks": "test_kernels.test_tracks_are_selected_by_two_thresholds",
     "frame.allowed": "test_twins.test_values_are_allowed_as_numpy_says",
-    "geometry.bev_iou": "test_geometry.test_iou_is_that_of_clipped_polygons",
+    "geometry.overlaps": "test_geometry.test_iou_is_that_of_clipped_polygons",
     "geometry.box_iou": "test_geometry.test_iou_is_that_of_clipped_polygons",
     "geometry.corners": "test_geometry.test_iou_is_that_of_clipped_polygons",
     "geometry.intersection_area": "test_geometry.test_iou_is_that_of_clipped_polygons",
@@ -41,18 +44,20 @@ TWINS = {
     "heading.follow_sign": "test_kernels.test_the_light_weight_filter_is_its_formulas",
     "heading.sign_probability": "test_kernels.test_tracks_are_read_off_the_states",
     "heading.turn_around": "test_kernels.test_the_light_weight_filter_is_its_formulas",
-    "hypotheses._grown": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "gating._grown": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.detection_costs": "test_hypotheses.test_costs_and_association_probabilities_are_the_formulas",
     "hypotheses.first_detections": "test_hypotheses.test_each_kind_of_first_detection_has_its_formula",
-    "hypotheses.gate": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
-    "hypotheses.pairs_of_few": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
-    "hypotheses.pairs_of_many": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "gating.gate": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "gating.gate_radii": "test_hypotheses.test_gates_widen_with_time_and_with_unknown_speed",
+    "gating.pairs_of_few": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "gating.pairs_of_many": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.local_hypotheses": "test_twins.test_hypotheses_are_those_of_their_parts",
     "lightweight.update_light_weight": "test_kernels.test_the_light_weight_filter_is_its_formulas",
     "motion.centred": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
     "motion.ctra_displacement": "test_motion.test_the_displacement_is_the_integral_of_the_velocity",
     "motion.predict_state": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
     "motion.square_root": "test_motion.test_the_square_root_squared_is_the_covariance",
+    "motion.travel": "test_motion.test_the_way_under_a_decaying_acceleration_is_its_integral",
     "motion.wrap": "test_motion.test_a_wrapped_angle_is_the_same_direction_in_the_half_open_interval",
     "neighbours.block": "test_kernels.test_a_search_finds_every_neighbour_once",
     "neighbours.cell": "test_kernels.test_a_search_finds_every_neighbour_once",
@@ -204,15 +209,16 @@ def test_hypotheses_are_those_of_their_parts(seed: int) -> None:
     given = *objects, weight[old], p_d[old], *components, weight[new], p_d[new]
     firsts = np.empty(15, np.int64), np.empty(15), np.empty(15)
     told = np.empty(15)
-    table = distance, noise, clutter, birth, threshold
-    found = local_hypotheses(*given, position, measured, score, *table, *firsts, told)
-    row, measurement, likelihood = gate(*objects, position, measured, distance, noise)
+    table = noise, clutter, birth, threshold, np.array([True, False])
+    radius = distance[label]
+    found = local_hypotheses(*given, radius[old], radius[new], position, measured, score, *table, *firsts, told)
+    row, measurement, likelihood = gate(*objects, radius[old], position, measured, noise)
     association, kind, first_cost, existence = np.empty(15), np.empty(15, np.int64), np.empty(15), np.empty(15)
     cost = detection_costs(row, measurement, likelihood, weight[old], p_d[old], association)
-    component, announced, log_e = gate(*components, position, measured, distance, noise)
+    component, announced, log_e = gate(*components, radius[new], position, measured, noise)
     log_e = np.log((weight * p_d)[new][component]) + log_e
     first = kind, first_cost, existence
-    first_detections(announced, log_e, score, association, measured, clutter, birth, threshold, *first)
+    first_detections(announced, log_e, score, association, measured, *table[1:], *first)
     wanted = row, measurement, cost, component, announced, log_e, *first, association
     for column, expected in zip((*found, *firsts, told), wanted, strict=True):
         np.testing.assert_allclose(column, expected, rtol=1e-12)

@@ -63,5 +63,6 @@ def _worse(frame: Frame, degradation: Degradation, rng: np.random.Generator) -> 
         score=score[kept],
         label=frame.label[kept],
         source=frame.source[kept],
+        labels=frame.labels,
         cloud=frame.cloud,
     )

@@ -113,7 +113,7 @@ def of_class(clip: Clip, name: str, rules: Rules) -> Clip:
     for frame in clip.frames:
         chosen = np.flatnonzero(frame.label == index)
         columns = {key: getattr(frame, key)[chosen] for key in _COLUMNS}
-        frames.append(replace(frame, label=np.zeros(len(chosen), dtype=np.int64), **columns))
+        frames.append(replace(frame, label=np.zeros(len(chosen), dtype=np.int64), labels=(name,), **columns))
     alike = (name, *rules.neighbours.get(name, ()))
     rows = np.isin(clip.truth.names, alike)
     return replace(clip, labels=(name,), frames=tuple(frames), truth=clip.truth.take(rows), world=clip.world.take(rows))

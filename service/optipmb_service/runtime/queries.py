@@ -177,11 +177,12 @@ class Queries:
 
     def _density(self, actor: StreamActor, request: Request) -> None:
         session = actor.session
+        parameters = session.parameters if session else self._registry.profiles.of(actor.stream)
         message = density_of(
-            session.density if session else optipmb.Density.empty(),
+            session.density if session else optipmb.Density.empty(parameters.labels),
             stream=actor.stream,
             session=session.session if session else NO_SESSION,
-            parameters=session.parameters if session else self._registry.profiles.of(actor.stream),
+            parameters=parameters,
         )
         request.answer(self._keys.query(actor.stream, "density"), message)
 

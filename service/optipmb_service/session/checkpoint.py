@@ -17,7 +17,6 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
 import msgpack
-import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
@@ -226,33 +225,32 @@ def _state(state: FilterState) -> dict[str, Any]:
 
 
 def _read_1(body: Document) -> Checkpoint:
-    """Read version 1, which did not follow the sign of headings.
+    """Read version 1, whose densities do not say which way objects face and whether their tracks are confirmed.
 
-    Its parameters say by class whether the sign can be trusted, which nothing asks any more; its tracks go on without
-    evidence which way they face.
+    These begin as those of a new object. Its parameters say by class whether the sign of a heading can be trusted,
+    which nothing asks any more.
     """
     classes = body.document("parameters").map("classes")
     for name, table in classes.items():
         if not isinstance(table, dict):
             raise body.wrong(f"parameters.classes.{name}", "a map", type(table).__name__)
         table.pop("heading_sign_reliable", None)
-    for moment in ("base", "head"):
-        if not body.absent(moment):
-            density = body.document(moment).map("density")
-            existence = schemas.read_columns(density).get("bernoulli.existence", np.zeros(0))
-            density |= schemas.pack_columns({"bernoulli.heading_odds": np.zeros(existence.shape)})
-    return _read_2(body)
+    return _read(body, earlier=True)
 
 
 def _read_2(body: Document) -> Checkpoint:
+    return _read(body, earlier=False)
+
+
+def _read(body: Document, *, earlier: bool) -> Checkpoint:
     stream = body.stream("stream")
     parameters = optipmb.parse_parameters(body.map("parameters"))
     schemas.SessionParameters(profile=parameters.name)  # as messages take it
-    base = _read_state(body.document("base"), stream, parameters)
+    base = _read_state(body.document("base"), stream, parameters, earlier=earlier)
     window = tuple(_read_recorded(one, stream) for one in body.documents("window"))
     if len({one.frame_id for one in window}) != len(window):
         raise body.wrong("window", "every frame once", "one again")
-    head = _read_state(body.document("head"), stream, parameters) if window else base
+    head = _read_state(body.document("head"), stream, parameters, earlier=earlier) if window else base
     return Checkpoint(
         stream=stream,
         parameters=parameters,
@@ -296,11 +294,10 @@ def _read_recorded(one: Document, stream: str) -> Recorded:
     return Recorded(message, cloud, one.flag("missed"), one.count("revision"))
 
 
-def _read_state(one: Document, stream: str, parameters: optipmb.Parameters) -> FilterState:
+def _read_state(one: Document, stream: str, parameters: optipmb.Parameters, *, earlier: bool) -> FilterState:
     columns = schemas.read_columns(one.map("density"))
-    density = optipmb.density_of(
-        one.whole("stamp_ns", low=-1), one.whole("next_id", high=MAX_COUNT), columns, len(parameters.classes)
-    )
+    stamp_ns, next_id = one.whole("stamp_ns", low=-1), one.whole("next_id", high=MAX_COUNT)
+    density = optipmb.density_of(stamp_ns, next_id, columns, parameters.labels, earlier=earlier)
     session = one.identity("session")
     convert.density_of(density, stream=stream, session=session, parameters=parameters)  # it can be asked for
     cursor = one.row("course", 6)

@@ -160,7 +160,7 @@ class Session:
         self._begin(
             replace(
                 head,
-                density=optipmb.Density.empty(head.density.next_id),
+                density=optipmb.Density.empty(self._processed.transition.parameters.labels, head.density.next_id),
                 session=self._processed.transition.name(head.last, starts),
                 starts=starts,
                 tracks=0,

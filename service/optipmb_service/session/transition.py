@@ -127,7 +127,7 @@ class Transition:
             session = self.name(frame_id, starts)
             reported = frozenset()
             if begins.reason != "first":
-                density = optipmb.Density.empty(density.next_id)
+                density = optipmb.Density.empty(self.parameters.labels, density.next_id)
         frame = entry.frame
         if entry.points is not None:
             frame = replace(frame, cloud=convert.cloud_of(entry.points))
@@ -207,9 +207,8 @@ def empty(
     transition: Transition, last: FrameId | None, next_id: int, starts: int, counts: FrameCounts | None = None
 ) -> FilterState:
     """Return the moment before the first frame of a stream, or of a profile."""
-    return FilterState(
-        optipmb.Density.empty(next_id), transition.name(last, starts), starts=starts, counts=counts or FrameCounts()
-    )
+    density = optipmb.Density.empty(transition.parameters.labels, next_id)
+    return FilterState(density, transition.name(last, starts), starts=starts, counts=counts or FrameCounts())
 
 
 def begins_with(before: FilterState, entry: Entry) -> bool:

@@ -1,0 +1,192 @@
+"""Gates: which measurements are near enough to an object to be its own (Section IV.D), and how likely they are."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from optipmb.compiled import kernel
+from optipmb.density import V
+from optipmb.neighbours import NOBODY, block, empty_torus, insert
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+MAX_RADIUS: Final = 1e6
+"""No gate is wider, m, however uncertain a speed and however long a silence."""
+
+FEW: Final = 256
+"""Up to so many measurements it is faster to look at all of them than to find the neighbours among them."""
+
+
+@kernel
+def gate_radii(
+    covariance: Array,
+    label: Index,
+    dt: float,
+    period: float,
+    distance: Array,
+    growth: Array,
+    deviations: Array,
+) -> Array:
+    """Compute the gating distance of each object.
+
+    ``eta_dist [1 + growth max(0, dt / period - 1)]``, at least the way that its speed may deviate: so many standard
+    deviations of v over dt. The paper has eta_dist alone, at the one frame rate of a data set.
+
+    Args:
+        covariance: (N, 6, 6) predicted covariances.
+        label: (N,) classes.
+        dt: s since the last frame.
+        period: nominal period, s.
+        distance: (C,) eta_dist, m.
+        growth: (C,) share of eta_dist per nominal period.
+        deviations: (C,) standard deviations of v.
+
+    Returns:
+        (N,) m.
+    """
+    radius = np.empty(label.shape[0])
+    beyond = max(0.0, dt / period - 1.0)
+    for n in range(label.shape[0]):
+        c = label[n]
+        radius[n] = distance[c] * (1.0 + growth[c] * beyond)
+        reach = deviations[c] * math.sqrt(max(covariance[n, V, V], 0.0)) * dt
+        if reach > radius[n]:  # noqa: PLR1730 - max() would keep NaN
+            radius[n] = reach
+        radius[n] = min(radius[n], MAX_RADIUS)
+    return radius
+
+
+@kernel
+def gate(
+    mean: Array,
+    covariance: Array,
+    label: Index,
+    radius: Array,
+    position: Array,
+    measured_label: Index,
+    noise_position: Array,
+) -> tuple[Index, Index, Array]:
+    """Find the measurements of an object's class within its gate and their position likelihoods.
+
+    Args:
+        mean: (N, 6) predicted means.
+        covariance: (N, 6, 6) predicted covariances.
+        label: (N,) classes.
+        radius: (N,) gating distances, m.
+        position: (M, 2) z_xy.
+        measured_label: (M,) z_c.
+        noise_position: (C,) standard deviation of z_x and z_y; R_xy = sigma^2 I.
+
+    Returns:
+        Objects, measurements and log-likelihoods ln N(z_xy; z_hat, S) of the pairs (eq. Predicted Measurement),
+        ordered by object, then measurement.
+    """
+    if position.shape[0] <= FEW:
+        row, measurement = pairs_of_few(mean, label, radius, position, measured_label, noise_position.shape[0])
+    else:
+        row, measurement = pairs_of_many(mean, label, radius, position, measured_label, noise_position.shape[0])
+    log_likelihood = np.empty(row.shape[0])
+    before = -1
+    s_xx = s_xy = s_yy = determinant = constant = 0.0
+    for k in range(row.shape[0]):
+        n, m = row[k], measurement[k]
+        if n != before:  # what the pairs of an object share
+            before = n
+            r_xy = noise_position[label[n]] ** 2
+            s_xx, s_xy, s_yy = covariance[n, 0, 0] + r_xy, covariance[n, 0, 1], covariance[n, 1, 1] + r_xy
+            determinant = s_xx * s_yy - s_xy * s_xy
+            constant = -math.log(2.0 * math.pi) - 0.5 * math.log(determinant)
+        dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
+        squared = (s_yy * dx * dx - 2.0 * s_xy * dx * dy + s_xx * dy * dy) / determinant
+        log_likelihood[k] = constant - 0.5 * squared
+    return row, measurement, log_likelihood
+
+
+@kernel
+def pairs_of_few(
+    mean: Array, label: Index, radius: Array, position: Array, measured_label: Index, classes: int
+) -> tuple[Index, Index]:
+    """Find the pairs within the gates by looking at every measurement of a class; arguments and order as in `gate`."""
+    n_measurements = position.shape[0]
+    capacity = 2 * (mean.shape[0] + n_measurements) + 16 if mean.shape[0] else 0
+    row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+    # The measurements, class after class.
+    start = np.zeros(classes + 2, np.int64)
+    for c in measured_label:
+        start[c + 2] += 1
+    for c in range(classes):
+        start[c + 2] += start[c + 1]
+    x, y, which = np.empty(n_measurements), np.empty(n_measurements), np.empty(n_measurements, np.int64)
+    for m in range(n_measurements):
+        k = start[measured_label[m] + 1]
+        x[k], y[k], which[k] = position[m, 0], position[m, 1], m
+        start[measured_label[m] + 1] += 1  # in the end where the next class starts
+
+    count = 0
+    for n in range(mean.shape[0]):
+        if count + n_measurements > capacity:
+            capacity = 2 * (count + n_measurements)
+            row, measurement = _grown(row, capacity), _grown(measurement, capacity)
+        eta, x_n, y_n = radius[n], mean[n, 0], mean[n, 1]
+        for k in range(start[label[n]], start[label[n] + 1]):
+            dx, dy = x[k] - x_n, y[k] - y_n
+            if abs(dx) <= eta and dx * dx + dy * dy <= eta * eta:  # most are too far along x already
+                row[count], measurement[count] = n, which[k]
+                count += 1
+    return row[:count], measurement[:count]
+
+
+@kernel
+def pairs_of_many(
+    mean: Array, label: Index, radius: Array, position: Array, measured_label: Index, classes: int
+) -> tuple[Index, Index]:
+    """Find the pairs within the gates by looking at neighbours; arguments and order as in `gate`.
+
+    The measurements stand in a torus of cells twice as wide as the widest gate of their class, so that a gate touches
+    at most three cells along each axis.
+    """
+    capacity = 2 * (mean.shape[0] + position.shape[0]) + 16 if mean.shape[0] else 0
+    row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+    widest = np.zeros(classes)
+    for n in range(mean.shape[0]):
+        widest[label[n]] = max(widest[label[n]], radius[n])
+    head, following, side = empty_torus(position.shape[0])
+    for m in range(position.shape[0]):
+        insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * widest[measured_label[m]])
+    count = 0
+    for n in range(mean.shape[0]):
+        eta = radius[n]
+        begin = count
+        first_x, last_x, first_y, last_y = block(mean[n, 0], mean[n, 1], eta, 2.0 * widest[label[n]])
+        for i in range(first_x, last_x + 1):
+            for j in range(first_y, last_y + 1):
+                m = head[(i & (side - 1)) * side + (j & (side - 1))]
+                while m != NOBODY:
+                    dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
+                    if dx * dx + dy * dy <= eta * eta and measured_label[m] == label[n]:
+                        if count == capacity:
+                            capacity *= 2
+                            row, measurement = _grown(row, capacity), _grown(measurement, capacity)
+                        slot = count  # keep the measurements of this object in ascending order
+                        while slot > begin and measurement[slot - 1] > m:
+                            measurement[slot] = measurement[slot - 1]
+                            slot -= 1
+                        measurement[slot] = m
+                        row[count] = n
+                        count += 1
+                    m = following[m]
+    return row[:count], measurement[:count]
+
+
+@kernel
+def _grown(array: Index, capacity: int) -> Index:
+    larger = np.empty(capacity, array.dtype)
+    larger[: array.shape[0]] = array
+    return larger

@@ -1,0 +1,83 @@
+"""Which tracks are confirmed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import boxes, random_parameters
+
+import optipmb
+from optipmb.extract import confirm
+
+SIMPLE: dict[str, Any] = {
+    "score_filter": 0.05,
+    "birth_score": 0.1,
+    "gate": 4.0,
+    "extract_new": 0.5,
+    "extract_known": 0.5,
+    "extract_misses": 20,
+    "survival": 1.0,
+    "max_misses": 15,
+    "confirm_from": 0.6,
+    "confirm_until": 0.3,
+    "calibration": {
+        "memory": 0.5,
+        "missed": 2.0,
+        "evidence": [-2.0, 2.0],
+        "existence": [0.0, 1.0],
+        "along": [0.0, 0.0],
+        "across": [0.0, 0.0],
+    },
+}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_confirmation_has_hysteresis(seed: int) -> None:
+    """From the upper threshold on, and while not below the lower one; rows that are not extracted stay as they were."""
+    rng = np.random.default_rng(seed)
+    label, rows, existence = rng.integers(0, 2, 30), np.flatnonzero(rng.random(30) < 0.6), rng.uniform(0, 1, 30)
+    before, upper, lower = rng.random(30) < 0.5, np.array([0.5, 0.8]), np.array([0.2, 0.8])
+    found, told = before.copy(), np.empty(rows.size, np.bool_)
+    confirm(rows, label, existence[: rows.size], upper, lower, found, told)
+    wanted = existence[: rows.size] >= np.where(before, lower[label], upper[label])[rows]
+    np.testing.assert_array_equal(told, wanted)
+    np.testing.assert_array_equal(found[rows], wanted)
+    np.testing.assert_array_equal(np.delete(found, rows), np.delete(before, rows))
+
+
+def test_a_track_is_confirmed_by_good_detections_and_stays_so_through_a_few_misses() -> None:
+    """The flag follows the calibrated existence, up and down, one threshold each; it is in the density too."""
+    document = random_parameters(0, ("Car",))
+    document["classes"]["Car"] |= SIMPLE
+    parameters = optipmb.parse_parameters(document)
+    tracker = optipmb.Tracker(parameters)
+    density, flags, existence = tracker.initial(), [], []
+    scores = [0.5, 0.5, 0.9, 0.9, 0.9, None, None, None, None, 0.6]
+    for k, score in enumerate(scores):
+        frame = boxes(parameters, 0.1 * k, () if score is None else (0, 0), score=score or 0.5)
+        result = tracker.step(density, frame)
+        density = result.density
+        np.testing.assert_array_equal(density.bernoulli.id, [1])
+        flags.append(bool(result.tracks.confirmed[0]))
+        existence.append(float(result.tracks.existence[0]))
+        np.testing.assert_array_equal(density.bernoulli.confirmed, result.tracks.confirmed)
+    wanted, state = [], False
+    for one in existence:
+        state = one >= (0.3 if state else 0.6)
+        wanted.append(state)
+    assert flags == wanted
+    assert not flags[0]
+    assert flags[4]
+    assert flags[5]  # between the thresholds, and stays
+    assert 0.3 < existence[5] < 0.6
+    assert not flags[8]
+    assert not flags[9]  # between the thresholds again, and stays
+
+
+def test_every_track_is_confirmed_where_the_profile_asks_for_nothing() -> None:
+    """The paper knows no confirmation: under its profiles whatever is extracted is confirmed."""
+    for name in ("kitti-paper", "nuscenes-paper"):
+        for values in optipmb.load_profile(name).classes.values():
+            assert values.confirm_from == values.confirm_until == 0.0

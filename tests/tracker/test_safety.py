@@ -1,0 +1,173 @@
+"""No public call crashes the interpreter: what does not fit is refused, and kernels stay within their arrays."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import boxes
+
+import optipmb
+from optipmb.columns import fitting, rows_fit
+
+KITTI, NUSCENES = optipmb.load_profile("kitti"), optipmb.load_profile("nuscenes")
+HERE = Path(__file__).parent
+
+
+def settled() -> optipmb.Density:
+    """A density with an object and a component."""
+    tracker = optipmb.Tracker(KITTI)
+    frame = boxes(KITTI, 0.0, [(0, 0), (30, 0)], score=[0.9, 0.4])
+    density = tracker.step(tracker.initial(), frame).density
+    assert (len(density.bernoulli), len(density.poisson)) == (1, 1)
+    return density
+
+
+def test_a_frame_of_other_classes_is_refused() -> None:
+    """Seven labels of one profile do not go through a tracker of three, whatever is in the frame."""
+    tracker = optipmb.Tracker(KITTI)
+    for xy in ((), (0, 0)):
+        with pytest.raises(optipmb.FrameError, match="labels"):
+            tracker.step(tracker.initial(), boxes(NUSCENES, 0.0, xy, label="truck"))
+
+
+def test_a_density_of_other_classes_is_refused() -> None:
+    """A density keeps the labels that it was made with."""
+    with pytest.raises(optipmb.FrameError, match=r"density\.labels"):
+        optipmb.Tracker(NUSCENES).step(settled(), boxes(NUSCENES, 1.0))
+
+
+@pytest.mark.parametrize("part", ["bernoulli", "poisson"])
+def test_a_density_whose_columns_do_not_fit_is_refused(part: str) -> None:
+    """Every column of another length, a label that is none, a wrong shape: each is named."""
+    density = settled()
+    rows = getattr(density, part)
+    for name, column in rows.columns():
+        broken = [np.concatenate([column, column]), column[:0], column.tolist()]
+        if name == "label":
+            broken += [column + 7, column - 1]
+        for values in broken:
+            changed = replace(density, **{part: replace(rows, **{name: values})})
+            with pytest.raises(optipmb.DensityError, match=part):
+                optipmb.Tracker(KITTI).step(changed, boxes(KITTI, 0.1, (0, 0)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rows_fit_as_numpy_says(seed: int) -> None:
+    """Shapes of one length, and classes that exist."""
+    rng = np.random.default_rng(seed)
+    shapes = [(3, 6), (3, 6, 6), (3,), (3, 4)]
+    place = int(rng.integers(0, 4))
+    for change in ((0, 0), (1, 0), (0, 1) if place != 2 else (1, 0)):
+        changed = list(shapes)
+        head, *tail = changed[place]
+        changed[place] = (head + change[0], *(one + change[1] for one in tail))
+        mean, covariance, boxes_ = np.zeros(changed[0]), np.zeros(changed[1]), np.zeros(changed[3])
+        label = rng.integers(0, 2, changed[2])
+        assert rows_fit(mean, covariance, label, boxes_, 2) == (changed == shapes)
+    label = np.array([0, 1, 2])
+    assert rows_fit(np.zeros((3, 6)), np.zeros((3, 6, 6)), label, np.zeros((3, 4)), 3)
+    assert not rows_fit(np.zeros((3, 6)), np.zeros((3, 6, 6)), label, np.zeros((3, 4)), 2)
+    assert not rows_fit(np.zeros((3, 6)), np.zeros((3, 6, 6)), -label, np.zeros((3, 4)), 3)
+
+
+def test_what_the_tracker_makes_fits() -> None:
+    """The check passes what comes out of a step."""
+    assert fitting(settled(), len(KITTI.classes))
+
+
+def test_a_frame_cannot_be_written_to() -> None:
+    """What was checked stays as it was."""
+    frame = boxes(KITTI, 0.0, (0, 0))
+    for field in fields(frame):
+        value = getattr(frame, field.name)
+        if isinstance(value, np.ndarray):
+            with pytest.raises(ValueError, match="read-only"):
+                value[...] = 0
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("label", np.array([3])),
+        ("label", np.array([-1])),
+        ("label", np.array([0.5])),
+        ("label", np.array([0, 0])),
+        ("source", np.zeros((1, 1), np.int64)),
+        ("center", np.zeros((1, 2))),
+        ("center", np.full((1, 3), np.nan)),
+        ("size", np.zeros((1, 3))),
+        ("yaw", np.zeros(2)),
+        ("velocity", np.zeros((2, 2))),
+        ("score", np.array([0.0])),
+        ("score", np.array([0.5, 0.5])),
+        ("stamp_ns", -1),
+    ],
+)
+def test_a_frame_made_by_hand_is_checked(name: str, values: Any) -> None:
+    """`Frame` itself refuses what `make_frame` would not make."""
+    with pytest.raises(optipmb.FrameError):
+        replace(boxes(KITTI, 0.0, (0, 0)), **{name: values})
+
+
+def test_a_score_of_zero_refuses_the_object_and_not_the_frame() -> None:
+    """It is left out and counted, the others are tracked; negative scores and NaN refuse the frame."""
+    given: dict[str, Any] = {"stamp_ns": 0, "labels": ["Car"], "label": [0, 0, 0], "size": [[4, 2, 1.5]] * 3}
+    given |= {"center": [[0, 0, 0], [20, 0, 0], [40, 0, 0]], "yaw": [0, 0, 0]}
+    frame, left_out = optipmb.make_frame(KITTI, score=[0.9, 0.0, 0.8], **given)
+    assert left_out == 1
+    np.testing.assert_array_equal(frame.source, [0, 2])
+    for score in (-0.1, np.nan, 1.5):
+        with pytest.raises(optipmb.FrameError, match=r"score\[1\]"):
+            optipmb.make_frame(KITTI, score=[0.9, score, 0.8], **given)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda cloud: optipmb.points_in_boxes(cloud, np.zeros((2, 3)), np.ones((1, 3)), np.zeros(2)),
+        lambda cloud: optipmb.points_in_boxes(cloud, np.zeros((2, 3)), np.ones((2, 3)), np.zeros(1)),
+        lambda cloud: optipmb.points_in_boxes(cloud, np.zeros((2, 2)), np.ones((2, 3)), np.zeros(2)),
+        lambda _: optipmb.bev_iou(np.zeros((2, 4)), np.ones((2, 5))),
+        lambda _: optipmb.bev_iou(np.ones((2, 5)), np.ones(5)),
+    ],
+)
+def test_boxes_of_other_shapes_are_refused(call: Any) -> None:
+    """The functions over boxes say which array does not fit."""
+    pose = optipmb.Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+    with pytest.raises(optipmb.FrameError):
+        call(optipmb.PointCloud(np.zeros((4, 3), np.float32), pose))
+
+
+def test_tracks_whose_columns_do_not_fit_are_not_sound() -> None:
+    """`sound` reads tracks of any origin."""
+    tracker = optipmb.Tracker(KITTI)
+    tracks = tracker.step(tracker.initial(), boxes(KITTI, 0.0, [(0, 0), (30, 0)])).tracks
+    assert optipmb.sound(tracks)
+    for field in fields(tracks):
+        short = replace(tracks, **{field.name: getattr(tracks, field.name)[:1]})
+        assert not optipmb.sound(short), field.name
+
+
+def test_kernels_stay_within_their_arrays(request: pytest.FixtureRequest) -> None:
+    """With numba's bounds checks on, the public calls never index beyond an array, and raise nothing but refusals."""
+    cache = request.config.cache
+    assert cache is not None
+    # Kernels with bounds checks are others, and need a cache of their own.
+    environment = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(cache.mkdir("numba-bounds"))}
+    found = subprocess.run(
+        [sys.executable, str(HERE.parent / "support" / "hostile_calls.py")],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
+    )
+    assert found.returncode == 0, found.stderr[-4000:]
+    assert "kernels with bounds checks" in found.stdout
