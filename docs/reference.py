@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 from optipmb_service.observability.logs import EVENTS
 from optipmb_service.observability.metrics import METRICS, NAMESPACE
 from optipmb_service.session.problems import CODES
-from optipmb_service.settings import LimitSettings, Settings
+from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -33,8 +33,10 @@ def page(text: str) -> str:
 
 def settings() -> str:
     """Return the table of all settings."""
-    rows = [_setting(name, field) for name, field in Settings.model_fields.items() if name != "limits"]
+    rows = [_setting(name, field) for name, field in Settings.model_fields.items() if name not in {"limits", "ros2"}]
     rows += [_setting(f"limits.{name}", field) for name, field in LimitSettings.model_fields.items()]
+    rows += [_setting(f"ros2.{name}", field) for name, field in Ros2Settings.model_fields.items()]
+    rows += [_setting(f"ros2.streams.NAME.{name}", field) for name, field in Ros2Stream.model_fields.items()]
     return _table(("setting", "default", "allowed", "meaning"), rows)
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from optipmb_schemas import DEFAULT, Limits
+from optipmb_schemas import DEFAULT, Keys, Limits, MessageError
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_settings import (
     BaseSettings,
@@ -97,6 +97,68 @@ class LimitSettings(BaseModel):
     def limits(self) -> Limits:
         """Return the limits for the decoder."""
         return Limits(**self.model_dump())
+
+
+def _topic(value: str) -> str:
+    if value and not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", value):
+        raise ValueError(f"a topic looks like /lidar/points, received {value!r}")
+    return value
+
+
+Topic = Annotated[str, AfterValidator(_topic)]
+
+
+class Ros2Stream(BaseModel):
+    """The topics of one stream."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    detections: Topic = Field(min_length=1, description="topic of the detections")
+    type: Literal[
+        "vision_msgs/msg/Detection3DArray",
+        "autoware_perception_msgs/msg/DetectedObjects",
+        "autoware_auto_perception_msgs/msg/DetectedObjects",
+    ] = Field(default="vision_msgs/msg/Detection3DArray", description="their type")
+    points: Topic = Field(default="", description="topic of the point clouds; default: none")
+    tracks: Topic = Field(
+        default="", description="topic of the tracks; default: `/tracks` below that of the detections"
+    )
+    classes: dict[str, str] = Field(default_factory=dict, description="names of classes by those in the messages")
+    fixed: bool = Field(default=False, description="the sensor stands still and has no tf: its frame is the world")
+
+    @property
+    def tracks_topic(self) -> str:
+        """Topic of the tracks."""
+        return self.tracks or f"{self.detections}/tracks"
+
+
+def _streams(value: dict[str, Ros2Stream]) -> dict[str, Ros2Stream]:
+    for name in value:
+        try:
+            Keys().detections(name)
+        except MessageError as error:
+            raise ValueError(f"a stream is named {error.expected}, received {error.received}") from None
+    return value
+
+
+class Ros2Settings(BaseModel):
+    """Topics of a ROS 2 system whose middleware is rmw_zenoh; used by `optipmb-service ros2`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    domain: int = Field(default=0, ge=0, le=232, description="`ROS_DOMAIN_ID` of the system")
+    node: str = Field(default="optipmb", pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="name of our node")
+    fixed_frame: str = Field(
+        default="", description="frame of the tracks; default: the one that the first detections' frame hangs from"
+    )
+    odometry: Topic = Field(
+        default="", description="topic of `nav_msgs/Odometry`, where it tells the pose and tf does not"
+    )
+    tf_wait_s: float = Field(default=0.5, ge=0, le=60, description="longest wait of a message for its transform")
+    diagnostics: Topic = Field(default="/diagnostics", description="topic of `diagnostic_msgs/DiagnosticArray`")
+    streams: Annotated[dict[str, Ros2Stream], AfterValidator(_streams)] = Field(
+        default_factory=dict, description="table of stream (`site/node/sensor`) to its topics"
+    )
 
 
 class Settings(BaseSettings):
@@ -274,6 +336,7 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="least level that is logged"
     )
+    ros2: Ros2Settings = Field(default=Ros2Settings(), description="topics of ROS 2, for `optipmb-service ros2`")
     limits: LimitSettings = Field(default=LimitSettings(), description="bounds on what one message may hold")
 
     @property

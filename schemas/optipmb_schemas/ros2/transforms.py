@@ -60,6 +60,8 @@ class _Edge:
         after = bisect.bisect_left(self.stamps, stamp_ns)
         if after < len(self.stamps) and self.stamps[after] == stamp_ns:
             return self.values[after]
+        if not self.stamps:
+            raise TransformError(f"{self.parent} from {child}: expected a transform, none has come yet", later=True)
         if after in {0, len(self.stamps)}:
             edge, side = (self.stamps[0], "before") if after == 0 else (self.stamps[-1], "after")
             raise TransformError(
@@ -134,6 +136,13 @@ class Transforms:
         edge.values.insert(at, value)
         if self._kept is not None and len(edge.stamps) > self._kept:
             del edge.stamps[0], edge.values[0]
+
+    def drop_after(self, stamp_ns: int) -> None:
+        """Forget moving transforms after a stamp: the clock has gone back, and they are of another past."""
+        for edge in self._edges.values():
+            if not edge.static:
+                at = bisect.bisect_right(edge.stamps, stamp_ns)
+                del edge.stamps[at:], edge.values[at:]
 
     def has_parent(self, frame: str) -> bool:
         """Return whether the pose of a frame in another one is known at any time."""

@@ -150,6 +150,17 @@ def grpc_command(**given: Unpack[GatewayOptions]) -> None:
     leave(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
 
 
+@app.command("ros2")
+@_taking(RouterOptions)
+def ros2_command(**given: Unpack[RouterOptions]) -> None:
+    """Run a bridge to ROS 2 (rmw_zenoh) alone, a client of routers, until SIGINT or SIGTERM. See docs/ros2.md."""
+    settings = _begin(_load(given, connect=[DEFAULT_LISTEN]))
+    if not settings.ros2.streams:
+        _wrong("setting ros2.streams: expected a table of streams and their topics in --settings, received none")
+    run = _needed("optipmb_service.app.ros2", "ros2").run
+    leave(run(settings.model_copy(update={"router": False, "listen": ()})))
+
+
 @app.command("health", add_help_option=False, context_settings=PASSED_ON)
 def health(context: typer.Context) -> None:
     """Ask a running service how it is; status 0 when well, else 1. See `health --help`."""
@@ -221,5 +232,8 @@ def _wrong(message: str) -> NoReturn:
 
 
 def _toml(value: object) -> str:
-    """Return a value as TOML; for what settings hold, that is JSON."""
-    return json.dumps(value)
+    """Return a value as TOML: as JSON, but for tables."""
+    if not isinstance(value, dict):
+        return json.dumps(value)
+    pairs = (f"{json.dumps(name)} = {_toml(one)}" for name, one in value.items())
+    return "{" + ", ".join(pairs) + "}"

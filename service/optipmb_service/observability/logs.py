@@ -50,6 +50,8 @@ EVENTS: Final = {
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames came again.",
     "problem": "Something was refused or lost; `count` equal ones since the last line. See the problems below.",
+    "ros2_mismatch": "An endpoint of ROS does not fit ours: another type or definition, or a quality of service that"
+    " DDS would refuse. `message` says which node, and what it should be.",
     "claim_failed": "The tracks of a stream cannot be published; the network is closing.",
     "publish_failed": "Tracks could not be handed to Zenoh; the network is closing.",
     "reply_failed": "Who asked was gone before the answer.",

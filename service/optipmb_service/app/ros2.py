@@ -1,0 +1,309 @@
+"""The ROS 2 bridge as a process: threads that receive put into one queue, and one thread does the work.
+
+The queue is bounded; when it is full the oldest message goes and is counted.
+"""
+
+from __future__ import annotations
+
+import collections
+import signal
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import optipmb_schemas as schemas
+import structlog
+from optipmb_schemas.ros2.arrays import CLOUD
+from optipmb_schemas.ros2.tracks import DETECTION_ARRAY, MARKERS, TRACKED
+from optipmb_schemas.ros2.types import own_types
+
+from optipmb_service import __version__
+from optipmb_service.app.monitoring import monitoring
+from optipmb_service.observability.health import BEAT_S, ProcessHealth
+from optipmb_service.ros2 import graph
+from optipmb_service.ros2.bridge import Bridge
+from optipmb_service.ros2.diagnostics import DIAGNOSTICS, diagnostics
+from optipmb_service.ros2.matching import Matching, Wanted
+from optipmb_service.runtime.ports import HttpError, TransportError
+from optipmb_service.zenoh.ros2 import Ros2Node
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType
+
+    from optipmb_service.settings import Settings
+
+QUEUE: Final = 2048
+QUEUE_BYTES: Final = 2**28
+"""Messages that wait for the working thread, and their bytes."""
+
+DIAGNOSTICS_S: Final = 1.0
+TICK_S: Final = 0.02
+
+SENSOR: Final = graph.Qos(reliable=False, depth=10)
+MOVING: Final = graph.Qos(reliable=False, depth=100)
+STATIC: Final = graph.Qos(transient_local=True, depth=100)
+OFFERED: Final = graph.Qos()
+
+TF: Final = "tf2_msgs/msg/TFMessage"
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+
+log = structlog.get_logger("optipmb_service")
+
+
+class _Reporting:
+    """What the process reports: ready while it has a router."""
+
+    stuck: Final = False
+    failure: Final = ""
+
+    def __init__(self, node: Ros2Node) -> None:
+        self._node = node
+
+    @property
+    def state(self) -> str:
+        """Whether it can be used."""
+        return "ready" if self._node.linked() else "unlinked"
+
+    def status(self) -> None:
+        """Return nothing: the bridge tracks no streams."""
+
+
+class _Process:
+    """The node, the bridge and what wires them."""
+
+    def __init__(self, settings: Settings, node: Ros2Node) -> None:
+        self._settings = settings
+        self._node = node
+        self._types = own_types()
+        self._bridge = Bridge(settings.ros2, settings.instance, self._types, self, time.monotonic)
+        self._queue: collections.deque[tuple[Callable[[], None], int]] = collections.deque()
+        self._waiting_bytes = 0
+        self._lock = threading.Lock()
+        self._filled = threading.Event()
+        self._shed = 0
+        self._told_shed = 0
+        self._told_problems: dict[str, int] = {}
+        self._next_diagnostics = 0.0
+        self._topics = tuple(self._wanted())
+        single = frozenset(stream.detections for stream in settings.ros2.streams.values())
+        self._matching = Matching(tuple(wanted for wanted, _ in self._topics), single)
+
+    def open(self) -> None:
+        """Declare everything."""
+        for wanted, receive in self._topics:
+            if receive is None:
+                self._node.advertise(wanted.topic, wanted.type, wanted.hash)
+            else:
+                take = self._reading(wanted, receive)
+                clouds = wanted.type == CLOUD
+                self._node.subscribe(wanted.topic, wanted.type, wanted.hash, wanted.qos, take, clouds=clouds)
+        self._node.watch(lambda endpoint, came: self._put(lambda: self._changed(endpoint, came=came)))
+        for stream in self._settings.ros2.streams:
+            self._node.follow(stream, lambda *arrival: self._put(lambda: self._come_back(*arrival)))
+
+    def work(self, seconds: float) -> None:
+        """Do what has come in, and what is due, for about so long."""
+        ends = time.monotonic() + seconds
+        while (left := ends - time.monotonic()) > 0:
+            self._filled.wait(min(left, TICK_S))
+            self._filled.clear()
+            while (work := self._next()) is not None:
+                work()
+            self._bridge.go_on()
+            if time.monotonic() >= self._next_diagnostics:
+                self._next_diagnostics = time.monotonic() + DIAGNOSTICS_S
+                self._diagnose()
+
+    # What the bridge sends
+
+    def send(self, stream: str, message: schemas.Detections | schemas.Points) -> None:
+        """Publish to the service."""
+        self._node.send(stream, message)
+
+    def tell(self, problem: schemas.Problem) -> None:
+        """Log a problem and publish it."""
+        log.warning("problem", stream=problem.stream, code=problem.code, message=problem.message)
+        self._node.tell(problem)
+
+    def publish(self, topic: str, message: Any) -> None:
+        """Publish to ROS."""
+        self._node.publish(topic, self._types.write(message))
+
+    # What comes in
+
+    def _wanted(self) -> list[tuple[Wanted, Callable[[Any], None] | None]]:
+        """Return our endpoints, and what takes the messages of subscriptions; None for publishers."""
+        ros2, bridge = self._settings.ros2, self._bridge
+        ours: list[tuple[Wanted, Callable[[Any], None] | None]] = [
+            (self._one(graph.SUBSCRIPTION, "/tf", TF, MOVING), lambda one: bridge.take_transforms(one, static=False)),
+            (
+                self._one(graph.SUBSCRIPTION, "/tf_static", TF, STATIC),
+                lambda one: bridge.take_transforms(one, static=True),
+            ),
+        ]
+        if ros2.odometry:
+            ours.append((self._one(graph.SUBSCRIPTION, ros2.odometry, ODOMETRY, MOVING), bridge.take_odometry))
+        for name, stream in ros2.streams.items():
+            ours.append(
+                (
+                    self._one(graph.SUBSCRIPTION, stream.detections, stream.type, SENSOR),
+                    lambda one, name=name: bridge.take(name, "detections", one),  # type: ignore[misc]
+                )
+            )
+            if stream.points:
+                ours.append(
+                    (
+                        self._one(graph.SUBSCRIPTION, stream.points, CLOUD, SENSOR),
+                        lambda one, name=name: bridge.take(name, "points", one),  # type: ignore[misc]
+                    )
+                )
+            base = stream.tracks_topic
+            for end, kind in (("", TRACKED), ("/detections", DETECTION_ARRAY), ("/markers", MARKERS)):
+                ours.append((self._one(graph.PUBLISHER, base + end, kind, OFFERED), None))
+        if ros2.diagnostics:
+            ours.append((self._one(graph.PUBLISHER, ros2.diagnostics, DIAGNOSTICS, OFFERED), None))
+        return ours
+
+    def _one(self, kind: str, topic: str, type_name: str, qos: graph.Qos) -> Wanted:
+        return Wanted(kind, topic, type_name, self._types.hash_of(type_name), qos)
+
+    def _reading(self, wanted: Wanted, receive: Callable[[Any], None]) -> Callable[[graph.TopicKey, bytes], None]:
+        """Return what takes the bytes of a topic: those of the right type are read and handed over."""
+
+        def take(key: graph.TopicKey, payload: bytes) -> None:
+            if key.type == wanted.type and key.hash in {wanted.hash, graph.NO_HASH}:  # else the graph has told
+                self._put(lambda: self._read(wanted, payload, receive), len(payload))
+
+        return take
+
+    def _read(self, wanted: Wanted, payload: bytes, receive: Callable[[Any], None]) -> None:
+        try:
+            self._check_size(payload)
+            receive(self._types.read(wanted.type, payload))
+        except schemas.MessageError as error:
+            for name, stream in self._settings.ros2.streams.items():
+                if wanted.topic in {stream.detections, stream.points}:
+                    self._bridge.refuse(name, error)
+                    return
+            log.warning("problem", topic=wanted.topic, message=str(error))
+
+    def _check_size(self, payload: bytes) -> None:
+        if len(payload) > (most := self._settings.limits.max_bytes):
+            raise schemas.MessageError("too_large", "", f"at most {most} bytes", f"{len(payload)} bytes")
+
+    def _come_back(self, key: str, payload: bytes, encoding: str) -> None:
+        try:
+            if key.endswith("/tracks"):
+                self._bridge.take_tracks(schemas.decode(payload, schemas.Tracks, encoding=encoding))
+            else:
+                self._bridge.take_problem(schemas.decode(payload, schemas.Problem, encoding=encoding))
+        except schemas.MessageError as error:
+            log.warning("problem", key=key, message=str(error))
+
+    def _changed(self, endpoint: graph.Endpoint, *, came: bool) -> None:
+        for problem in self._matching.change(endpoint, came=came):
+            log.warning("ros2_mismatch", message=problem)
+
+    def _put(self, work: Callable[[], None], size: int = 0) -> None:
+        with self._lock:
+            self._queue.append((work, size))
+            self._waiting_bytes += size
+            while len(self._queue) > QUEUE or self._waiting_bytes > QUEUE_BYTES:
+                self._waiting_bytes -= self._queue.popleft()[1]
+                self._shed += 1
+        self._filled.set()
+
+    def _next(self) -> Callable[[], None] | None:
+        with self._lock:
+            if not self._queue:
+                return None
+            work, size = self._queue.popleft()
+            self._waiting_bytes -= size
+            return work
+
+    def _diagnose(self) -> None:
+        counts = self._bridge.counts
+        new = {name: one.problems - self._told_problems.get(name, 0) for name, one in counts.items()}
+        self._told_problems = {name: one.problems for name, one in counts.items()}
+        if shed := self._shed - self._told_shed:
+            self._told_shed += shed
+            log.warning("problem", code="shed", message="the bridge is too slow for what comes in", count=shed)
+        if not self._settings.ros2.diagnostics:
+            return
+        message = diagnostics(
+            self._types,
+            time.time_ns(),
+            self._settings.instance,
+            counts,
+            self._matching.problems(),
+            new_problems=new,
+            now_s=time.monotonic(),
+            stale_s=self._settings.stale_s,
+        )
+        self.publish(self._settings.ros2.diagnostics, message)
+
+
+def run(settings: Settings) -> int:
+    """Bridge until SIGINT or SIGTERM; to be called on the main thread.
+
+    Returns:
+        The exit status: 0, or 1 when the network cannot be used.
+    """
+    asked = threading.Event()
+
+    def ask(number: int, _frame: FrameType | None) -> None:
+        asked.set()
+        log.info("stop_asked", signal=signal.Signals(number).name)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, ask)
+    health = ProcessHealth(settings.instance)
+    log.info("starting", instance=settings.instance, version=__version__)
+    try:
+        with monitoring(settings, health):
+            log.info("connecting", endpoints=settings.connect)
+            node = _opened(settings, asked)
+            if node is None:
+                return 0
+            try:
+                process = _Process(settings, node)
+                process.open()
+                health.report(_Reporting(node))
+                streams = ",".join(settings.ros2.streams)
+                print(f"ready ros2={streams} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
+                log.info("ready", instance=settings.instance, streams=streams, connect=settings.connect)
+                while not asked.is_set():
+                    health.beat()
+                    process.work(BEAT_S)
+                health.ends()
+            finally:
+                node.close()
+    except (TransportError, HttpError) as error:
+        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+        return 1
+    log.info("stopped", drained=True)
+    return 0
+
+
+def _opened(settings: Settings, asked: threading.Event) -> Ros2Node | None:
+    """Return a node as soon as there is a router; None when the end was asked for before."""
+    found: list[Ros2Node | TransportError] = []
+
+    def wait() -> None:
+        try:
+            found.append(Ros2Node(settings))
+        except TransportError as error:
+            found.append(error)
+
+    # A daemon: waiting for a router cannot be interrupted, and must not keep the process.
+    thread = threading.Thread(target=wait, name="start", daemon=True)
+    thread.start()
+    while thread.is_alive() and not asked.is_set():
+        thread.join(0.05)
+    if not found:
+        return None
+    if isinstance(found[0], TransportError):
+        raise found[0]
+    return found[0]

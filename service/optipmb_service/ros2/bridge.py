@@ -1,0 +1,325 @@
+"""What becomes of each message between ROS 2 and the service: free of the network, the clock is handed in.
+
+Detections and clouds need the pose of their frame. They wait for it, at most `tf_wait_s` and at most `WAITING` of them
+per stream, and go out in the order in which they came. What is refused or lost is counted, and told as a
+problem of the stream.
+"""
+
+from __future__ import annotations
+
+import collections
+import math
+import secrets
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
+
+import numpy as np
+import optipmb_schemas as schemas
+from optipmb_schemas.ros2 import arrays, tracks
+from optipmb_schemas.ros2.transforms import TransformError, Transforms
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from optipmb_schemas.ros2.types import Types
+
+    from optipmb_service.settings import Ros2Settings, Ros2Stream
+
+Kind = Literal["detections", "points"]
+
+__all__ = ["WAITING", "Bridge", "Counts", "Sink"]
+
+WAITING: Final[dict[Kind, int]] = {"detections": 64, "points": 16}
+"""Messages of a stream that wait for their pose."""
+KEPT: Final = 4096
+"""Stamps of each moving frame: 40 s at 100 Hz."""
+FRAMES: Final = 2000
+CLOUDS_S: Final = 2.0
+"""Without a cloud for so long none is waited for."""
+CLOCK_BACK_NS: Final = 5 * 10**9
+"""Stamps of detections that go back by more are those of a clock that was set back, as a simulation's that restarts."""
+
+
+class Sink(Protocol):
+    """Where things go."""
+
+    def send(self, stream: str, message: schemas.Detections | schemas.Points) -> None:
+        """Publish to the service."""
+
+    def tell(self, problem: schemas.Problem) -> None:
+        """Publish a problem of a stream."""
+
+    def publish(self, topic: str, message: Any) -> None:
+        """Publish to ROS."""
+
+
+@dataclass
+class Counts:
+    """What became of the messages of a stream since the start."""
+
+    detections: int = 0
+    points: int = 0
+    refused: int = 0
+    tracks: int = 0
+    problems: int = 0
+    problem: str = ""
+    """The newest."""
+    newest_s: float | None = None
+    """When the newest detections came; clock of the bridge."""
+    latency_ms: float = 0.0
+    """Of the newest tracks, from the arrival of the detections."""
+
+
+@dataclass
+class _Waiting:
+    kind: Kind
+    message: Any
+    stamp_ns: int
+    deadline_s: float
+    arrived_s: float
+
+
+@dataclass
+class _Stream:
+    name: str
+    topics: Ros2Stream
+    epoch: bytes = field(default_factory=lambda: secrets.token_bytes(16))
+    world: str = ""
+    seq: dict[Kind, int] = field(default_factory=lambda: {"detections": 0, "points": 0})
+    waiting: dict[Kind, collections.deque[_Waiting]] = field(
+        default_factory=lambda: {"detections": collections.deque(), "points": collections.deque()}
+    )
+    arrived: collections.OrderedDict[int, float] = field(default_factory=collections.OrderedDict)
+    cloud_s: float = -math.inf
+    """When the newest cloud came; clock of the bridge."""
+    newest_ns: int = -1
+    """Stamp of the newest detections."""
+    shown_ns: int = -1
+    """Stamp of the newest tracks that went to ROS."""
+    counts: Counts = field(default_factory=Counts)
+
+
+class Bridge:
+    """The streams of the settings, and the transforms that they share. Not for several threads.
+
+    Args:
+        settings: topics and streams.
+        instance: who tells problems.
+        types: makes ROS's messages.
+        sink: where things go.
+        clock: seconds, monotonic.
+    """
+
+    def __init__(
+        self, settings: Ros2Settings, instance: str, types: Types, sink: Sink, clock: Callable[[], float]
+    ) -> None:
+        self._settings = settings
+        self._instance = instance
+        self._types = types
+        self._sink = sink
+        self._clock = clock
+        self._transforms = Transforms(kept=KEPT, frames=FRAMES)
+        self._streams = {name: _Stream(name, topics) for name, topics in settings.streams.items()}
+
+    @property
+    def counts(self) -> dict[str, Counts]:
+        """What became of the messages, by stream."""
+        return {name: stream.counts for name, stream in self._streams.items()}
+
+    def take_transforms(self, message: Any, *, static: bool) -> None:
+        """Take in a `TFMessage`; what waited for it goes out.
+
+        Raises:
+            MessageError: one of them is no transform; those before it are taken.
+        """
+        for row, one in enumerate(message.transforms):
+            place, turn = one.transform.translation, one.transform.rotation
+            self._add(f"transforms[{row}]", one.header, one.child_frame_id, place, turn, static=static)
+        self.go_on()
+
+    def take_odometry(self, message: Any) -> None:
+        """Take in an `Odometry` as the transform of its child frame.
+
+        Raises:
+            MessageError: it is no pose.
+        """
+        pose = message.pose.pose
+        self._add("pose", message.header, message.child_frame_id, pose.position, pose.orientation, static=False)
+        self.go_on()
+
+    def take(self, stream: str, kind: Kind, message: Any) -> None:
+        """Take in detections or a cloud of a stream; it goes out as soon as its pose is known."""
+        one, now = self._streams[stream], self._clock()
+        if kind == "detections":
+            one.counts.newest_s = now
+        else:
+            one.cloud_s = now
+        try:
+            stamp_ns = _stamp(message.header)
+        except schemas.MessageError as error:
+            self._refuse(one, error)
+            return
+        if kind == "detections":
+            if stamp_ns < one.newest_ns - CLOCK_BACK_NS:
+                self._transforms.drop_after(stamp_ns + CLOCK_BACK_NS)
+                one.shown_ns = -1
+                self._tell(
+                    one, "clock_back", f"the clock went back by {(one.newest_ns - stamp_ns) / 1e9:.1f} s", stamp_ns
+                )
+                one.newest_ns = stamp_ns
+            one.newest_ns = max(one.newest_ns, stamp_ns)
+        queue = one.waiting[kind]
+        queue.append(_Waiting(kind, message, stamp_ns, now + self._settings.tf_wait_s, now))
+        if len(queue) > WAITING[kind]:
+            shed = queue.popleft()
+            self._tell(one, "shed", f"more than {WAITING[kind]} {kind} wait for their pose", shed.stamp_ns)
+        self.go_on()
+
+    def refuse(self, stream: str, error: schemas.MessageError) -> None:
+        """Count and tell a message that cannot be read."""
+        self._refuse(self._streams[stream], error)
+
+    def go_on(self) -> None:
+        """Send what has its pose by now, and give up what has waited for too long; to be called now and then."""
+        now = self._clock()
+        for stream in self._streams.values():
+            for queue in stream.waiting.values():
+                while queue and self._sent(stream, queue[0], now):
+                    queue.popleft()
+
+    def take_tracks(self, message: schemas.Tracks) -> None:
+        """Publish the tracks of a stream to ROS; those of frames before the newest one are left out."""
+        stream = self._streams[message.stream]
+        if message.stamp_ns < stream.shown_ns or message.epoch != stream.epoch:
+            return  # a repetition after a restart, or a late correction: ROS expects stamps that ascend
+        stream.shown_ns = message.stamp_ns
+        arrived = stream.arrived.get(message.stamp_ns)
+        if arrived is not None:
+            stream.counts.latency_ms = 1e3 * (self._clock() - arrived)
+        stream.counts.tracks += 1
+        types, stamp_ns, world = self._types, message.stamp_ns, stream.world
+        base = stream.topics.tracks_topic
+        self._sink.publish(base, tracks.tracked_objects(types, message, stamp_ns, world, stream.name))
+        self._sink.publish(f"{base}/detections", tracks.detection_array(types, message, stamp_ns, world))
+        self._sink.publish(f"{base}/markers", tracks.markers(types, message, stamp_ns, world))
+
+    def take_problem(self, problem: schemas.Problem) -> None:
+        """Take in a problem that the service tells of a stream."""
+        if problem.instance != self._instance and (stream := self._streams.get(problem.stream)) is not None:
+            self._note(stream.counts, f"{problem.instance}: {problem.message}")
+
+    def _sent(self, stream: _Stream, waiting: _Waiting, now: float) -> bool:
+        """Send a message, or give it up; False while it has to wait."""
+        frame = arrays.frame_of(waiting.message.header)
+        try:
+            pose = self._pose(stream, frame, waiting.stamp_ns)
+        except TransformError as error:
+            if error.later and now < waiting.deadline_s:
+                return False
+            waited = f" (waited {now - waiting.arrived_s:.1f} s)" if error.later else ""
+            self._tell(
+                stream, "no_pose", f"{waiting.kind} in frame {frame!r} left out: {error}{waited}", waiting.stamp_ns
+            )
+            return True
+        except schemas.MessageError as error:
+            self._refuse(stream, error)
+            return True
+        try:
+            self._sink.send(stream.name, self._message(stream, waiting, pose))
+        except schemas.MessageError as error:
+            self._refuse(stream, error, waiting.stamp_ns)
+            return True
+        stream.seq[waiting.kind] += 1
+        if waiting.kind == "detections":
+            stream.counts.detections += 1
+            stream.arrived[waiting.stamp_ns] = waiting.arrived_s
+            if len(stream.arrived) > WAITING["detections"]:
+                stream.arrived.popitem(last=False)
+        else:
+            stream.counts.points += 1
+        return True
+
+    def _message(self, stream: _Stream, waiting: _Waiting, pose: schemas.Pose) -> schemas.Detections | schemas.Points:
+        header: Any = {
+            "stream": stream.name,
+            "epoch": stream.epoch,
+            "seq": stream.seq[waiting.kind],
+            "stamp_ns": waiting.stamp_ns,
+            "frame": "sensor",
+            "pose": pose,
+        }
+        if waiting.kind == "points":
+            return schemas.Points(**header, xyz=arrays.points_of(waiting.message))
+        boxes = arrays.boxes_of(waiting.message, stream.topics.classes)
+        return schemas.Detections(
+            **header,
+            labels=boxes.labels,
+            label=boxes.label,
+            center=boxes.center,
+            size=boxes.size,
+            yaw=boxes.yaw,
+            score=boxes.score,
+            velocity=boxes.velocity,
+            has_points=self._has_points(stream),
+        )
+
+    def _has_points(self, stream: _Stream) -> bool | None:
+        """Whether the service shall wait for a cloud: while clouds come, and before it is known whether they do."""
+        if not stream.topics.points:
+            return False
+        expected = not stream.counts.detections or self._clock() - stream.cloud_s < CLOUDS_S
+        return True if expected else None
+
+    def _pose(self, stream: _Stream, frame: str, stamp_ns: int) -> schemas.Pose:
+        """Return world from frame; the world is chosen at the first frame, and stays."""
+        world = stream.world or self._settings.fixed_frame
+        if not world:
+            if self._transforms.has_parent(frame):
+                world = self._transforms.root(frame)
+            elif stream.topics.fixed:
+                world = frame
+            else:
+                raise TransformError(f"frame {frame!r}: expected a transform to it in tf", later=True)
+        translation, quaternion = self._transforms.lookup(world, frame, stamp_ns)
+        stream.world = world
+        return schemas.Pose(translation=translation, quaternion=quaternion)
+
+    def _add(self, path: str, header: Any, child: Any, place: Any, turn: Any, *, static: bool) -> None:
+        try:
+            self._transforms.add(
+                str(header.frame_id),
+                str(child),
+                arrays.stamp_of(header),
+                np.array([place.x, place.y, place.z]),
+                np.array([turn.w, turn.x, turn.y, turn.z]),
+                static=static,
+            )
+        except schemas.MessageError as error:
+            raise error.under(path) from None
+
+    def _refuse(self, stream: _Stream, error: schemas.MessageError, stamp_ns: int | None = None) -> None:
+        stream.counts.refused += 1
+        problem = schemas.Problem.of(error, stream=stream.name, instance=self._instance)
+        self._note(stream.counts, problem.message)
+        self._sink.tell(problem.model_copy(update={"stamp_ns": stamp_ns}))
+
+    def _tell(self, stream: _Stream, code: str, text: str, stamp_ns: int) -> None:
+        stream.counts.refused += 1
+        text = text[:500]
+        self._note(stream.counts, text)
+        self._sink.tell(
+            schemas.Problem(stream=stream.name, instance=self._instance, code=code, message=text, stamp_ns=stamp_ns)
+        )
+
+    @staticmethod
+    def _note(counts: Counts, text: str) -> None:
+        counts.problems += 1
+        counts.problem = text
+
+
+def _stamp(header: Any) -> int:
+    stamp_ns = arrays.stamp_of(header)
+    if stamp_ns == 0:
+        expected = "a stamp above 0 (does the publisher use a simulated clock that has not started?)"
+        raise schemas.MessageError("invalid_value", "header.stamp", expected, "0")
+    return stamp_ns

@@ -1,0 +1,178 @@
+"""How rmw_zenoh names things: keys of topics, liveliness tokens, quality of service, attachments.
+
+A message of a topic goes to `<domain>/<topic>/<type>/<hash>`. Nodes and endpoints are known by tokens,
+
+    @ros2_lv/<domain>/<session>/<node>/<node>/NN/<enclave>/<namespace>/<name>
+    @ros2_lv/<domain>/<session>/<node>/<entity>/MP|MS/<enclave>/<namespace>/<name>/<topic>/<type>/<hash>/<qos>
+
+in which `%` stands for `/`. Quality of service is `reliability:durability:history,depth:deadline:lifespan:liveliness`
+as numbers of rmw, empty where it is the default. Humble has no hashes of types and writes `TypeHashNotSupported`.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+__all__ = [
+    "NO_HASH",
+    "PUBLISHER",
+    "SUBSCRIPTION",
+    "Endpoint",
+    "Node",
+    "Qos",
+    "TopicKey",
+    "attachment",
+    "parse_endpoint",
+]
+
+PUBLISHER: Final = "MP"
+SUBSCRIPTION: Final = "MS"
+NO_HASH: Final = "TypeHashNotSupported"
+
+_SPACE: Final = "@ros2_lv"
+_NODE: Final = "NN"
+_PARTS: Final = 13
+_RELIABLE, _BEST_EFFORT = "1", "2"
+_TRANSIENT_LOCAL, _VOLATILE = "1", "2"
+_GID: Final = 16
+
+
+def mangled(name: str) -> str:
+    """Return a name as one chunk of a key."""
+    return name.replace("/", "%") or "%"
+
+
+def dds_type(name: str) -> str:
+    """Return the name of a type as keys have it: `std_msgs/msg/String` is `std_msgs::msg::dds_::String_`."""
+    package, kind, message = name.split("/")
+    return f"{package}::{kind}::dds_::{message}_"
+
+
+def ros_type(name: str) -> str:
+    """Return the name of a type as ROS has it; what is none stays as it is."""
+    return name.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
+
+
+@dataclass(frozen=True)
+class Qos:
+    """What two endpoints must agree on, as DDS has it: the offer must be at least what is asked for."""
+
+    reliable: bool = True
+    transient_local: bool = False
+    depth: int = 10
+
+    def token(self) -> str:
+        """Return the text in a token."""
+        reliability = "" if self.reliable else _BEST_EFFORT
+        durability = _TRANSIENT_LOCAL if self.transient_local else ""
+        return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
+
+    def lacks(self, offered: Qos) -> str:
+        """Return what an offer lacks of this request, in words; empty when nothing."""
+        if self.reliable and not offered.reliable:
+            return "reliability: asked for RELIABLE, offered BEST_EFFORT"
+        if self.transient_local and not offered.transient_local:
+            return "durability: asked for TRANSIENT_LOCAL, offered VOLATILE"
+        return ""
+
+
+def parse_qos(text: str) -> Qos | None:
+    """Return what a token says; None when it is no quality of service."""
+    parts = text.split(":")
+    if len(parts) < 3:  # noqa: PLR2004 - reliability, durability, history
+        return None
+    depth = parts[2].rpartition(",")[2]
+    return Qos(parts[0] != _BEST_EFFORT, parts[1] == _TRANSIENT_LOCAL, int(depth) if depth.isdecimal() else 0)
+
+
+class TopicKey(NamedTuple):
+    """The parts of the key of a topic."""
+
+    domain: int
+    topic: str
+    type: str
+    hash: str
+
+    @property
+    def key(self) -> str:
+        """The key that messages go to."""
+        return f"{self.domain}/{self.topic.strip('/')}/{dds_type(self.type)}/{self.hash}"
+
+
+def topic_pattern(domain: int, topic: str) -> str:
+    """Return the key expression of a topic with any type: another type or hash is to be noticed, not missed."""
+    return f"{domain}/{topic.strip('/')}/*/*"
+
+
+def parse_topic(key: str) -> TopicKey | None:
+    """Return the parts of a key; None when it is that of no topic."""
+    parts = key.split("/")
+    if len(parts) < 4 or not parts[0].isdecimal():  # noqa: PLR2004 - domain, topic, type, hash
+        return None
+    return TopicKey(int(parts[0]), "/" + "/".join(parts[1:-2]), ros_type(parts[-2]), parts[-1])
+
+
+@dataclass(frozen=True)
+class Node:
+    """A node of a Zenoh session."""
+
+    domain: int
+    session: str
+    name: str
+    namespace: str = "/"
+    number: int = 0
+
+    def token(self) -> str:
+        """Return the key of its token."""
+        where = f"{_SPACE}/{self.domain}/{self.session}/{self.number}/{self.number}/{_NODE}"
+        return f"{where}/%/{mangled(self.namespace)}/{self.name}"
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A publisher or subscription of a node."""
+
+    node: Node
+    entity: int
+    kind: str
+    topic: str
+    type: str
+    hash: str
+    qos: Qos
+
+    @property
+    def name(self) -> str:
+        """The node's name with its namespace."""
+        return f"{self.node.namespace.rstrip('/')}/{self.node.name}"
+
+    def token(self) -> str:
+        """Return the key of its token."""
+        node = self.node
+        where = f"{_SPACE}/{node.domain}/{node.session}/{node.number}/{self.entity}/{self.kind}"
+        what = f"{mangled(self.topic)}/{dds_type(self.type)}/{self.hash}/{self.qos.token()}"
+        return f"{where}/%/{mangled(node.namespace)}/{node.name}/{what}"
+
+
+def graph_pattern(domain: int) -> str:
+    """Return the key expression of all tokens of a domain."""
+    return f"{_SPACE}/{domain}/**"
+
+
+def parse_endpoint(key: str) -> Endpoint | None:
+    """Return the publisher or subscription of a token; None for other tokens, and for what is none."""
+    parts = key.split("/")
+    if len(parts) != _PARTS or parts[0] != _SPACE or parts[5] not in {PUBLISHER, SUBSCRIPTION}:
+        return None
+    _, domain, session, node, entity, kind, _, namespace, name, topic, type_, hash_, qos = parts
+    offered = parse_qos(qos)
+    if offered is None or not (domain.isdecimal() and node.isdecimal() and entity.isdecimal()):
+        return None
+    owner = Node(int(domain), session, name.replace("%", "/"), namespace.replace("%", "/"), int(node))
+    return Endpoint(owner, int(entity), kind, topic.replace("%", "/"), ros_type(type_), hash_, offered)
+
+
+def attachment(number: int, stamp_ns: int, gid: bytes) -> bytes:
+    """Return what goes with each message: its number, when it was sent (ns since 1970), and who sent it (16 bytes)."""
+    return struct.pack("<qqB", number, stamp_ns, _GID) + gid[:_GID]

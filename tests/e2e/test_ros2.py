@@ -1,0 +1,295 @@
+"""The bridge to ROS 2 with a node by zenoh-ros2-sdk on the other side, over a real router and a real service."""
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import bags
+import numpy as np
+import pytest
+import zenoh
+import zenoh.ext
+from optipmb_client.datasets import DataSequence, open_dataset
+from optipmb_client.offline import read_profile, track_sequence
+from optipmb_schemas.ros2.arrays import CLOUD
+from optipmb_schemas.ros2.tracks import DETECTION_ARRAY, MARKERS, TRACKED
+from optipmb_schemas.ros2.types import own_types
+from optipmb_service.ros2 import graph
+from ros2_client import Ros2Client, hash_by_sdk
+from routers import open_client
+from service_process import ServiceProcess
+from zenoh_ros2_sdk.qos import QosDurability, QosProfile
+
+pytestmark = pytest.mark.alone
+
+DOMAIN = 7
+STREAM = "garage/robot/lidar"
+TF = "tf2_msgs/msg/TFMessage"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+TRACKS = "/detector/boxes/tracks"
+START_NS = 10**18
+SETTINGS = f"""
+[ros2]
+domain = {DOMAIN}
+tf_wait_s = 1.0
+[ros2.streams."{STREAM}"]
+detections = "/detector/boxes"
+points = "/points"
+"""
+
+
+@pytest.fixture(scope="module")
+def scene() -> DataSequence:
+    """A small generated scene with clouds."""
+    (sequence,) = open_dataset("scene", frames=16, vehicles=6, pedestrians=3).sequences(["0000"])
+    return sequence
+
+
+@pytest.fixture
+def service() -> Iterator[ServiceProcess]:
+    """A service that is a router, and waits long enough for clouds on a busy machine."""
+    with ServiceProcess("--profile", "scene", environment={"OPTIPMB_CLOUD_WAIT_S": "20"}) as process:
+        process.wait_ready()
+        yield process
+
+
+def bridge(service: ServiceProcess, folder: Path) -> ServiceProcess:
+    """Start the bridge; use it as a context manager."""
+    file = folder / "ros2.toml"
+    file.write_text(SETTINGS)
+    process = ServiceProcess("ros2", "--settings", str(file), "--connect", service.endpoint, listen=False)
+    assert process.wait_ready().startswith(f"ready ros2={STREAM} ")
+    return process
+
+
+def frames_of(sequence: DataSequence) -> list[list[bags.Sent]]:
+    """Give the messages of a scene by frame: transforms first, then the cloud, then the detections."""
+    frames: list[list[bags.Sent]] = [[]]
+    for one in bags.messages(sequence, start_ns=START_NS):
+        frames[-1].append(one)
+        if one.topic == "/detector/boxes":
+            frames.append([])
+    return frames[:-1]
+
+
+def publish_static(session: zenoh.Session, message: dict[str, Any]) -> Any:
+    """Publish a static transform as rmw_zenoh does, with a cache for who comes late; keep what is returned."""
+    key = graph.TopicKey(DOMAIN, "/tf_static", TF, hash_by_sdk(TF)).key
+    publisher = zenoh.ext.declare_advanced_publisher(
+        session,
+        key,
+        cache=zenoh.ext.CacheConfig(1),
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+        publisher_detection=True,
+    )
+    types = own_types()
+    one = message["transforms"][0]
+
+    def made(kind: str, fields: dict[str, float]) -> Any:
+        return types.new(f"geometry_msgs/msg/{kind}", **fields)
+
+    moved = types.new(
+        "geometry_msgs/msg/Transform",
+        translation=made("Vector3", one["transform"]["translation"]),
+        rotation=made("Quaternion", one["transform"]["rotation"]),
+    )
+    stamp = types.new("builtin_interfaces/msg/Time", sec=0, nanosec=0)
+    header = types.new("std_msgs/msg/Header", stamp=stamp, frame_id=one["header"]["frame_id"])
+    fixed = types.new(
+        "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=one["child_frame_id"], transform=moved
+    )
+    publisher.put(types.write(types.new(TF, transforms=[fixed])))
+    return publisher
+
+
+def play(client: Ros2Client, frames: list[list[bags.Sent]]) -> None:
+    """Publish frames, each when the tracks of the one before have come back."""
+    for frame in frames:
+        before = len(client.received[TRACKS])
+        for one in frame:
+            if one.topic != "/tf_static":
+                client.publish(one.topic, one.kind, one.message)
+        client.wait(TRACKS, lambda got, before=before: len(got) > before)  # type: ignore[misc]
+
+
+def ids(message: Any) -> list[int]:
+    """Give the track ids in a TrackedObjects."""
+    return [int.from_bytes(bytes(one.object_id.uuid)[8:], "big") for one in message.objects]
+
+
+def told(client: Ros2Client, text: str) -> str:
+    """Wait until a diagnostic says a text, and give it."""
+
+    def texts(messages: list[Any]) -> list[str]:
+        return [
+            f"{status.message} {pair.value}"
+            for message in messages
+            for status in message.status
+            for pair in status.values
+            if text in f"{status.message} {pair.value}"
+        ]
+
+    return texts(client.wait("/diagnostics", lambda got: bool(texts(got))))[0]
+
+
+def ready_client(service: ServiceProcess) -> Ros2Client:
+    """Start a node that listens to what the bridge publishes; returns when the bridge is heard."""
+    client = Ros2Client(service.endpoint, DOMAIN)
+    for topic, kind in (
+        (TRACKS, TRACKED),
+        (f"{TRACKS}/detections", DETECTION_ARRAY),
+        (f"{TRACKS}/markers", MARKERS),
+        ("/diagnostics", DIAGNOSTICS),
+    ):
+        client.subscribe(topic, kind)
+    client.wait("/diagnostics", bool)
+    return client
+
+
+@pytest.mark.parametrize("kind", [TRACKED, DETECTION_ARRAY, MARKERS, DIAGNOSTICS, TF, CLOUD, bags.AUTOWARE])
+def test_hashes_of_types_are_those_of_another_library(kind: str) -> None:
+    """Two programs compute the same hash of every type that is used live."""
+    assert own_types().hash_of(kind) == hash_by_sdk(kind)
+
+
+def test_topics_become_tracks_of_another_node(service: ServiceProcess, scene: DataSequence, tmp_path: Path) -> None:
+    """Detections, clouds and tf of a node that is not ours come back to it as the tracks of the same data."""
+    frames = frames_of(scene)
+    static = next(one.message for one in frames[0] if one.topic == "/tf_static")
+    with open_client(service.endpoint) as session, bridge(service, tmp_path) as process:
+        publisher = publish_static(session, static)
+        with ready_client(service) as client:
+            play(client, frames)
+            tracked = client.received[TRACKS]
+            detections = client.wait(f"{TRACKS}/detections", lambda got: len(got) == len(frames))
+            shown = client.wait(f"{TRACKS}/markers", lambda got: len(got) == len(frames))
+            tokens = [
+                str(reply.ok.key_expr) for reply in session.liveliness().get(graph.graph_pattern(DOMAIN)) if reply.ok
+            ]
+        publisher.undeclare()
+    assert process.process.poll() is not None
+    expected = [step[1] for step in track_sequence(read_profile("scene"), scene)]
+    assert sum(len(tracks.id) for tracks in expected) > 30
+    for index, (message, tracks) in enumerate(zip(tracked, expected, strict=True)):
+        assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS + index * 10**8
+        assert message.header.frame_id == "map"
+        assert ids(message) == tracks.id.tolist() == [int(one.id) for one in detections[index].detections]
+        places = [one.kinematics.pose_with_covariance.pose.position for one in message.objects]
+        np.testing.assert_allclose([[p.x, p.y, p.z] for p in places], tracks.center.reshape(-1, 3), atol=1e-9)
+        existence = [one.existence_probability for one in message.objects]
+        np.testing.assert_allclose(existence, tracks.existence, rtol=1e-6)
+        assert len(shown[index].markers) > len(tracks.id)
+    ours = [
+        endpoint for token in tokens if (endpoint := graph.parse_endpoint(token)) and endpoint.node.name == "optipmb"
+    ]
+    assert {(endpoint.kind, endpoint.topic) for endpoint in ours} >= {
+        ("MP", TRACKS),
+        ("MP", "/diagnostics"),
+        ("MS", "/detector/boxes"),
+        ("MS", "/points"),
+        ("MS", "/tf"),
+        ("MS", "/tf_static"),
+    }
+
+
+def test_either_side_may_restart(service: ServiceProcess, scene: DataSequence, tmp_path: Path) -> None:
+    """After a restart of the node, and a kill of the bridge, tracks go on with their ids."""
+    frames = frames_of(scene)
+    static = next(one.message for one in frames[0] if one.topic == "/tf_static")
+    with open_client(service.endpoint) as session:
+        publisher = publish_static(session, static)
+        with bridge(service, tmp_path) as process:
+            with ready_client(service) as client:
+                play(client, frames[:6])
+                before = ids(client.received[TRACKS][-1])
+            with ready_client(service) as client:
+                play(client, frames[6:10])
+                between = ids(client.received[TRACKS][-1])
+            process.process.kill()
+        with bridge(service, tmp_path), ready_client(service) as client:
+            play(client, frames[10:])
+            after = ids(client.received[TRACKS][-1])
+            counted = told(client, "tracking")
+        publisher.undeclare()
+    assert len(before) > 1
+    assert set(before) & set(between) & set(after)
+    assert counted
+
+
+def test_what_is_wrong_on_the_other_side_is_told(service: ServiceProcess, scene: DataSequence, tmp_path: Path) -> None:
+    """A clock that starts late, frames that tf lacks, quality of service or definitions that do not fit are told."""
+    frames = frames_of(scene)
+    boxes = json.loads(json.dumps(next(one for one in frames[0] if one.topic == "/detector/boxes").message))
+    with bridge(service, tmp_path) as process, ready_client(service) as client:
+        boxes["header"]["stamp"] = {"sec": 0, "nanosec": 0}
+        client.publish("/detector/boxes", bags.VISION, boxes)
+        assert "simulated clock that has not started" in told(client, "header.stamp")
+
+        boxes["header"] = bags.header(START_NS, "radar")
+        client.publish("/detector/boxes", bags.VISION, boxes)
+        assert "expected a transform to it in tf (waited 1." in told(client, "frame 'radar'")
+
+        lasting = QosProfile(durability=QosDurability.TRANSIENT_LOCAL)
+        client.subscribe(TRACKS, TRACKED, qos=lasting, node_name="late_joiner")
+        assert "node /late_joiner subscribes to" in told(client, "asked for TRANSIENT_LOCAL, offered VOLATILE")
+
+        fixed = {"transforms": []}
+        client.publish("/tf_static", TF, fixed, node_name="forgetful")
+        assert "/tf_static: node /forgetful publishes" in told(client, "/tf_static")
+
+        other = f"RIHS01_{'0' * 64}"
+        client.publish("/points", CLOUD, bags.cloud(START_NS, "velodyne", np.zeros((1, 3))), type_hash=other)
+        assert f"another definition of {CLOUD}" in told(client, other)
+        process.wait_log("ros2_mismatch")
+        assert client.received[TRACKS] == []
+
+        # The clock has started, the transforms come: the same bridge tracks.
+        play(client, [[one for one in frame if one.topic != "/points"] for frame in frames[:2]])
+        assert ids(client.received[TRACKS][-1])
+
+
+def test_a_clock_that_is_set_back_starts_anew(service: ServiceProcess, scene: DataSequence, tmp_path: Path) -> None:
+    """When a simulation starts again, transforms of before are forgotten, and tracks come again."""
+    frames = [[one for one in frame if one.topic != "/points"] for frame in frames_of(scene)[:4]]
+    with bridge(service, tmp_path), ready_client(service) as client:
+        play(client, frames)
+        back = json.loads(json.dumps([[list(one) for one in frame] for frame in frames]))
+        for frame in back:
+            for one in frame:
+                _shift(one[3], -100)
+        play(client, [[bags.Sent(*one) for one in frame] for frame in back])
+        stamps = [message.header.stamp.sec for message in client.received[TRACKS]]
+        assert stamps[-1] == START_NS // 10**9 - 100
+        assert "the clock went back by 100." in told(client, "clock went back")
+
+
+def _shift(message: Any, seconds: int) -> None:
+    """Move every stamp in a message."""
+    if isinstance(message, dict):
+        for name, value in message.items():
+            if name == "stamp":
+                value["sec"] += seconds
+            else:
+                _shift(value, seconds)
+    elif isinstance(message, list):
+        for one in message:
+            _shift(one, seconds)
+
+
+def test_the_command_says_what_it_needs(tmp_path: Path) -> None:
+    """Without streams, and with a topic that is none, the command ends with status 2 and one clear line."""
+    file = tmp_path / "ros2.toml"
+    for text, expected in (
+        ("", "setting ros2.streams: expected a table of streams"),
+        ('[ros2.streams."a/b/c"]\ndetections = "boxes"', "a topic looks like /lidar/points, received 'boxes'"),
+        ('[ros2.streams."a/b"]\ndetections = "/boxes"', "setting ros2.streams (from the file): a stream is named"),
+    ):
+        file.write_text(text)
+        with ServiceProcess("ros2", "--settings", str(file), listen=False) as process:
+            assert process.process.wait(60) == 2
+            ends = time.monotonic() + 5
+            while not process.errors and time.monotonic() < ends:
+                time.sleep(0.01)
+            assert expected in process.errors
