@@ -15,7 +15,7 @@ _EXTRAS: Final[Mapping[str, str]] = {
     "tune": "optuna",
     "plot": "matplotlib",
     "table": "pyarrow",
-    "record": "mcap mcap_protobuf foxglove_schemas_protobuf",
+    "record": "mcap foxglove",
     "ros2": "rosbags",
     "watch": "rerun",
 }

@@ -1,15 +1,19 @@
 """Recordings: what is in the file, what is left of it after a cut, and what is played of it."""
 
+import concurrent.futures
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_client import FoxgloveClient
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from optipmb_client.datasets import DatasetError, open_dataset
+from optipmb_client.foxglove_server import FoxgloveServer
 from optipmb_client.mcap_files.plan import plan, renamed, steps
 from optipmb_client.mcap_files.reading import Recorded, RecordingFile
 from optipmb_client.mcap_files.writing import RecordingWriter
@@ -18,6 +22,8 @@ from optipmb_schemas import (
     Keys,
     Message,
     Points,
+    Pose,
+    Problem,
     SessionParameters,
     Tracks,
     decode,
@@ -88,7 +94,8 @@ def tracks(seq: int, ids: list[int], *, cloud_used: bool = False, revision: int 
 
 def put(writer: RecordingWriter, message: Message, received_ns: int, *, json: bool = False) -> bytes:
     """Add a message under its own key; give its bytes."""
-    topic = {Detections: "detections", Points: "points", Tracks: "tracks"}[type(message)]
+    topics = {Detections: "detections", Points: "points", Tracks: "tracks", Problem: "problems"}
+    topic = topics[type(message)]
     payload = encode_json(message) if json else encode(message)
     key = f"optipmb/v1/{STREAM}/{topic}"
     writer.add(key, payload, encoding_of(message, form="json" if json else "msgpack"), received_ns)
@@ -118,6 +125,52 @@ def test_messages_come_back_byte_for_byte(tmp_path: Path) -> None:
     assert [one.stamp_ns for one in found] == [700, 700, 800, 1_500_000_007, 14, 15]
     assert found[1].encoding == "application/msgpack;optipmb.Detections.v1"
     assert found[2].encoding == "application/json;optipmb.Detections.v1"
+
+
+def test_foxglove_finds_boxes_plots_and_logs_beside_our_messages(tmp_path: Path) -> None:
+    """Detections are boxes and a pose, tracks also figures, problems are logs; our reader ignores them."""
+    problem = Problem(stream=STREAM, instance="one", code="pose", message="it jumped", stamp_ns=5)
+    pose = Pose(translation=np.array([0.0, 0.0, 1.0]), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
+    seen = detections(0).model_copy(update={"frame": "sensor", "pose": pose})
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        put(writer, seen, 10)
+        put(writer, tracks(0, [3, 4]), 11)
+        put(writer, problem, 12)
+    found = {}
+    factory = DecoderFactory()
+    with (tmp_path / "a.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            decoder = factory.decoder_for(channel.message_encoding, schema) or json.loads
+            if channel.message_encoding in {"protobuf", "json"}:
+                found["/".join(channel.topic.split("/")[-2:])] = decoder(message.data)
+    (boxes,) = found["detections/scene"].entities
+    assert [cube.pose.position.z for cube in boxes.cubes] == [2.0, 2.0]
+    assert (found["detections/pose"].child_frame_id, found["detections/pose"].translation.z) == (STREAM, 1.0)
+    assert found["tracks/figures"]["tracks"] == 2
+    assert (found["problems/log"].message, found["problems/log"].name) == ("it jumped", "pose")
+    assert [one.topic for one in RecordingFile(tmp_path / "a.mcap")] == ["detections", "tracks", "problems"]
+
+
+def test_foxglove_is_served_live(tmp_path: Path) -> None:
+    """A client of Foxglove's protocol gets the scene, the cloud, plots and logs, by the schemas that it is sent."""
+    problem = Problem(stream=STREAM, instance="one", code="pose", message="it jumped", stamp_ns=5)
+    ends = {"tracks/scene", "tracks/figures", "detections/scene", "points/cloud", "problems/log"}
+    with FoxgloveServer("127.0.0.1", 0) as server, concurrent.futures.ThreadPoolExecutor(1) as pool:
+        client = FoxgloveClient(server.address)
+        result = pool.submit(client.collect, {f"/{STREAM}/{end}" for end in ends})
+        while not result.done():  # a channel is there with its first message, and one may subscribe only then
+            for message in (tracks(0, [3]), detections(0), points(0, 700), problem):
+                server.show(message)
+            concurrent.futures.wait([result], timeout=0.05)
+        found = {topic.removeprefix(f"/{STREAM}/"): one for topic, one in result.result().items()}
+        client.close()
+    assert found["tracks/scene"][0] == 1_500_000_000
+    assert [entity.id for entity in found["tracks/scene"][1].entities] == ["3"]
+    assert found["tracks/figures"][1]["tracks"] == 1
+    cloud = found["points/cloud"][1]
+    assert np.frombuffer(cloud.data, "<f4").tolist() == [1.0] * 9
+    assert (cloud.point_stride, [field.name for field in cloud.fields]) == (12, ["x", "y", "z"])
+    assert found["problems/log"][1].message == "it jumped"
 
 
 def test_foxglove_finds_boxes_arrows_and_ids(tmp_path: Path) -> None:

@@ -4,24 +4,43 @@ import contextlib
 import itertools
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from optipmb_schemas import PREFIX, Density, Detections, Keys, Message, MessageError, Points, Topic, Tracks, decode
+from optipmb_schemas import (
+    PREFIX,
+    Density,
+    Detections,
+    Keys,
+    Message,
+    MessageError,
+    Points,
+    Problem,
+    Topic,
+    Tracks,
+    decode,
+)
 
 from optipmb_client.asking import DensityAsker
 from optipmb_client.commands.options import Config, Connect, Prefix, mcap_needed, say
 from optipmb_client.commands.replay import speed_of
-from optipmb_client.errors import ClientError, UsageError
+from optipmb_client.errors import UsageError
+from optipmb_client.extras import needed
 from optipmb_client.transport import Connection, Inbox
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
-TOPICS: tuple[Topic, ...] = ("tracks", "detections", "points")
-KINDS: dict[str, type[Message]] = {"tracks": Tracks, "detections": Detections, "points": Points, "density": Density}
+TOPICS: tuple[Topic, ...] = ("tracks", "detections", "problems", "points")
+KINDS: dict[str, type[Message]] = {
+    "tracks": Tracks,
+    "detections": Detections,
+    "points": Points,
+    "problems": Problem,
+    "density": Density,
+}
 WAITING = 32  # messages; a viewer that is too slow loses the oldest
 TICK_S = 0.2
 
@@ -44,6 +63,11 @@ def watch(  # noqa: PLR0913  these are the command's options
     ] = False,
     web_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page, with --web.")] = 9090,
     data_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page's data, with --web.")] = 9876,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Serve Foxglove instead: open the printed address there.")
+    ] = False,
+    foxglove_port: Annotated[int, typer.Option(min=0, max=65535, help="Port for Foxglove.")] = 8765,
+    host: Annotated[str, typer.Option(help="Address that Foxglove is served at.")] = "127.0.0.1",
     save: Annotated[Path | None, typer.Option("--save", help="Write an .rrd file instead, for Rerun.")] = None,
     speed: Annotated[str, typer.Option(help="Of a recording: 1 as recorded, 10 ten times as fast, max.")] = "max",
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so many seconds.")] = None,
@@ -54,43 +78,80 @@ def watch(  # noqa: PLR0913  these are the command's options
 ) -> None:
     """Watch streams from above and in 3D: tracks, their velocity, uncertainty and ways, detections, clouds.
 
-    Ends when it is interrupted, or at the end of a recording with --save.
+    Ends when it is interrupted, or at the end of a recording with --save. With --foxglove also problems, as logs.
     """
-    if web and save is not None:
-        raise UsageError("--save: expected either a file or --web, received both")
-    if poisson and file is not None:
-        raise UsageError("--poisson: expected without a recording, which holds no densities; received one")
+    if web + foxglove + (save is not None) > 1:
+        raise UsageError("expected one of --web, --foxglove and --save, received several")
+    if poisson and (file is not None or foxglove):
+        raise UsageError("--poisson: expected without a recording or --foxglove, which show no densities; received one")
     pace = speed_of(speed)
-    try:
-        import rerun as rr  # noqa: PLC0415  an extra of the installation
-
-        from optipmb_client.watching import View  # noqa: PLC0415  as above
-    except ImportError as error:
-        raise ClientError("watching needs Rerun, which is not installed: pip install 'optipmb[watch]'") from error
+    if foxglove:
+        needed("watching with Foxglove", "record", "foxglove")
+    else:
+        needed("watching", "watch", "rerun")
     messages = (
         _live(connect, config, timeout, streams or ["*/*/*"], prefix, points=points, poisson=poisson)
         if file is None
         else _recorded(file, streams, pace, points=points)
     )
     first = next(messages, None)  # what is wrong with the source is told before a viewer opens
+    ends = None if seconds is None else time.monotonic() + seconds
+    shown = _until(itertools.chain([first], messages), ends)
+    if foxglove:
+        _in_foxglove(shown, host, foxglove_port, ends)
+        return
+    followed = streams[0] if streams and "*" not in streams[0] else None
+    _in_rerun(shown, followed, save, (web_port, data_port) if web else None, ends)
+
+
+def _until(messages: Iterable[Message | None], ends: float | None) -> Iterator[Message]:
+    """Yield what comes until a time of the monotonic clock; for ever without."""
+    for message in messages:
+        if message is not None:
+            yield message
+        if ends is not None and time.monotonic() > ends:
+            return
+
+
+def _stay(ends: float | None) -> None:
+    threading.Event().wait(None if ends is None else max(0.0, ends - time.monotonic()))
+
+
+def _in_foxglove(messages: Iterable[Message], host: str, port: int, ends: float | None) -> None:
+    from optipmb_client.foxglove_server import FoxgloveServer  # noqa: PLC0415  an extra of the installation
+
+    with FoxgloveServer(host, port) as server:
+        say(f"open {server.address} in Foxglove (Open connection, Foxglove WebSocket)")
+        for message in messages:
+            server.show(message)
+        _stay(ends)
+
+
+def _in_rerun(
+    messages: Iterable[Message],
+    followed: str | None,
+    save: Path | None,
+    ports: tuple[int, int] | None,
+    ends: float | None,
+) -> None:
+    import rerun as rr  # noqa: PLC0415  an extra of the installation
+
+    from optipmb_client.watching import View  # noqa: PLC0415  as above
+
     recording = rr.RecordingStream("optipmb")
-    if web:
-        source = recording.serve_grpc(grpc_port=data_port)
-        rr.serve_web_viewer(web_port=web_port, open_browser=False, connect_to=source)
-        say(f"watch at http://localhost:{web_port}/?url={source.replace(':', '%3A').replace('/', '%2F')}")
+    if ports is not None:
+        page, data = ports
+        source = recording.serve_grpc(grpc_port=data)
+        rr.serve_web_viewer(web_port=page, open_browser=False, connect_to=source)
+        say(f"watch at http://localhost:{page}/?url={source.replace(':', '%3A').replace('/', '%2F')}")
     else:
         _open(recording, save)
-    view = View(recording, streams[0] if streams and "*" not in streams[0] else None)
-    ends = None if seconds is None else time.monotonic() + seconds
+    view = View(recording, followed)
     try:
-        for message in itertools.chain([first], messages):
-            if message is not None:
-                view.show(message)
-            if ends is not None and time.monotonic() > ends:
-                break
-        else:
-            if web:
-                threading.Event().wait(None if ends is None else max(0.0, ends - time.monotonic()))
+        for message in messages:
+            view.show(message)
+        if ports is not None:
+            _stay(ends)
     finally:
         recording.flush()
     if save is not None:

@@ -15,7 +15,7 @@ from optipmb_schemas import Detections, Message, MessageError, Points, Problem, 
 from optipmb_schemas.codec import MAJOR
 from optipmb_schemas.export import schema_of
 
-from optipmb_client.mcap_files.scene_update import SCHEMA_NAME, scene_schema, scene_update
+from optipmb_client.foxglove_messages import FoxgloveMessages, Shown
 
 __all__ = ["ENCODING", "KINDS", "RecordingWriter"]
 
@@ -53,7 +53,7 @@ class RecordingWriter:
         self._lock = threading.Lock()
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
-        self._shown: dict[str, set[int]] = {}
+        self._foxglove = FoxgloveMessages()
         self._closed = False
         self._size = 0
         self.messages = 0
@@ -85,15 +85,16 @@ class RecordingWriter:
         stamp_ns = getattr(message, "stamp_ns", None)
         stamp_ns = received_ns if stamp_ns is None or stamp_ns < 0 else stamp_ns
         sequence = (getattr(message, "seq", None) or 0) % SEQUENCES
-        scene = None if not isinstance(message, Tracks) else self._scene(message)
+        # Clouds would double the size of the file: they are shown live alone.
+        shown = [] if message is None or isinstance(message, Points) else list(self._foxglove.of(message))
         with self._lock:
             if self._closed:
                 return None
             channel = self._channel(key, kind, payload, encoding)
             self._writer.add_message(channel, received_ns, payload, stamp_ns, sequence)
             self.messages += 1
-            if scene is not None:
-                self._writer.add_message(self._scene_channel(key), received_ns, scene, stamp_ns, sequence)
+            for one in shown:
+                self._writer.add_message(self._shown_channel(key, one), received_ns, one.payload, stamp_ns, sequence)
         return message
 
     def flush(self) -> int:
@@ -113,12 +114,6 @@ class RecordingWriter:
                 self._size = self._file.tell()
                 self._file.close()
 
-    def _scene(self, tracks: Tracks) -> bytes:
-        shown = set(tracks.id.tolist())
-        gone = sorted(self._shown.get(tracks.stream, set()) - shown)
-        self._shown[tracks.stream] = shown
-        return scene_update(tracks, gone)
-
     def _channel(self, key: str, kind: type[Message], payload: bytes, encoding: str) -> int:
         """Return the channel of a key and encoding: a publisher may change from msgpack to JSON."""
         if (key, encoding) not in self._channels:
@@ -131,10 +126,11 @@ class RecordingWriter:
             self._channels[key, encoding] = self._writer.register_channel(key, form, self._schemas[name], about)
         return self._channels[key, encoding]
 
-    def _scene_channel(self, key: str) -> int:
-        topic = f"{key}/scene"
+    def _shown_channel(self, key: str, one: Shown) -> int:
+        topic = f"{key}{one.end}"
         if (topic, "") not in self._channels:
-            if SCHEMA_NAME not in self._schemas:
-                self._schemas[SCHEMA_NAME] = self._writer.register_schema(SCHEMA_NAME, "protobuf", scene_schema())
-            self._channels[topic, ""] = self._writer.register_channel(topic, "protobuf", self._schemas[SCHEMA_NAME])
+            name = one.schema.name
+            if name not in self._schemas:
+                self._schemas[name] = self._writer.register_schema(name, one.schema.encoding, one.schema.data)
+            self._channels[topic, ""] = self._writer.register_channel(topic, one.encoding, self._schemas[name])
         return self._channels[topic, ""]
