@@ -9,7 +9,7 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints
-.PHONY: help demo test bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) stack install lint types tests schemas wheel clean tune ablate
+.PHONY: help demo test bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    everything that CI runs: lint, types, tests, schemas, wheel, demo"
@@ -19,7 +19,7 @@ help:
 	@echo "make kills   kill the service a hundred times while recorded frames stream through it, and compare (needs KITTI)"
 	@echo "make soak    load the service for an hour, and see that nothing grows and every message is counted"
 	@echo "make fuzz    search for bytes that the decoders neither read nor refuse, FUZZ_S=1800 seconds per decoder"
-	@echo "make stack   run the compose file's stack as processes and show that it works (needs Debian's prometheus)"
+	@echo "make containers  build the image, run the compose file's stack in containers, and show that it works"
 	@echo "make tune    make the tuned profiles anew from DATA=... (out/tune-*/tuned.toml) and compare them with those that ship"
 	@echo "make ablate  print the tables of docs/ablation.md anew from DATA=..."
 	@echo "make clean   remove the virtual environment and everything generated"
@@ -42,8 +42,9 @@ $(DEMO)/bin/optipmb:
 demo: $(DEMO)/bin/optipmb
 	$(DEMO)/bin/optipmb demo --out out/demo
 
-stack: install
-	$(BIN)/python docker/stack.py --work out/stack
+# OPTIONAL=--optional: said clearly, and no failure, where no container engine runs.
+containers: install
+	$(BIN)/python docker/containers.py $(OPTIONAL)
 
 test: lint types tests schemas wheel
 	$(MAKE) demo

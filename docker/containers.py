@@ -1,0 +1,406 @@
+#!/usr/bin/env python3
+"""Builds the image, runs the compose file's stack in containers, and shows that it does what it says; prints a table.
+
+make containers
+
+Docker is used where it answers, else Podman (`sh docker/install-engine.sh` installs it on Debian). Images that cannot
+be pulled are made from Debian's packages under the same names; the table says which. The stack has a project name of
+its own and is removed at the end with its networks and volumes; images are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import signal
+import sys
+import tempfile
+import time
+import urllib.parse
+import urllib.request
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import container_engine
+import image_scan
+import yaml
+from container_engine import Engine, EngineError, NoEngineError, SystemLog
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+HERE: Final = Path(__file__).parent
+COMPOSE: Final = HERE / "compose.yaml"
+PROJECT: Final = "optipmb-check"
+OURS: Final = "optipmb:local"
+LABEL: Final = "com.docker.compose"
+CLIENT: Final = "client"
+DATA: Final = "--dataset scene --sequences 0001 --option frames=200"
+KILL_AT: Final = 60
+"""Frames after which the service that tracks is killed; checkpoints are a second old at most, which is ten frames."""
+READY_S: Final = 60.0
+WAIT_S: Final = 90.0
+INTERVALS: Final = {"$__rate_interval": "20s"}
+"""Grafana's own variables: four scrape intervals."""
+TERMINATED: Final = 128 + signal.SIGTERM
+STATUSES: Final = {"replay": TERMINATED}
+"""Exit statuses after the stop signal that are not 0: the replay is interrupted in what it does."""
+CONFINED: Final = """\
+id -u
+sed -n 's/^\\(CapEff\\|CapBnd\\|NoNewPrivs\\|Seccomp\\):\\t*/\\1=/p' /proc/1/status
+for place in / /opt/optipmb /etc /tmp; do touch $place/trial 2>/dev/null && echo writes=$place; done; rm -f /tmp/trial
+cat /sys/fs/cgroup/memory.max /sys/fs/cgroup/memory/memory.limit_in_bytes 2>/dev/null | sed 's/^/memory=/'
+awk '$2 == "/tmp" { print "tmp=" $4 }' /proc/mounts
+"""
+
+
+class CheckError(Exception):
+    """Something does not do what it should; the text says what."""
+
+
+class Check:
+    """One run through everything.
+
+    Args:
+        found: the engine.
+        work: folder for logs and what is made on the way.
+    """
+
+    def __init__(self, found: Engine, work: Path) -> None:
+        self.engine = found
+        self.work = work
+        self.rows: list[tuple[str, str, str]] = []
+        services: dict[str, dict[str, Any]] = yaml.safe_load(COMPOSE.read_text(encoding="utf-8"))["services"]
+        self.services = {name: one for name, one in services.items() if "profiles" not in one}
+        self.ours = [name for name, one in self.services.items() if one["image"] == OURS]
+        self.checked = [name for name in self.ours if not self.services[name].get("healthcheck", {}).get("disable")]
+
+    def show(self, step: str, what: str, figure: str = "") -> None:
+        """Note what a step has shown, and print it at once."""
+        self.rows.append((step, what, figure))
+        print(f"{time.strftime('%H:%M:%S')} {step}: {what}{f' ({figure})' if figure else ''}", flush=True)
+
+    def table(self) -> str:
+        """Everything that was shown, as Markdown."""
+        rows = [("step", "shown", "figure"), ("---", "---", "---"), *self.rows]
+        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+    def images(self) -> None:
+        """Build ours as the Dockerfile has it, and get those of others."""
+        settings, hosts = container_engine.index_settings()
+        began = time.monotonic()
+        with tempfile.TemporaryDirectory() as secret:
+            secrets = container_engine.secrets(Path(secret), settings) if settings else []
+            options = [*self.engine.build_options(), *secrets, "--file", str(HERE / "Dockerfile"), "--tag", OURS]
+            log = self.engine.run("build", *options, str(HERE.parent))
+        (self.work / "build.log").write_text(log, encoding="utf-8")
+        self.show("image", "built from the Dockerfile as it ships", f"{time.monotonic() - began:.0f} s")
+        base = self.engine.inspect(container_engine.PYTHON_IMAGE)
+        archive = self.work / "image.tar"
+        try:
+            self.engine.run("save", "--output", str(archive), OURS)
+            found = image_scan.scan(archive, len(base["RootFS"]["Layers"]), hosts)
+        finally:
+            archive.unlink(missing_ok=True)
+        if found.wrong:
+            raise CheckError("in the image:\n" + "\n".join(found.wrong))
+        size = f"{found.bytes / 1e6:.0f} MB, {found.added / 1e6:.0f} MB of them above the base image"
+        self.show("size", "of all layers, not compressed", size)
+        what = "only root can write, but in the volume; no program runs as its owner or its group; in our layers no "
+        self.show("scan", what + "settings of pip, keys, tokens, passwords or private hosts", f"{found.files} files")
+        for name, service in list(self.services.items()):
+            if service["image"] == OURS:
+                continue
+            try:
+                self.show(f"image of {name}", self.engine.image(service["image"], self.work))
+            except EngineError as error:
+                self.show(f"image of {name}", f"left out: {error}")
+                del self.services[name]
+
+    def start(self) -> None:
+        """Start the stack and a client beside it, and wait until all that have a health check are healthy."""
+        began = time.monotonic()
+        self.compose("up", "-d", "--no-build", *self.services)
+        labels = f"--label {LABEL}.project={PROJECT} --label {LABEL}.service={CLIENT}"
+        confined = f"--read-only --tmpfs /tmp --cap-drop ALL --stop-signal KILL --network {PROJECT}_default"
+        self.engine.run(*f"run --detach {labels} {confined} --entrypoint sleep {OURS} 1800".split())
+        waiting = set(self.checked)
+        ready = {}
+        while waiting:
+            for name in sorted(waiting):
+                if self.healthy(name):
+                    ready[name] = time.monotonic() - began
+                    waiting.discard(name)
+            if time.monotonic() - began > READY_S:
+                raise CheckError(f"not healthy after {READY_S:g} s: {', '.join(sorted(waiting))}")
+            time.sleep(0.2)
+        what = f"{len(self.services)} containers on a network; health checks of {', '.join(sorted(ready))} hold"
+        self.show("start", what, f"healthy {max(ready.values()):.1f} s after `up`")
+        starts = {name: _wait(partial(self.ready_s, name), f"{name} is ready") for name in self.checked}
+        self.show("time to ready", "from the start of the container to the service's own word", _seconds(starts))
+        if self.engine.works("exec", self.container(CLIENT), "optipmb-service", "health"):
+            raise CheckError("the health check holds where no service runs")
+        self.show("health check", "fails in a container where no service runs")
+
+    def confinement(self) -> None:
+        """Ask from inside what each container may do."""
+        for name in self.ours:
+            said = self.engine.run("exec", self.container(name), "sh", "-c", CONFINED).split()
+            facts = dict(word.partition("=")[::2] for word in said)
+            expected = {"CapEff": "0" * 16, "CapBnd": "0" * 16, "NoNewPrivs": "1", "Seccomp": "2"}
+            limit = _bytes(self.services[name]["deploy"]["resources"]["limits"]["memory"])
+            expected |= {"writes": "/tmp", "memory": str(limit)}
+            wrong = {key: facts.get(key) for key, value in expected.items() if facts.get(key) != value}
+            if wrong or said[0] != str(image_scan.USER) or "size=65536k" not in facts["tmp"]:
+                raise CheckError(f"{name} is not confined as the compose file says: {said}")
+        what = "user 10001, no capabilities, no new privileges, system calls filtered, read-only but for 64 MB of /tmp"
+        self.show("confinement", f"{what}, memory limited: as the kernel says inside {', '.join(self.ours)}")
+
+    def network(self) -> None:
+        """Names resolve inside, and ports are open on the loopback only."""
+        client = self.container(CLIENT)
+        for name in self.services:
+            if name != "replay" and not self.engine.works("exec", client, "getent", "hosts", name):
+                raise CheckError(f"the name {name} does not resolve")
+        published = []
+        for name in self.services:
+            ports = self.engine.inspect(self.container(name))["NetworkSettings"]["Ports"] or {}
+            published += [(one["HostIp"], one["HostPort"]) for bound in ports.values() for one in bound or []]
+        if {host for host, _ in published} != {"127.0.0.1"}:
+            raise CheckError(f"ports are open to others: {published}")
+        with urllib.request.urlopen("http://127.0.0.1:8080/readyz", timeout=10) as answer:
+            state = json.load(answer)["state"]
+        self.show("network", "services have names; ports open on 127.0.0.1 only", f"service-a says {state} on the host")
+
+    def takeover(self) -> None:
+        """Replay a scene, kill the service that tracks it, and compare the result with tracking in one process."""
+        client = self.container(CLIENT)
+        self.engine.run("exec", client, "sh", "-c", f"optipmb track {DATA} --out /tmp/track --json")
+        command = f"optipmb replay {DATA} --speed 1 --patience 30 --connect tcp/router:7447 --out /tmp/replay --json"
+        with ThreadPoolExecutor(1) as pool:
+            replay = pool.submit(self.engine.run, "exec", client, "sh", "-c", command)
+            owner = _wait(lambda: self.owner(KILL_AT), f"{KILL_AT} frames of the replay were tracked")
+            before = self.container(owner)
+            restarts = self.restarts(before)
+            # From outside, as the kernel does when memory runs out: `kill` of the engine would count as wanted.
+            end = f"kill -KILL {self.engine.inspect(before)['State']['Pid']}"
+            self.engine.run(*f"run --rm --pid host --user 0:0 --entrypoint sh {OURS} -c".split(), end)
+            other = _wait(
+                lambda: (found := self.owner(KILL_AT)) != owner and found, "another service tracks the stream"
+            )
+            result = json.loads(replay.result())
+        (sequence,) = result["sequences"]
+        if (sequence["returned"], sequence["missing"]) != (sequence["frames"], 0):
+            raise CheckError(f"frames are missing: {sequence}")
+        if not self.engine.works("exec", client, "cmp", *(f"/tmp/{one}/0001.txt" for one in ("track", "replay"))):
+            raise CheckError("the tracks are not those of a run without a kill")
+        what = f"SIGKILL to {owner} in a replay; {other} goes on: {sequence['frames']} frames of {sequence['frames']}, "
+        waited = f"no frame waited longer than {result['latency']['max_ms'] / 1e3:.2f} s"
+        self.show("takeover", f"{what}ids, boxes and times byte-equal to tracking without a service", waited)
+        began = time.monotonic()
+        _wait(lambda: self.restarts(before) > restarts and self.healthy(owner), f"{owner} is healthy again")
+        self.show(
+            "restart", f"`restart: always` starts {owner} again", f"healthy {time.monotonic() - began:.1f} s later"
+        )
+
+    def metrics(self) -> None:
+        """Prometheus takes its configuration, scrapes everybody, and answers every query of the dashboard."""
+        self.engine.run(
+            "exec", self.container("prometheus"), "promtool", "check", "config", "/etc/prometheus/prometheus.yml"
+        )
+        targets = len(self.checked)
+        _wait(lambda: len(ask('up{job="optipmb"} == 1')) == targets, f"Prometheus scrapes {targets} targets")
+        dashboard = json.loads((HERE / "grafana/dashboards/optipmb.json").read_text(encoding="utf-8"))
+        queries = {target["expr"] for panel in dashboard["panels"] for target in panel["targets"]}
+        waiting = set(queries)
+
+        def answered() -> bool:
+            waiting.difference_update([query for query in waiting if ask(query)])
+            return not waiting
+
+        _wait(answered, f"these queries have data: {waiting}")
+        figure = f"{len(queries)} queries, {targets} targets"
+        self.show(
+            "metrics",
+            "configuration and alerts are valid, all are scraped, each query of the dashboard has data",
+            figure,
+        )
+        if "grafana" in self.services:
+            with urllib.request.urlopen("http://127.0.0.1:3000/api/search?query=", timeout=10) as answer:
+                titles = [one["title"] for one in json.load(answer)]
+            if dashboard["title"] not in titles:
+                raise CheckError(f"Grafana has {titles}, not {dashboard['title']}")
+            self.show("Grafana", "has the dashboard")
+
+    def stop(self) -> None:
+        """End every container by its stop signal, within its time."""
+        ends = {}
+        for name in sorted(self.services, key=lambda name: (name == "router", name != "replay")):
+            container = self.container(name)
+            grace = float(str(self.services[name].get("stop_grace_period", "10s")).rstrip("s"))
+            began = time.monotonic()
+            self.engine.run("stop", container)
+            ends[name] = time.monotonic() - began
+            status = self.engine.inspect(container)["State"]["ExitCode"]
+            if status != STATUSES.get(name, 0) or ends[name] > grace:
+                raise CheckError(f"{name} ended with status {status} after {ends[name]:.1f} s of {grace:g} s")
+        what = f"the stop signal ends all with status 0, the replay with {TERMINATED}"
+        self.show("stop", what, f"{max(ends.values()):.1f} s at most, of {grace:g} s")
+
+    def remove(self) -> None:
+        """Remove containers, networks and volumes of this project, whatever state they are in."""
+        mine = f"label={LABEL}.project={PROJECT}"
+        for name in self.engine.run("ps", "--all", "--quiet", "--filter", mine).split():
+            self.engine.run("rm", "--force", "--volumes", name)
+        with suppress(CheckError):
+            self.compose("down", "--volumes", "--remove-orphans")
+        for kind in (["ps", "--all"], ["network", "ls"], ["volume", "ls"]):
+            left = self.engine.run(*kind, "--quiet", "--filter", mine).split()
+            if left:
+                raise CheckError(f"left behind by {kind}: {left}")
+
+    def logs(self) -> None:
+        """Write what every container has said into the work folder."""
+        for name in self.services:
+            with suppress(EngineError, CheckError):
+                command = [self.engine.program, "logs", self.container(name)]
+                said = container_engine.call(command, self.engine.environment)
+                (self.work / f"{name}.log").write_text(said.stdout + said.stderr, encoding="utf-8")
+
+    def compose(self, *words: str) -> None:
+        """Run a command of the compose tool.
+
+        Raises:
+            CheckError: it fails.
+        """
+        command = [*self.engine.compose, "--project-name", PROJECT, "--file", str(COMPOSE), *words]
+        done = container_engine.call(command, self.engine.environment)
+        if done.returncode:
+            raise CheckError(f"{' '.join(command)}: status {done.returncode}: {done.stderr[-2000:]}")
+
+    def container(self, service: str) -> str:
+        """The container of a service.
+
+        Raises:
+            CheckError: there is not exactly one.
+        """
+        filters = [f"label={LABEL}.project={PROJECT}", f"label={LABEL}.service={service}"]
+        words = [word for one in filters for word in ("--filter", one)]
+        found = self.engine.run("ps", "--all", "--quiet", "--no-trunc", *words).split()
+        if len(found) != 1:
+            raise CheckError(f"{service} has {len(found)} containers")
+        return found[0]
+
+    def healthy(self, service: str) -> bool:
+        """Whether the image's health check holds; Podman runs it when asked, as it needs systemd to do so by itself."""
+        container = self.container(service)
+        if self.engine.program == "podman":
+            return self.engine.works("healthcheck", "run", container)
+        return bool(self.engine.inspect(container)["State"]["Health"]["Status"] == "healthy")
+
+    def restarts(self, container: str) -> int:
+        """How often a container was started again by itself."""
+        return int(self.engine.inspect(container)["RestartCount"])
+
+    def ready_s(self, service: str) -> float:
+        """Seconds from the start of a container to the line in its log that says ready; 0 before that line."""
+        container = self.container(service)
+        text = self.engine.run("logs", "--timestamps", container)
+        said = [line.split()[0] for line in text.splitlines() if line.split()[1:2] == ["ready"]]
+        return _instant(said[0]) - _instant(self.engine.inspect(container)["State"]["StartedAt"]) if said else 0.0
+
+    def owner(self, frames: int) -> str:
+        """The service that tracks the replay's stream and has at least so many frames of it; none: empty."""
+        text = self.engine.run(
+            "exec", self.container(CLIENT), "optipmb", "status", "--json", "--connect", "tcp/router:7447"
+        )
+        for service in json.loads(text)["services"]:
+            for session in service["sessions"]:
+                if session["stream"].endswith("/0001") and session["frames"] >= frames:
+                    return str(service["instance"])
+        return ""
+
+
+def ask(query: str) -> list[Any]:
+    """What Prometheus answers to a query; nothing while it starts."""
+    for name, value in INTERVALS.items():
+        query = query.replace(name, value)
+    url = f"http://127.0.0.1:9090/api/v1/query?{urllib.parse.urlencode({'query': query})}"
+    try:
+        with urllib.request.urlopen(url, timeout=10) as response:
+            return list(json.load(response)["data"]["result"])
+    except urllib.error.HTTPError as error:
+        raise CheckError(f"Prometheus refuses {query}: {error.read().decode()}") from error
+    except OSError:
+        return []
+
+
+def _wait(true: Callable[[], Any], what: str) -> Any:
+    """Ask until the answer is true, and return it."""
+    end = time.monotonic() + WAIT_S
+    while not (answer := true()):
+        if time.monotonic() > end:
+            raise CheckError(f"not within {WAIT_S:g} s: {what}")
+        time.sleep(0.3)
+    return answer
+
+
+def _seconds(values: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.1f} s" for name, value in values.items())
+
+
+def _bytes(text: str) -> int:
+    return int(text[:-1]) << {"k": 10, "m": 20, "g": 30}[text[-1]]
+
+
+def _instant(text: str) -> float:
+    return datetime.fromisoformat(re.sub(r"(\.\d{6})\d*", r"\1", text)).timestamp()
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=Path("out/containers"), help="folder for logs")
+    parser.add_argument("--optional", action="store_true", help="status 0, said clearly, where no engine runs")
+    options = parser.parse_args(arguments)
+    options.work.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    log = SystemLog()
+    try:
+        found, origin = container_engine.find(options.work)
+    except NoEngineError as error:
+        log.close()
+        print(f"NO CONTAINER HAS RUN: {error}", flush=True)
+        return 0 if options.optional else 1
+    check = Check(found, options.work)
+    version = found.run("version", "--format", "{{.Client.Version}}").strip()
+    how = ", with settings for a machine without systemd" if found.restricted else ""
+    check.show("engine", f"{found.program} {version}{how}")
+    check.show("base image", f"{container_engine.PYTHON_IMAGE}: {origin}", f"{time.monotonic() - began:.0f} s")
+    failed = ""
+    try:
+        check.remove()
+        check.images()
+        for step in (check.start, check.confinement, check.network, check.takeover, check.metrics, check.stop):
+            step()
+    except (CheckError, EngineError, OSError, KeyboardInterrupt) as error:
+        failed = str(error) or "interrupted"
+    finally:
+        check.logs()
+        check.remove()
+        log.close()
+    if failed:
+        print(f"FAILED: {failed}\nlogs are in {options.work}", flush=True)
+        return 1
+    check.show("end", "no container, network or volume is left", f"{time.monotonic() - began:.0f} s in all")
+    print(f"\n{check.table()}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
