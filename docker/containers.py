@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import signal
 import sys
 import tempfile
@@ -20,29 +19,22 @@ import time
 import urllib.parse
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import container_engine
 import image_scan
-import yaml
 from container_engine import Engine, EngineError, NoEngineError, SystemLog
+from container_stack import CLIENT, OURS, CheckError, Stack
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 HERE: Final = Path(__file__).parent
-COMPOSE: Final = HERE / "compose.yaml"
-PROJECT: Final = "optipmb-check"
-OURS: Final = "optipmb:local"
-LABEL: Final = "com.docker.compose"
-CLIENT: Final = "client"
-DATA: Final = "--dataset scene --sequences 0001 --option frames=200"
-KILL_AT: Final = 60
-"""Frames after which the service that tracks is killed; checkpoints are a second old at most, which is ten frames."""
+DATA: Final = "--dataset scene --sequences 0001 --option frames=300"
+KILL_AT: Final = 30
+"""Frames after which the service that tracks is killed; the rest is time for a slow machine to do so."""
 READY_S: Final = 60.0
 WAIT_S: Final = 90.0
 INTERVALS: Final = {"$__rate_interval": "20s"}
@@ -54,13 +46,11 @@ CONFINED: Final = """\
 id -u
 sed -n 's/^\\(CapEff\\|CapBnd\\|NoNewPrivs\\|Seccomp\\):\\t*/\\1=/p' /proc/1/status
 for place in / /opt/optipmb /etc /tmp; do touch $place/trial 2>/dev/null && echo writes=$place; done; rm -f /tmp/trial
-cat /sys/fs/cgroup/memory.max /sys/fs/cgroup/memory/memory.limit_in_bytes 2>/dev/null | sed 's/^/memory=/'
-awk '$2 == "/tmp" { print "tmp=" $4 }' /proc/mounts
+cd /sys/fs/cgroup
+cat memory.max memory/memory.limit_in_bytes 2>/dev/null | sed 's/^/memory=/'
+cat cpu.max cpu/cpu.cfs_quota_us cpu/cpu.cfs_period_us 2>/dev/null | xargs | awk '{ print "cpus=" $1 / $2 }'
+awk '$2 == "/" { print "root=" substr($4, 1, 2) } $2 == "/tmp" { print "tmp=" $4 }' /proc/mounts
 """
-
-
-class CheckError(Exception):
-    """Something does not do what it should; the text says what."""
 
 
 class Check:
@@ -75,10 +65,7 @@ class Check:
         self.engine = found
         self.work = work
         self.rows: list[tuple[str, str, str]] = []
-        services: dict[str, dict[str, Any]] = yaml.safe_load(COMPOSE.read_text(encoding="utf-8"))["services"]
-        self.services = {name: one for name, one in services.items() if "profiles" not in one}
-        self.ours = [name for name, one in self.services.items() if one["image"] == OURS]
-        self.checked = [name for name in self.ours if not self.services[name].get("healthcheck", {}).get("disable")]
+        self.stack = Stack(found)
 
     def show(self, step: str, what: str, figure: str = "") -> None:
         """Note what a step has shown, and print it at once."""
@@ -113,63 +100,67 @@ class Check:
         self.show("size", "of all layers, not compressed", size)
         what = "only root can write, but in the volume; no program runs as its owner or its group; in our layers no "
         self.show("scan", what + "settings of pip, keys, tokens, passwords or private hosts", f"{found.files} files")
-        for name, service in list(self.services.items()):
+        for name, service in list(self.stack.services.items()):
             if service["image"] == OURS:
                 continue
             try:
                 self.show(f"image of {name}", self.engine.image(service["image"], self.work))
             except EngineError as error:
                 self.show(f"image of {name}", f"left out: {error}")
-                del self.services[name]
+                del self.stack.services[name]
 
     def start(self) -> None:
         """Start the stack and a client beside it, and wait until all that have a health check are healthy."""
         began = time.monotonic()
-        self.compose("up", "-d", "--no-build", *self.services)
-        labels = f"--label {LABEL}.project={PROJECT} --label {LABEL}.service={CLIENT}"
-        confined = f"--read-only --tmpfs /tmp --cap-drop ALL --stop-signal KILL --network {PROJECT}_default"
-        self.engine.run(*f"run --detach {labels} {confined} --entrypoint sleep {OURS} 1800".split())
-        waiting = set(self.checked)
+        self.stack.start()
+        waiting = set(self.stack.checked)
         ready = {}
         while waiting:
             for name in sorted(waiting):
-                if self.healthy(name):
+                if self.stack.healthy(name):
                     ready[name] = time.monotonic() - began
                     waiting.discard(name)
             if time.monotonic() - began > READY_S:
                 raise CheckError(f"not healthy after {READY_S:g} s: {', '.join(sorted(waiting))}")
             time.sleep(0.2)
-        what = f"{len(self.services)} containers on a network; health checks of {', '.join(sorted(ready))} hold"
+        what = f"{len(self.stack.services)} containers on a network; health checks of {', '.join(sorted(ready))} hold"
         self.show("start", what, f"healthy {max(ready.values()):.1f} s after `up`")
-        starts = {name: _wait(partial(self.ready_s, name), f"{name} is ready") for name in self.checked}
+        starts = {name: _wait(partial(self.stack.ready_s, name), f"{name} is ready") for name in self.stack.checked}
         self.show("time to ready", "from the start of the container to the service's own word", _seconds(starts))
-        if self.engine.works("exec", self.container(CLIENT), "optipmb-service", "health"):
+        if self.engine.works("exec", self.stack.container(CLIENT), "optipmb-service", "health"):
             raise CheckError("the health check holds where no service runs")
         self.show("health check", "fails in a container where no service runs")
 
     def confinement(self) -> None:
         """Ask from inside what each container may do."""
-        for name in self.ours:
-            said = self.engine.run("exec", self.container(name), "sh", "-c", CONFINED).split()
+        for name in self.stack.ours:
+            said = self.engine.run("exec", self.stack.container(name), "sh", "-c", CONFINED).split()
             facts = dict(word.partition("=")[::2] for word in said)
             expected = {"CapEff": "0" * 16, "CapBnd": "0" * 16, "NoNewPrivs": "1", "Seccomp": "2"}
-            limit = _bytes(self.services[name]["deploy"]["resources"]["limits"]["memory"])
-            expected |= {"writes": "/tmp", "memory": str(limit)}
+            limits = self.stack.services[name]["deploy"]["resources"]["limits"]
+            expected |= {
+                "root": "ro",
+                "writes": "/tmp",
+                "memory": str(_bytes(limits["memory"])),
+                "cpus": limits["cpus"],
+            }
             wrong = {key: facts.get(key) for key, value in expected.items() if facts.get(key) != value}
             if wrong or said[0] != str(image_scan.USER) or "size=65536k" not in facts["tmp"]:
                 raise CheckError(f"{name} is not confined as the compose file says: {said}")
-        what = "user 10001, no capabilities, no new privileges, system calls filtered, read-only but for 64 MB of /tmp"
-        self.show("confinement", f"{what}, memory limited: as the kernel says inside {', '.join(self.ours)}")
+        what = "user 10001, no capabilities, no new privileges, seccomp, read-only but for 64 MB of /tmp, "
+        self.show(
+            "confinement", f"{what}memory and processors limited, as seen from inside {', '.join(self.stack.ours)}"
+        )
 
     def network(self) -> None:
         """Names resolve inside, and ports are open on the loopback only."""
-        client = self.container(CLIENT)
-        for name in self.services:
+        client = self.stack.container(CLIENT)
+        for name in self.stack.services:
             if name != "replay" and not self.engine.works("exec", client, "getent", "hosts", name):
                 raise CheckError(f"the name {name} does not resolve")
         published = []
-        for name in self.services:
-            ports = self.engine.inspect(self.container(name))["NetworkSettings"]["Ports"] or {}
+        for name in self.stack.services:
+            ports = self.engine.inspect(self.stack.container(name))["NetworkSettings"]["Ports"] or {}
             published += [(one["HostIp"], one["HostPort"]) for bound in ports.values() for one in bound or []]
         if {host for host, _ in published} != {"127.0.0.1"}:
             raise CheckError(f"ports are open to others: {published}")
@@ -179,31 +170,33 @@ class Check:
 
     def takeover(self) -> None:
         """Replay a scene, kill the service that tracks it, and compare the result with tracking in one process."""
-        client = self.container(CLIENT)
+        client = self.stack.container(CLIENT)
         self.engine.run("exec", client, "sh", "-c", f"optipmb track {DATA} --out /tmp/track --json")
         command = f"optipmb replay {DATA} --speed 1 --patience 30 --connect tcp/router:7447 --out /tmp/replay --json"
         with ThreadPoolExecutor(1) as pool:
             replay = pool.submit(self.engine.run, "exec", client, "sh", "-c", command)
-            owner = _wait(lambda: self.owner(KILL_AT), f"{KILL_AT} frames of the replay were tracked")
-            before = self.container(owner)
-            restarts = self.restarts(before)
+            owner = _wait(lambda: self.stack.owner(KILL_AT), f"{KILL_AT} frames of the replay were tracked")
+            before = self.stack.container(owner)
+            restarts = self.stack.restarts(before)
             # From outside, as the kernel does when memory runs out: `kill` of the engine would count as wanted.
             end = f"kill -KILL {self.engine.inspect(before)['State']['Pid']}"
             self.engine.run(*f"run --rm --pid host --user 0:0 --entrypoint sh {OURS} -c".split(), end)
-            other = _wait(
-                lambda: (found := self.owner(KILL_AT)) != owner and found, "another service tracks the stream"
-            )
             result = json.loads(replay.result())
+        ended = [name for name in self.stack.checked for stream in self.stack.closed(name) if stream.endswith("/0001")]
+        if len(ended) != 1 or ended[0] == owner:
+            raise CheckError(f"{owner} was killed, and the replay's stream was closed by {ended}")
         (sequence,) = result["sequences"]
         if (sequence["returned"], sequence["missing"]) != (sequence["frames"], 0):
             raise CheckError(f"frames are missing: {sequence}")
         if not self.engine.works("exec", client, "cmp", *(f"/tmp/{one}/0001.txt" for one in ("track", "replay"))):
             raise CheckError("the tracks are not those of a run without a kill")
-        what = f"SIGKILL to {owner} in a replay; {other} goes on: {sequence['frames']} frames of {sequence['frames']}, "
+        what = (
+            f"SIGKILL to {owner} in a replay; {ended[0]} goes on: {sequence['frames']} frames of {sequence['frames']}, "
+        )
         waited = f"no frame waited longer than {result['latency']['max_ms'] / 1e3:.2f} s"
         self.show("takeover", f"{what}ids, boxes and times byte-equal to tracking without a service", waited)
         began = time.monotonic()
-        _wait(lambda: self.restarts(before) > restarts and self.healthy(owner), f"{owner} is healthy again")
+        _wait(lambda: self.stack.restarts(before) > restarts and self.stack.healthy(owner), f"{owner} is healthy again")
         self.show(
             "restart", f"`restart: always` starts {owner} again", f"healthy {time.monotonic() - began:.1f} s later"
         )
@@ -211,9 +204,9 @@ class Check:
     def metrics(self) -> None:
         """Prometheus takes its configuration, scrapes everybody, and answers every query of the dashboard."""
         self.engine.run(
-            "exec", self.container("prometheus"), "promtool", "check", "config", "/etc/prometheus/prometheus.yml"
+            "exec", self.stack.container("prometheus"), "promtool", "check", "config", "/etc/prometheus/prometheus.yml"
         )
-        targets = len(self.checked)
+        targets = len(self.stack.checked)
         _wait(lambda: len(ask('up{job="optipmb"} == 1')) == targets, f"Prometheus scrapes {targets} targets")
         dashboard = json.loads((HERE / "grafana/dashboards/optipmb.json").read_text(encoding="utf-8"))
         queries = {target["expr"] for panel in dashboard["panels"] for target in panel["targets"]}
@@ -230,7 +223,7 @@ class Check:
             "configuration and alerts are valid, all are scraped, each query of the dashboard has data",
             figure,
         )
-        if "grafana" in self.services:
+        if "grafana" in self.stack.services:
             with urllib.request.urlopen("http://127.0.0.1:3000/api/search?query=", timeout=10) as answer:
                 titles = [one["title"] for one in json.load(answer)]
             if dashboard["title"] not in titles:
@@ -240,9 +233,9 @@ class Check:
     def stop(self) -> None:
         """End every container by its stop signal, within its time."""
         ends = {}
-        for name in sorted(self.services, key=lambda name: (name == "router", name != "replay")):
-            container = self.container(name)
-            grace = float(str(self.services[name].get("stop_grace_period", "10s")).rstrip("s"))
+        for name in sorted(self.stack.services, key=lambda name: (name == "router", name != "replay")):
+            container = self.stack.container(name)
+            grace = float(str(self.stack.services[name].get("stop_grace_period", "10s")).rstrip("s"))
             began = time.monotonic()
             self.engine.run("stop", container)
             ends[name] = time.monotonic() - began
@@ -251,79 +244,6 @@ class Check:
                 raise CheckError(f"{name} ended with status {status} after {ends[name]:.1f} s of {grace:g} s")
         what = f"the stop signal ends all with status 0, the replay with {TERMINATED}"
         self.show("stop", what, f"{max(ends.values()):.1f} s at most, of {grace:g} s")
-
-    def remove(self) -> None:
-        """Remove containers, networks and volumes of this project, whatever state they are in."""
-        mine = f"label={LABEL}.project={PROJECT}"
-        for name in self.engine.run("ps", "--all", "--quiet", "--filter", mine).split():
-            self.engine.run("rm", "--force", "--volumes", name)
-        with suppress(CheckError):
-            self.compose("down", "--volumes", "--remove-orphans")
-        for kind in (["ps", "--all"], ["network", "ls"], ["volume", "ls"]):
-            left = self.engine.run(*kind, "--quiet", "--filter", mine).split()
-            if left:
-                raise CheckError(f"left behind by {kind}: {left}")
-
-    def logs(self) -> None:
-        """Write what every container has said into the work folder."""
-        for name in self.services:
-            with suppress(EngineError, CheckError):
-                command = [self.engine.program, "logs", self.container(name)]
-                said = container_engine.call(command, self.engine.environment)
-                (self.work / f"{name}.log").write_text(said.stdout + said.stderr, encoding="utf-8")
-
-    def compose(self, *words: str) -> None:
-        """Run a command of the compose tool.
-
-        Raises:
-            CheckError: it fails.
-        """
-        command = [*self.engine.compose, "--project-name", PROJECT, "--file", str(COMPOSE), *words]
-        done = container_engine.call(command, self.engine.environment)
-        if done.returncode:
-            raise CheckError(f"{' '.join(command)}: status {done.returncode}: {done.stderr[-2000:]}")
-
-    def container(self, service: str) -> str:
-        """The container of a service.
-
-        Raises:
-            CheckError: there is not exactly one.
-        """
-        filters = [f"label={LABEL}.project={PROJECT}", f"label={LABEL}.service={service}"]
-        words = [word for one in filters for word in ("--filter", one)]
-        found = self.engine.run("ps", "--all", "--quiet", "--no-trunc", *words).split()
-        if len(found) != 1:
-            raise CheckError(f"{service} has {len(found)} containers")
-        return found[0]
-
-    def healthy(self, service: str) -> bool:
-        """Whether the image's health check holds; Podman runs it when asked, as it needs systemd to do so by itself."""
-        container = self.container(service)
-        if self.engine.program == "podman":
-            return self.engine.works("healthcheck", "run", container)
-        return bool(self.engine.inspect(container)["State"]["Health"]["Status"] == "healthy")
-
-    def restarts(self, container: str) -> int:
-        """How often a container was started again by itself."""
-        return int(self.engine.inspect(container)["RestartCount"])
-
-    def ready_s(self, service: str) -> float:
-        """Seconds from the start of a container to the line in its log that says ready; 0 before that line."""
-        container = self.container(service)
-        text = self.engine.run("logs", "--timestamps", container)
-        said = [line.split()[0] for line in text.splitlines() if line.split()[1:2] == ["ready"]]
-        return _instant(said[0]) - _instant(self.engine.inspect(container)["State"]["StartedAt"]) if said else 0.0
-
-    def owner(self, frames: int) -> str:
-        """The service that tracks the replay's stream and has at least so many frames of it; none: empty."""
-        text = self.engine.run(
-            "exec", self.container(CLIENT), "optipmb", "status", "--json", "--connect", "tcp/router:7447"
-        )
-        for service in json.loads(text)["services"]:
-            for session in service["sessions"]:
-                if session["stream"].endswith("/0001") and session["frames"] >= frames:
-                    return str(service["instance"])
-        return ""
 
 
 def ask(query: str) -> list[Any]:
@@ -358,10 +278,6 @@ def _bytes(text: str) -> int:
     return int(text[:-1]) << {"k": 10, "m": 20, "g": 30}[text[-1]]
 
 
-def _instant(text: str) -> float:
-    return datetime.fromisoformat(re.sub(r"(\.\d{6})\d*", r"\1", text)).timestamp()
-
-
 def main(arguments: list[str]) -> int:
     """Run the command line; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -384,15 +300,15 @@ def main(arguments: list[str]) -> int:
     check.show("base image", f"{container_engine.PYTHON_IMAGE}: {origin}", f"{time.monotonic() - began:.0f} s")
     failed = ""
     try:
-        check.remove()
+        check.stack.remove()
         check.images()
         for step in (check.start, check.confinement, check.network, check.takeover, check.metrics, check.stop):
             step()
     except (CheckError, EngineError, OSError, KeyboardInterrupt) as error:
         failed = str(error) or "interrupted"
     finally:
-        check.logs()
-        check.remove()
+        check.stack.logs(options.work)
+        check.stack.remove()
         log.close()
     if failed:
         print(f"FAILED: {failed}\nlogs are in {options.work}", flush=True)
