@@ -19,9 +19,9 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from optipmb_schemas import PREFIX, Detections, Keys, MessageError, Points, Pose, encode, encoding_of
+from optipmb_schemas import PREFIX, Detections, Keys, MessageError, Points, Pose
 
-from optipmb_client.transport import Connection
+from optipmb_client.links import Link, linked
 
 __all__ = ["Publisher"]
 
@@ -39,8 +39,9 @@ class Publisher:
 
     Args:
         stream: Name of the stream, `site/node/sensor`. One publisher per stream at a time.
-        connect: Endpoint or endpoints of routers, such as `tcp/10.0.0.1:7447`; default: this machine.
-        config: A Zenoh configuration file, for TLS, passwords and the like.
+        connect: Endpoint or endpoints of routers, such as `tcp/10.0.0.1:7447`, or of gRPC gateways, such as
+            `grpc://10.0.0.1:50051`; default: this machine.
+        config: A Zenoh configuration file, for TLS, passwords and the like; for gRPC the folder of the certificates.
         frame: Frame of all boxes and points given to `publish`.
         timeout: Seconds to wait for a router.
         connection: Share an open connection (it stays open) in the place of `connect` and `config`.
@@ -51,7 +52,7 @@ class Publisher:
         prefix: First part of all keys, as configured in the service.
 
     Raises:
-        ConnectionFailed: No router within `timeout`.
+        ConnectionFailed: No router, or gateway, within `timeout`.
         MessageError: `stream` is no stream name.
     """
 
@@ -63,13 +64,12 @@ class Publisher:
         frame: Literal["sensor", "world"] = "sensor",
         config: str | Path | None = None,
         timeout: float = 5.0,
-        connection: Connection | None = None,
+        connection: Link | None = None,
         cache: int = CACHE,
         cache_clouds: int = 0,
         prefix: str = PREFIX,
     ) -> None:
-        keys = Keys(prefix)
-        detections, points = keys.detections(stream), keys.points(stream)
+        Keys(prefix).detections(stream)  # checks both
         self.stream = stream
         self.frame = frame
         self.epoch = secrets.token_bytes(16)  # tells this run of the publisher from the next one
@@ -77,11 +77,10 @@ class Publisher:
         self._seq = 0
         self._points_seq = 0
         self._order = threading.Lock()  # sequence numbers go out in order
-        self._own = Connection(connect, config=config, timeout=timeout) if connection is None else None
+        self._own = linked(connect, config=config, timeout=timeout) if connection is None else None
         link = connection or self._own
         assert link is not None  # noqa: S101  one of the two is there: said for the type checker
-        self._detections = link.cached_sender(detections, encoding_of(Detections), cache=cache)
-        self._points = link.plain_sender(points, encoding_of(Points), cache=cache_clouds)
+        self._detections, self._points = link.senders(stream, prefix=prefix, cache=cache, cache_clouds=cache_clouds)
 
     def __enter__(self) -> Self:
         return self
@@ -169,7 +168,7 @@ class Publisher:
                 score=_array(score),
                 has_points=has_points,
             )
-            payload = encode(message)
+            payload = self._detections.pack(message)
             if cloud is not None:
                 self._points.put(cloud)
                 self._points_seq += 1
@@ -197,7 +196,7 @@ class Publisher:
             return self._points_seq - 1
 
     def _encode_points(self, stamp_ns: int, points: ArrayLike, pose: PoseLike | None) -> bytes:
-        return encode(
+        return self._points.pack(
             Points(
                 stream=self.stream,
                 epoch=self.epoch,

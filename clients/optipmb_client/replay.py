@@ -20,11 +20,11 @@ from pathlib import Path
 from optipmb_schemas import PREFIX, Problem, SessionParameters, Tracks
 
 from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame
+from optipmb_client.links import Link
 from optipmb_client.publisher import Publisher
 from optipmb_client.recording import Latency, Results, latency, selected_frames
 from optipmb_client.sessions import close_session, set_parameters
 from optipmb_client.subscriber import Subscriber
-from optipmb_client.transport import Connection
 
 __all__ = ["Pace", "ReplayedSequence", "replay"]
 
@@ -79,7 +79,7 @@ class ReplayedSequence:
 
 
 def replay(  # noqa: PLR0913  one argument per decision of the caller
-    connection: Connection,
+    connection: Link,
     dataset: Dataset,
     sequences: Sequence[DataSequence],
     out: Path,
@@ -150,7 +150,7 @@ def _replay_and_write(one: "_Replay") -> ReplayedSequence:
 class _Task:
     """What the sequences of one replay share."""
 
-    connection: Connection
+    connection: Link
     results: Results
     profile: str
     pace: Pace

@@ -19,6 +19,7 @@ from optipmb_schemas import (
 )
 
 from optipmb_client.errors import ServiceRefused, ServiceUnavailable
+from optipmb_client.links import Link
 from optipmb_client.transport import Answer, Connection
 
 __all__ = ["close_session", "find_services", "move_stream", "set_parameters"]
@@ -31,7 +32,7 @@ Message = TypeVar("Message", SessionParameters, SessionState, ServiceStatus, Mov
 
 
 def set_parameters(
-    connection: Connection,
+    connection: Link,
     stream: str,
     parameters: SessionParameters,
     *,
@@ -57,7 +58,7 @@ def set_parameters(
         time.sleep(RETRY_S)
 
 
-def close_session(connection: Connection, stream: str, *, prefix: str = PREFIX) -> SessionState | None:
+def close_session(connection: Link, stream: str, *, prefix: str = PREFIX) -> SessionState | None:
     """End the session of a stream and free what it holds; None when no service answers, or it says no."""
     key = Keys(prefix).query(stream, "reset")
     asked = connection.query(key, encode(ResetRequest(close=True)), encoding_of(ResetRequest), timeout=QUERY_S)

@@ -10,10 +10,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from optipmb_schemas import PREFIX, Keys, MessageError, Problem, Tracks, decode
+from optipmb_schemas import PREFIX, Keys, MessageError, Problem, Tracks
 
+from optipmb_client.links import Link, linked
 from optipmb_client.merging import Merging, Novelty
-from optipmb_client.transport import Arrival, Connection, Inbox
+from optipmb_client.transport import Arrival, Inbox
 
 __all__ = ["Received", "Statistics", "Subscriber"]
 
@@ -60,19 +61,20 @@ class Subscriber:
 
     Args:
         pattern: Name of a stream, `site/node/sensor`, or a pattern with `*` in the place of names: `garage/*/*`.
-        connect: Endpoint or endpoints of routers, such as `tcp/10.0.0.1:7447`; default: this machine.
+        connect: Endpoint or endpoints of routers, such as `tcp/10.0.0.1:7447`, or of gRPC gateways, such as
+            `grpc://10.0.0.1:50051`; default: this machine.
         timeout: Iterating ends when nothing has come for so many seconds; None: never.
         on_problem: Called with each `Problem` that the service reports for these streams (refused messages and the
             like), by the thread that iterates.
         corrections: Whether messages that replace earlier ones are given out too.
         queue: Number of messages that may wait.
-        config: A Zenoh configuration file, for TLS, passwords and the like.
+        config: A Zenoh configuration file, for TLS, passwords and the like; for gRPC the folder of the certificates.
         connection: Share an open connection (it stays open) in the place of `connect` and `config`.
         connect_timeout: Seconds to wait for a router.
         prefix: First part of all keys, as configured in the service.
 
     Raises:
-        ConnectionFailed: No router within `connect_timeout`.
+        ConnectionFailed: No router, or gateway, within `connect_timeout`.
         MessageError: `pattern` is neither the name of a stream nor such a pattern.
     """
 
@@ -86,12 +88,11 @@ class Subscriber:
         corrections: bool = True,
         queue: int = 1024,
         config: str | Path | None = None,
-        connection: Connection | None = None,
+        connection: Link | None = None,
         connect_timeout: float = 5.0,
         prefix: str = PREFIX,
     ) -> None:
-        keys = Keys(prefix)
-        tracks, problems = keys.matching(pattern, "tracks"), keys.matching(pattern, "problems")
+        Keys(prefix).matching(pattern, "tracks")  # checks both
         self.timeout = timeout
         self._on_problem = on_problem
         self._merging = Merging(REMEMBERED)
@@ -101,12 +102,10 @@ class Subscriber:
         self._repeated = 0
         self._invalid = 0
         self._inbox = Inbox(queue)
-        self._own = Connection(connect, config=config, timeout=connect_timeout) if connection is None else None
+        self._own = linked(connect, config=config, timeout=connect_timeout) if connection is None else None
         link = connection or self._own
         assert link is not None  # noqa: S101  one of the two is there: said for the type checker
-        self._subscriptions = [link.subscribe(tracks, self._inbox)]
-        if on_problem is not None:
-            self._subscriptions.append(link.subscribe(problems, self._inbox))
+        self._subscription = link.subscribe_tracks(pattern, self._inbox, prefix=prefix, problems=on_problem is not None)
 
     def __enter__(self) -> Self:
         return self
@@ -118,8 +117,7 @@ class Subscriber:
 
     def close(self) -> None:
         """End the subscription; a loop over it gets what still waits, then ends. May be called twice."""
-        for subscription in self._subscriptions:
-            subscription.close()
+        self._subscription.close()
         self._inbox.close()
         if self._own is not None:
             self._own.close()
@@ -161,11 +159,11 @@ class Subscriber:
         """Return the tracks that arrived; None for problems, and what is no message of ours."""
         try:
             if arrival.key.endswith("/problems"):
-                problem = decode(arrival.payload, Problem, encoding=arrival.encoding)
+                problem = arrival.read(Problem)
                 if self._on_problem is not None:
                     self._on_problem(problem)
                 return None
-            return decode(arrival.payload, Tracks, encoding=arrival.encoding)
+            return arrival.read(Tracks)
         except MessageError:
             self._invalid += 1
             return None

@@ -23,6 +23,7 @@ from typing import Protocol, Self, TypeVar, cast
 
 import zenoh
 import zenoh.ext
+from optipmb_schemas import Detections, Keys, Message, Points, Topic, decode, encode, encoding_of
 
 from optipmb_client.errors import ConnectionFailed
 
@@ -30,6 +31,8 @@ __all__ = ["DEFAULT_ENDPOINT", "Answer", "Arrival", "Connection", "Inbox", "Send
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CHANNEL = 1024  # samples between Zenoh and the draining thread; larger than any publisher's history
+_Message = TypeVar("_Message", bound=Message)
+
 HEARTBEAT_S = 0.2  # how long the loss of a newest message may stay unnoticed
 WAIT_BEFORE_DROP_US = 50_000  # with the defaults (1 ms) large messages are lost whenever the machine is busy
 WAIT_BEFORE_DROP_FRAGMENTS_US = 500_000
@@ -71,6 +74,14 @@ class Arrival:
     payload: bytes
     encoding: str
     monotonic_ns: int
+
+    def read(self, kind: type[_Message]) -> _Message:
+        """Return the message, checked.
+
+        Raises:
+            MessageError: it is not valid.
+        """
+        return decode(self.payload, kind, encoding=self.encoding)
 
 
 @dataclass(frozen=True)
@@ -141,6 +152,10 @@ class Sender:
         """Whether somebody is known to listen. Always True with a cache: that also serves those who come later."""
         return self._matching is None or self._matching.matching_status.matching
 
+    def pack(self, message: Message) -> bytes:
+        """Return a message as it is sent."""
+        return encode(message)
+
     def put(self, payload: bytes) -> None:
         """Send one message; does not wait for anybody to receive it.
 
@@ -185,6 +200,18 @@ class Subscription:
         with contextlib.suppress(zenoh.ZError):
             self._subscriber.undeclare()
         self._thread.join(timeout=5.0)
+
+
+class Subscriptions:
+    """Several of them, which end together."""
+
+    def __init__(self, subscriptions: Sequence[Subscription]) -> None:
+        self._subscriptions = subscriptions
+
+    def close(self) -> None:
+        """End all; what is in the inbox stays readable."""
+        for subscription in self._subscriptions:
+            subscription.close()
 
 
 _Opened = TypeVar("_Opened", Sender, Subscription)
@@ -301,6 +328,19 @@ class Connection:
                 recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
             )
         return self._keep(Subscription(subscriber, inbox))
+
+    def senders(self, stream: str, *, prefix: str, cache: int, cache_clouds: int) -> tuple[Sender, Sender]:
+        """Open what sends the detections and the clouds of a stream, each keeping the newest for recovery."""
+        keys = Keys(prefix)
+        return (
+            self.cached_sender(keys.detections(stream), encoding_of(Detections), cache=cache),
+            self.plain_sender(keys.points(stream), encoding_of(Points), cache=cache_clouds),
+        )
+
+    def subscribe_tracks(self, pattern: str, inbox: Inbox, *, prefix: str, problems: bool) -> Subscriptions:
+        """Move the tracks of a pattern into an inbox, its problems too where that is asked for."""
+        topics: tuple[Topic, ...] = ("tracks", "problems") if problems else ("tracks",)
+        return Subscriptions([self.subscribe(Keys(prefix).matching(pattern, topic), inbox) for topic in topics])
 
     def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:
         """Ask everybody who answers at `key`; an empty result means that nobody did within `timeout` seconds."""

@@ -1,5 +1,6 @@
 """`optipmb replay`: a dataset through the service."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -30,11 +31,11 @@ from optipmb_client.commands.options import (
     print_json,
     say,
 )
+from optipmb_client.links import linked
 from optipmb_client.progress import FrameProgress
 from optipmb_client.recording import latency
 from optipmb_client.replay import Pace, ReplayedSequence
 from optipmb_client.replay import replay as replay_sequences
-from optipmb_client.transport import Connection
 
 
 def replay(  # noqa: PLR0913  these are the command's options
@@ -68,7 +69,7 @@ def replay(  # noqa: PLR0913  these are the command's options
     opened, chosen = open_sequences(asked, sequences)
     name = profile or opened.profile
     with (
-        Connection(connect, config=config, timeout=wait) as connection,
+        closing(linked(connect, config=config, timeout=wait)) as connection,
         FrameProgress("replaying", sum(map(len, chosen))) as progress,
     ):
         results = replay_sequences(

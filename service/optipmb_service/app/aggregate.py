@@ -25,10 +25,11 @@ from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.problems import problem_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from prometheus_client.metrics_core import Metric
 
+    from optipmb_service.observability.metrics import Value
     from optipmb_service.runtime.ports import Request
     from optipmb_service.settings import Settings
 
@@ -95,6 +96,10 @@ class AggregateView:
         self._asking = ThreadPoolExecutor(workers.count, "asking")
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
+
+    def add(self, figures: Callable[[], Iterable[Value]]) -> None:
+        """Have figures of the parent itself read with the metrics."""
+        self._registry.register(ReadOnDemand(figures))
 
     # As http.Source
 

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from optipmb_service import __version__
+from optipmb_service.app.edges import monitoring
 from optipmb_service.app.loops import StopRequest, beat, unless
-from optipmb_service.app.monitoring import monitoring
 from optipmb_service.grpc.server import GRACE_S, Server
 from optipmb_service.observability.health import ProcessHealth
-from optipmb_service.runtime.ports import EdgeError, HttpError, TransportError
+from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from optipmb_service.observability.metrics import Metrics
+    from optipmb_service.app.edges import AddFigures
     from optipmb_service.settings import Settings
 
 SWITCH_S: Final = 0.0005
@@ -77,7 +77,7 @@ async def run(settings: Settings) -> int:
                 await server.stop()
             finally:
                 await asyncio.to_thread(client.close)
-    except (TransportError, HttpError, EdgeError) as error:
+    except (TransportError, EdgeError) as error:
         print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
         return 1
     finally:
@@ -87,7 +87,7 @@ async def run(settings: Settings) -> int:
 
 
 @contextlib.contextmanager
-def beside(settings: Settings, client: Client, metrics: Metrics) -> Iterator[None]:
+def beside(settings: Settings, client: Client, add: AddFigures) -> Iterator[None]:
     """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other.
 
     Raises:
@@ -105,7 +105,7 @@ def beside(settings: Settings, client: Client, metrics: Metrics) -> Iterator[Non
     server: Server | None = None
     try:
         server = asyncio.run_coroutine_threadsafe(begin(), loop).result()
-        metrics.add(server.metrics.figures)
+        add(server.metrics.figures)
         log.info("grpc", address=server.address)
         yield
     finally:

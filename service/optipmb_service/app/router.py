@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import structlog
 
 from optipmb_service import __version__
-from optipmb_service.app.monitoring import monitoring
+from optipmb_service.app.edges import monitoring
 from optipmb_service.observability.health import BEAT_S, ProcessHealth
-from optipmb_service.runtime.ports import HttpError, TransportError
+from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh import Router
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def route(settings: Settings) -> int:
                 health.beat()
             health.ends()
             router.close()
-    except (TransportError, HttpError) as error:
+    except (TransportError, EdgeError) as error:
         print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
         return 1
     log.info("stopped", drained=True)

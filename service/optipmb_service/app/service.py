@@ -23,9 +23,9 @@ import structlog
 
 import optipmb
 from optipmb_service import __version__
+from optipmb_service.app.edges import grpc_edge, monitoring
 from optipmb_service.app.kernels import warm_up
 from optipmb_service.app.loops import StopRequest, beat, say_ready, unless
-from optipmb_service.app.monitoring import monitoring
 from optipmb_service.cluster.assignment import Assignment
 from optipmb_service.cluster.coordinator import Coordinator
 from optipmb_service.observability import collectors
@@ -33,7 +33,7 @@ from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter
 from optipmb_service.runtime.persistence import open_persistence
-from optipmb_service.runtime.ports import HttpError, TransportError
+from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.runtime.queries import Queries
 from optipmb_service.runtime.registry import Registry
 from optipmb_service.runtime.scheduler import Scheduler
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.context import Actor
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.settings import Settings
+    from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
 
@@ -193,6 +194,10 @@ class Service:
         """Hand over what comes on a stream to a viewer, until the result is called."""
         return self._transport.tap(stream, receive)
 
+    def client(self) -> Client:
+        """Return what an edge in this process uses of the network."""
+        return self._transport.client()
+
     def _summaries(self, now_ns: int) -> tuple[schemas.SessionSummary, ...]:
         """Return a line for each session; one that cannot be made is a problem of its stream alone."""
         summaries = []
@@ -316,7 +321,7 @@ async def run(settings: Settings, profiles: Profiles, parent: Parent | None = No
                 return await _serve(settings, profiles, asked, health, parent)
             finally:
                 beating.cancel()
-    except (TransportError, HttpError) as error:
+    except (TransportError, EdgeError) as error:
         print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
         return 1
 
@@ -346,13 +351,14 @@ async def _serve(
     service.start(announce=parent.announces)
     health.report(service)
     settle()
-    parent.ready(service)
-    log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
-    while not asked.is_set():
-        await asked.wait(HOUSEKEEPING_S)
-        service.housekeeping()
-        parent.beat()
-    health.ends()
+    with grpc_edge(settings, service.client, health.metrics.add):
+        parent.ready(service)
+        log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+        while not asked.is_set():
+            await asked.wait(HOUSEKEEPING_S)
+            service.housekeeping()
+            parent.beat()
+        health.ends()
     ended = await asyncio.to_thread(service.stop)
     log.info("stopped", drained=ended)
     return 0

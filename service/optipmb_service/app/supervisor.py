@@ -20,12 +20,12 @@ import structlog
 
 from optipmb_service import __version__
 from optipmb_service.app.aggregate import AggregateView
+from optipmb_service.app.edges import grpc_edge, monitoring
 from optipmb_service.app.loops import StopRequest, beat, say_ready, unless
-from optipmb_service.app.monitoring import monitoring
 from optipmb_service.app.private_folder import private_folder
 from optipmb_service.app.worker_process import WorkerProcess
 from optipmb_service.observability.health import BEAT_S
-from optipmb_service.runtime.ports import HttpError, TransportError
+from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh import Transport
 
 if TYPE_CHECKING:
@@ -235,7 +235,7 @@ async def supervise(settings: Settings) -> int:
             if transport is None:
                 return 0
             return await _supervised(settings, workers, transport, asked, folder / "lock")
-        except (TransportError, HttpError) as error:
+        except (TransportError, EdgeError) as error:
             print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
             return 1
 
@@ -258,9 +258,10 @@ async def _supervised(
                 transport.watch()
                 transport.serve_service(view.answer)
                 transport.announce()
-                say_ready(settings)
-                log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
-                await asked.wait()
+                with grpc_edge(settings, transport.client, view.add):
+                    say_ready(settings)
+                    log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+                    await asked.wait()
             view.ends()
             ended = await supervisor.stop()
     finally:
@@ -286,6 +287,7 @@ def divided(settings: Settings, socket: str) -> tuple[Settings, Settings]:
             "listen": (),
             "connect": (socket,) if router else settings.connect,
             "http": "",
+            "grpc": "",
             # Its name follows from the endpoints, and those of the workers are the parent's own affair.
             "store": "none" if settings.folder is None else str(settings.folder),
             "zenoh_config": None if router else settings.zenoh_config,

@@ -42,7 +42,10 @@ METHODS: Final[dict[str, Callable[[Call], Awaitable[None]]]] = {
     "ListStreams": questions.list_streams,
 }
 
-GRACE_S: Final = 2.0
+SAID_BY: Final = "optipmb-gateway"
+"""Trailing metadata by which a gateway signs its errors: others come of the way to it."""
+
+GRACE_S: Final = 1.0
 """How long calls may take to finish what is under way at the end."""
 
 LINK_S: Final = 0.5
@@ -158,7 +161,8 @@ class Server:
             except EndCall as end:
                 code = end.code.name
                 status = end.status()
-                await context.abort(status.code, status.details, tuple(status.trailing_metadata or ()))
+                signed = (*(status.trailing_metadata or ()), (SAID_BY, self._gateway.instance))
+                await context.abort(status.code, status.details, signed)
             except asyncio.CancelledError:
                 code = "CANCELLED"
                 raise

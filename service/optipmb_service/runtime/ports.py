@@ -98,5 +98,5 @@ class EdgeError(Exception):
     """An edge beside Zenoh cannot be opened; the text is one clear line."""
 
 
-class HttpError(Exception):
+class HttpError(EdgeError):
     """The address of the HTTP endpoint cannot be listened on; the text is one clear line."""

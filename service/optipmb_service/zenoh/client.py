@@ -199,11 +199,13 @@ class Client:
     Args:
         session: where everything is declared.
         prefix: first chunks of all keys.
+        router: whether the session is a router itself.
     """
 
-    def __init__(self, session: zenoh.Session, prefix: str) -> None:
+    def __init__(self, session: zenoh.Session, prefix: str, *, router: bool = False) -> None:
         self.keys = schemas.Keys(prefix)
         self._session = session
+        self._router = router
 
     @classmethod
     def opened(cls, settings: Settings) -> Self:
@@ -219,8 +221,8 @@ class Client:
         close(self._session)
 
     def linked(self) -> bool:
-        """Whether the session has a router."""
-        return bool(self._session.info.routers_zid())
+        """Whether the session has a router, or is one."""
+        return self._router or bool(self._session.info.routers_zid())
 
     def publish(self, stream: str, cache: int, cache_clouds: int, wanted: Callable[[], None]) -> Outgoing:
         """Open the publishers of a stream; arguments and errors are those of `Outgoing`."""

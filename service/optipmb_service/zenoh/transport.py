@@ -13,6 +13,7 @@ import zenoh
 import zenoh.ext
 
 from optipmb_service.runtime.ports import Packet, TransportError
+from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.connection import close, line, opened
 from optipmb_service.zenoh.handles import Publisher, Question, Token, undeclare
 
@@ -145,6 +146,10 @@ class Transport:
             release()
             raise TransportError(line(error)) from error
         return release
+
+    def client(self) -> Client:
+        """Return what an edge in this process uses of the session."""
+        return Client(self._session, self._prefix, router=self._is_router)
 
     def watch(self) -> None:
         """Log the nodes and routers that this session is linked to, as they come and go."""

@@ -1,0 +1,140 @@
+"""Channels to gateways: any of several will do, and when one goes the next is taken."""
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import grpc
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+
+from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused
+
+__all__ = ["Channels", "from_gateway", "lasting", "refused"]
+
+SERVICE: Final = pb.DESCRIPTOR.services_by_name["TrackingService"].full_name
+
+SAID_BY: Final = "optipmb-gateway"
+"""Trailing metadata by which a gateway signs its errors."""
+
+FIRST_PAUSE_S: Final = 0.05
+LONGEST_PAUSE_S: Final = 1.0
+
+OPTIONS: Final = (
+    ("grpc.keepalive_time_ms", 10_000),
+    ("grpc.keepalive_timeout_ms", 5_000),
+    ("grpc.max_receive_message_length", -1),
+    ("grpc.max_send_message_length", -1),
+    ("grpc.initial_reconnect_backoff_ms", 50),
+    ("grpc.max_reconnect_backoff_ms", 1000),
+)
+
+_PASSING: Final = frozenset(
+    {
+        grpc.StatusCode.UNAVAILABLE,
+        grpc.StatusCode.CANCELLED,
+        grpc.StatusCode.DEADLINE_EXCEEDED,
+        grpc.StatusCode.RESOURCE_EXHAUSTED,
+        grpc.StatusCode.INTERNAL,
+        grpc.StatusCode.UNKNOWN,
+    }
+)
+
+
+class Channels:
+    """One channel to one of several gateways.
+
+    Args:
+        addresses: of gateways, `host:port`.
+        config: a folder with `key.pem`, `cert.pem` and `ca.pem`, or a file in it, for TLS.
+        metadata: sent with every call, a token for example.
+        timeout: seconds to wait for a gateway.
+
+    Raises:
+        ConnectionFailed: no gateway answers within `timeout`, or a certificate cannot be read.
+    """
+
+    def __init__(
+        self, addresses: Sequence[str], config: str | Path | None, metadata: Mapping[str, str], timeout: float
+    ) -> None:
+        self.addresses = tuple(addresses)
+        self.metadata = tuple(metadata.items())
+        credentials = None if config is None else _credentials(Path(config))
+        self._channels = [_channel(address, credentials) for address in self.addresses]
+        self._lock = threading.Lock()
+        self._at = 0
+        self._closed = False
+        ends = time.monotonic() + timeout
+        while not self._ready(timeout / len(self.addresses)):
+            if time.monotonic() >= ends:
+                self.close()
+                raise ConnectionFailed(
+                    f"no gRPC gateway answers at {', '.join(self.addresses)} (waited {timeout:g} s)",
+                    endpoints=self.addresses,
+                    timeout=timeout,
+                )
+
+    def call(self, method: str) -> tuple[Any, grpc.Channel]:
+        """Return a method of the present gateway, which takes and gives bytes, and the channel that it is on.
+
+        Raises:
+            ConnectionFailed: after `close`.
+        """
+        with self._lock:
+            if self._closed:
+                raise ConnectionFailed("the connection has been closed")
+            channel = self._channels[self._at]
+        return channel.stream_stream(f"/{SERVICE}/{method}"), channel
+
+    def failed(self, channel: grpc.Channel) -> None:
+        """Go on with the next gateway, unless another call has done so already."""
+        with self._lock:
+            if self._channels[self._at] is channel:
+                self._at = (self._at + 1) % len(self._channels)
+
+    def close(self) -> None:
+        """End all calls."""
+        with self._lock:
+            self._closed = True
+        for channel in self._channels:
+            channel.close()
+
+    def _ready(self, timeout: float) -> bool:
+        channel = self._channels[self._at]
+        try:
+            grpc.channel_ready_future(channel).result(max(timeout, 0.01))
+        except grpc.FutureTimeoutError:
+            self.failed(channel)
+            return False
+        return True
+
+
+def lasting(error: Any) -> bool:
+    """Tell whether another try would end in the same way."""
+    return error.code() not in _PASSING
+
+
+def from_gateway(error: Any) -> bool:
+    """Tell whether a gateway said this, and not that there is none."""
+    return any(key == SAID_BY for key, _ in error.trailing_metadata() or ())
+
+
+def refused(error: Any) -> ClientError:
+    """Return what a gateway said as an error of this package."""
+    return ServiceRefused(f"the gateway refused: {error.details()}")
+
+
+def _channel(address: str, credentials: grpc.ChannelCredentials | None) -> grpc.Channel:
+    if credentials is None:
+        return grpc.insecure_channel(address, options=OPTIONS)
+    return grpc.secure_channel(address, credentials, options=OPTIONS)
+
+
+def _credentials(path: Path) -> grpc.ChannelCredentials:
+    folder = path if path.is_dir() else path.parent
+    try:
+        authority, key, certificate = ((folder / name).read_bytes() for name in ("ca.pem", "key.pem", "cert.pem"))
+    except OSError as error:
+        raise ConnectionFailed(f"certificates for gRPC: {error.filename}: {error.strerror}") from error
+    return grpc.ssl_channel_credentials(authority, key, certificate)

@@ -1,0 +1,134 @@
+"""`optipmb replay --connect grpc://…`: the same files as over Zenoh and offline, whatever happens to a gateway."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from commands import optipmb, result_of
+from gateway import GatewayProcess
+from optipmb_client import Publisher, Subscriber
+from optipmb_client.errors import ConnectionFailed
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+from real_data import kitti_root
+from routers import free_endpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from service_process import ServiceProcess
+
+SCENE = ("--dataset", "scene", "--option", "frames=60")
+
+
+@pytest.fixture(scope="module")
+def gateways(service: ServiceProcess) -> Iterator[list[GatewayProcess]]:
+    """Three gateways of one network."""
+    with contextlib.ExitStack() as stack:
+        processes = [stack.enter_context(GatewayProcess(service.endpoint)) for _ in range(3)]
+        for process in processes:
+            process.wait_ready()
+        yield processes
+
+
+def connect(*gateways: GatewayProcess) -> list[str]:
+    """The options that name gateways."""
+    return [part for gateway in gateways for part in ("--connect", f"grpc://{gateway.address}")]
+
+
+def compare(out: Path, folders: tuple[str, ...], names: list[str]) -> None:
+    """Result files of several folders are byte-equal."""
+    for name in names:
+        first, *others = ((out / folder / f"{name}.txt").read_bytes() for folder in folders)
+        assert len(first.splitlines()) > 100
+        assert all(other == first for other in others), name
+
+
+def test_a_scene_with_clouds(service: ServiceProcess, gateways: list[GatewayProcess], tmp_path: Path) -> None:
+    """Through gRPC, through Zenoh and offline a scene gives the same file; no frame and no cloud is missing."""
+    optipmb("track", *SCENE, "--out", tmp_path / "track")
+    optipmb("replay", *SCENE, "--connect", service.endpoint, "--out", tmp_path / "zenoh")
+    result = result_of(optipmb("replay", *SCENE, *connect(gateways[0]), "--out", tmp_path / "grpc", "--json"))
+    compare(tmp_path, ("track", "zenoh", "grpc"), ["0000"])
+    (sequence,) = result["sequences"]
+    assert (sequence["clouds"], sequence["clouds_missed"], sequence["problems"], sequence["missing"]) == (60, 0, 0, 0)
+
+
+def test_kitti_through_three_gateways_at_once(gateways: list[GatewayProcess], tmp_path: Path) -> None:
+    """Recorded sequences, each sent by a process of its own to a gateway of its own, give the offline files."""
+    data = ("--dataset", "kitti", "--root", kitti_root(), "--detections", "pointrcnn")
+    names = ["0000", "0002", "0005"]
+    optipmb("track", *data, "--sequences", *names, "--out", tmp_path / "track")
+    options = ("--out", str(tmp_path / "grpc"), *map(str, data))
+    commands = [
+        [sys.executable, "-m", "optipmb_client", "replay", *options, "--sequences", name, *connect(gateway)]
+        for name, gateway in zip(names, gateways, strict=True)
+    ]
+    running = [subprocess.Popen(command, stdout=subprocess.DEVNULL) for command in commands]
+    assert [process.wait(240) for process in running] == [0, 0, 0]
+    compare(tmp_path, ("track", "grpc"), names)
+
+
+def test_a_gateway_that_is_killed_loses_nothing(
+    service: ServiceProcess, gateways: list[GatewayProcess], tmp_path: Path
+) -> None:
+    """A gateway killed in the middle: the client goes on at another, every frame comes back once, the file is equal."""
+    scene = ("--dataset", "scene", "--option", "frames=200", "--option", "seed=5")
+    optipmb("track", *scene, "--out", tmp_path / "track")
+    with GatewayProcess(service.endpoint) as doomed:
+        doomed.wait_ready()
+        command = [sys.executable, "-m", "optipmb_client", "replay", *scene, "--speed", "4", "--json"]
+        command += [*connect(doomed, gateways[1]), "--out", str(tmp_path / "grpc")]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as replay:
+            wait_for_frames(gateways[1], 60)
+            doomed.process.send_signal(signal.SIGKILL)
+            output, _ = replay.communicate(timeout=120)
+    result: Any = result_of(subprocess.CompletedProcess(command, replay.returncode, output, ""))
+    assert replay.returncode == 0
+    compare(tmp_path, ("track", "grpc"), ["0000"])
+    assert (result["sequences"][0]["returned"], result["missing"]) == (200, 0)
+
+
+def wait_for_frames(gateway: GatewayProcess, frames: int) -> None:
+    """Wait until a replay has come so far."""
+    stub, ends = gateway.stub(), time.monotonic() + 60
+    while time.monotonic() < ends:
+        listed = stub.ListStreams(pb.ListStreamsRequest(pattern="replay/*/*"), wait_for_ready=True).streams
+        if any(frames <= one.session.frames < 2 * frames for one in listed):
+            return
+        time.sleep(0.02)
+    raise AssertionError(f"no stream with {frames} frames")
+
+
+def test_publisher_and_subscriber_at_different_gateways(gateways: list[GatewayProcess], stream: str) -> None:
+    """What one publishes at a gateway another gets at the next, problems too."""
+    problems = []
+    car: dict[str, Any] = {"center": [[1, 2, 0.8]], "size": [[4.5, 1.9, 1.6]], "yaw": [0.5], "score": [0.9]}
+    with (
+        Subscriber(
+            stream, f"grpc://{gateways[1].address}", timeout=10.0, on_problem=lambda one: problems.append(one.code)
+        ) as tracks,
+        Publisher(stream, f"grpc://{gateways[0].address}", frame="world") as publisher,
+    ):
+        for k in range(20):
+            publisher.publish(stamp_ns=10**18 + k * 10**8, label=["car" if k < 19 else "unicorn"], **car)
+        received = [message.seq for message, _ in zip(tracks, range(20), strict=False)]
+    assert received == list(range(20))
+    assert problems == ["unknown_class"]
+
+
+def test_nobody_there_is_one_clear_line(tmp_path: Path) -> None:
+    """A gateway that does not answer is an error with its address, not a wait."""
+    address = free_endpoint().removeprefix("tcp/")
+    with pytest.raises(ConnectionFailed, match=address):
+        Publisher("a/b/c", f"grpc://{address}", timeout=0.5)
+    done = optipmb("replay", *SCENE, "--connect", f"grpc://{address}", "--wait", 0.5, "--out", tmp_path)
+    assert done.returncode == 1
+    assert address in done.stderr
+    assert len(done.stderr.splitlines()) == 1
