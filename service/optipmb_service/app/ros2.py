@@ -19,7 +19,7 @@ from optipmb_schemas.ros2.tracks import DETECTION_ARRAY, MARKERS, TRACKED
 from optipmb_schemas.ros2.types import own_types
 
 from optipmb_service import __version__
-from optipmb_service.app.monitoring import monitoring
+from optipmb_service.app.edges import monitoring
 from optipmb_service.observability.health import BEAT_S, ProcessHealth
 from optipmb_service.ros2 import graph
 from optipmb_service.ros2.bridge import Bridge
