@@ -9,7 +9,7 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints
-.PHONY: help demo test bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests schemas wheel clean tune ablate
+.PHONY: help docs release demo test bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    everything that CI runs: lint, types, tests, schemas, wheel, demo"
@@ -22,6 +22,8 @@ help:
 	@echo "make containers  build the image, run the compose file's stack in containers, and show that it works"
 	@echo "make tune    make the tuned profiles anew from DATA=... (out/tune-*/tuned.toml) and compare them with those that ship"
 	@echo "make ablate  print the tables of docs/ablation.md anew from DATA=..."
+	@echo "make docs    build the documentation site into out/site and check its links"
+	@echo "make release test, build and check a release, and print what would publish it"
 	@echo "make clean   remove the virtual environment and everything generated"
 
 # The stamp is newer than what it was made from, so a second call installs nothing.
@@ -78,6 +80,21 @@ BASELINES := benchmarks/baselines
 TIMED := benchmarks/test_kernels.py benchmarks/test_tracker.py benchmarks/test_codec.py
 BENCH := $(BIN)/pytest $(TIMED) -W default --benchmark-storage=file://$(BASELINES) --benchmark-group-by=fullname \
 	--benchmark-columns=min,median,iqr,rounds --benchmark-timer=time.thread_time --benchmark-max-time=0.3
+# The site, with every link checked; nothing is published.
+DOCS := out/docs-env
+$(DOCS)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(DOCS)
+	$(DOCS)/bin/python -m pip install --quiet --constraint requirements.lock ".[client,docs]"
+	touch $@
+
+docs: $(DOCS)/.installed
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict --quiet
+	@echo "the site is in out/site"
+
+# Everything that a release needs, up to publishing.
+release: install
+	sh tests/release.sh $(BIN)
+
 bench: install
 	$(BENCH) --benchmark-compare
 	$(BIN)/pytest benchmarks/test_service.py -s

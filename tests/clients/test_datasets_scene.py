@@ -325,9 +325,9 @@ def test_truth_holds_what_is_in_range(scenes: list[SceneSequence]) -> None:
 
 
 def test_a_stay_goes_on_over_a_short_break_only() -> None:
-    """With breaks of up to two frames allowed, a break of three begins a new stay; ids are in the order of time."""
+    """With breaks of up to two frames allowed, which belong to the stay, a break of three begins a new one."""
     inside = np.array([[1, 0], [1, 1], [0, 1], [0, 1], [1, 0], [1, 0], [0, 0], [1, 1]], dtype=np.bool_)
-    expected = [[0, -1], [0, 1], [-1, 1], [-1, 1], [0, -1], [0, -1], [-1, -1], [0, 2]]
+    expected = [[0, -1], [0, 1], [0, 1], [0, 1], [0, -1], [0, -1], [0, -1], [0, 2]]
     assert visits(inside, 2).tolist() == expected
 
 

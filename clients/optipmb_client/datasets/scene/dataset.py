@@ -29,7 +29,10 @@ RADIUS = 60.0
 MIN_POINTS = 5
 """An object with fewer points cannot be expected to be found: its truth is ignored."""
 
-_ABSENCE_S = 1.0
+HIDDEN_S = 2.0
+"""An object that no ray has met for longer is a new one when it is seen again, as is one that was out of range: without
+its looks nobody could know it again."""
+
 _NAME_DIGITS = 4
 
 
@@ -174,7 +177,7 @@ class SceneSequence:
             )
 
     def truth(self) -> Truth:
-        """Return the objects in range; one that comes back after a while is a new one."""
+        """Return the objects in range, from when they are first seen; one that was away or hidden long is a new one."""
         world = self._world
         for frame in range(len(self)):
             if frame not in self._scanned:
@@ -182,9 +185,10 @@ class SceneSequence:
         inside = np.zeros(world.yaw.shape, dtype=np.bool_)
         for frame in range(len(self)):
             inside[frame, self._in_range(frame)] = True
-        identity = visits(inside, round(_ABSENCE_S * self._options.rate))
-        when, which = np.nonzero(inside)
-        points = np.stack([self._scanned[i][0] for i in range(len(self))])[when, which]
+        returns = np.stack([self._scanned[i][0] for i in range(len(self))])
+        identity = visits(inside & (returns > 0), round(HIDDEN_S * self._options.rate))
+        when, which = np.nonzero(inside & (identity >= 0))
+        points = returns[when, which]
         covered = np.stack([self._scanned[i][1] for i in range(len(self))])[when, which]
         level = np.digitize(np.nan_to_num(covered, nan=0.0), [0.1, 0.5])
         count = len(when)
@@ -210,7 +214,7 @@ class SceneSequence:
 def visits(inside: Bools, absence: int) -> Ints:
     """Return the id (F, O) of the stay that each object is on, -1 outside; stays are numbered in order of time.
 
-    A stay goes on over a break of at most `absence` frames.
+    A stay goes on over a break of at most `absence` frames, which belong to it.
     """
     identity = np.full(inside.shape, -1, dtype=np.int64)
     last = np.full(inside.shape[1], -absence - 2, dtype=np.int64)
@@ -220,6 +224,8 @@ def visits(inside: Bools, absence: int) -> Ints:
         new = np.flatnonzero(present & (frame - last > absence + 1))
         current[new] = following + np.arange(len(new))
         following += len(new)
+        for row in np.flatnonzero(present & (frame - last <= absence + 1)):
+            identity[last[row] + 1 : frame, row] = current[row]
         identity[frame, present] = current[present]
         last[present] = frame
     return identity

@@ -1,0 +1,81 @@
+"""Pages of the site that are generated: the quick start from the README, the references from the code."""
+
+from __future__ import annotations
+
+import re
+import types
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, get_args
+
+import optipmb_client
+from mkdocs.structure.files import File
+from pydantic import BaseModel
+
+import optipmb
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+
+ROOT: Final = Path(__file__).parent.parent
+PAGES: Final = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages."""
+    pages = {page: _page(ROOT / source) for source, page in PAGES.items()}
+    pages |= {"profiles.md": _profiles(), "api.md": _api()}
+    for page, text in pages.items():
+        files.append(File.generated(config, page, content=text))
+    return files
+
+
+def _page(path: Path) -> str:
+    """Return a page of the repository with its links as they are in the site."""
+    text = path.read_text(encoding="utf-8").replace("](docs/", "](")
+    for source, page in PAGES.items():
+        text = text.replace(f"]({source})", f"]({page})")
+    return text
+
+
+def _profiles() -> str:
+    """Return the reference of profiles: every field with its description, and the profiles that come along."""
+    lines = [
+        "# Profiles",
+        "",
+        "A profile is a TOML file. `optipmb profiles` lists those that come along, shows and copies them.",
+        "",
+    ]
+    lines += _fields(optipmb.Parameters, "Profile")
+    lines += ["## Profiles that come along", ""]
+    for name in optipmb.profiles():
+        one = optipmb.load_profile(name)
+        lines += [f"**{name}**: {1.0 / one.nominal_period:g} Hz; {', '.join(one.labels)}", ""]
+    return "\n".join(lines)
+
+
+def _fields(model: type[BaseModel], title: str) -> list[str]:
+    lines = [f"## {title}", "", (model.__doc__ or "").strip().split("\n\n")[0].replace("\n", " "), ""]
+    lines += ["| field | meaning | default |", "| --- | --- | --- |"]
+    inner: list[str] = []
+    for name, field in model.model_fields.items():
+        default = "required" if field.is_required() else f"`{field.default!r}`"
+        lines.append(f"| `{name}` | {field.description or ''} | {default} |")
+        for part in _models(field.annotation):
+            inner += _fields(part, f"`{name}`")
+    return [*lines, "", *inner]
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
+        return [annotation] if issubclass(annotation, BaseModel) else []
+    return [model for part in get_args(annotation) for model in _models(part)]
+
+
+def _api() -> str:
+    """Return the reference of the public names of the library and of the node API."""
+    lines = ["# Python", "", "## The library", ""]
+    lines += [f"::: optipmb.{name}\n" for name in optipmb.__all__]
+    lines += ["## Nodes", ""]
+    lines += [f"::: optipmb_client.{name}\n" for name in optipmb_client.__all__ if not re.fullmatch("[A-Z_]+", name)]
+    return "\n".join(lines)
