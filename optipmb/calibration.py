@@ -22,7 +22,6 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from optipmb.compiled import kernel
-from optipmb.density import PHI
 
 if TYPE_CHECKING:
     import numpy as np
@@ -44,10 +43,9 @@ def log_odds(score: float) -> float:
 
 @kernel
 def calibrate_rows(
-    rows: Index,
     label: Index,
     evidence: Array,
-    mean: Array,
+    yaw: Array,
     knots: Index,
     knot_evidence: Array,
     knot_existence: Array,
@@ -61,10 +59,9 @@ def calibrate_rows(
     """Overwrite existence, score and covariance of the rows whose class has a calibration.
 
     Args:
-        rows: (>= K,) objects, in front.
-        label: (N,) classes.
-        evidence: (N,) e_k.
-        mean: (N, 6) motion states.
+        label: (K,) classes.
+        evidence: (K,) e_k.
+        yaw: (K,) headings.
         knots: (C,) number of knots of each class, zero without a calibration.
         knot_evidence: (C, K) where the curves bend, ascending.
         knot_existence: (C, K) f there.
@@ -76,12 +73,11 @@ def calibrate_rows(
         covariance: (K, 6, 6) in: P, out: with the lasting error.
     """
     for row in range(existence.shape[0]):
-        n = rows[row]
-        c = label[n]
+        c = label[row]
         count = knots[c]
         if count == 0:
             continue
-        e = evidence[n]
+        e = evidence[row]
         k = 0
         while k < count and knot_evidence[c, k] <= e:
             k += 1
@@ -92,7 +88,7 @@ def calibrate_rows(
         existence[row] = knot_existence[c, low] + share * (knot_existence[c, high] - knot_existence[c, low])
         along = knot_along[c, low] + share * (knot_along[c, high] - knot_along[c, low])
         across = knot_across[c, low] + share * (knot_across[c, high] - knot_across[c, low])
-        cos, sin = math.cos(mean[n, PHI]), math.sin(mean[n, PHI])
+        cos, sin = math.cos(yaw[row]), math.sin(yaw[row])
         covariance[row, 0, 0] += along * along * cos * cos + across * across * sin * sin
         covariance[row, 1, 1] += along * along * sin * sin + across * across * cos * cos
         mixed = (along * along - across * across) * cos * sin

@@ -9,14 +9,16 @@ import numpy as np
 
 from optipmb.calibration import calibrate_rows
 from optipmb.compiled import kernel
-from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, whole_periods
-from optipmb.heading import sign_probability
+from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, copy_state, whole_periods
+from optipmb.heading import doubt, sign_probability
 from optipmb.records import record
+from optipmb.reported import follow_box
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.density import Bernoullis
+    from optipmb.preprocess import Measurements
     from optipmb.table import ClassTable
 
     Array = NDArray[np.float64]
@@ -73,7 +75,7 @@ class Tracks:
 def extract(
     bernoulli: Bernoullis,
     measurement: Index,
-    source: Index,
+    measurements: Measurements,
     stamp_ns: int,
     table: ClassTable,
     *,
@@ -87,7 +89,7 @@ def extract(
     Args:
         bernoulli: the posterior, not yet given away.
         measurement: (N,) measurement of each object, negative where missed.
-        source: (M,) place of each measurement in the caller's arrays.
+        measurements: Z_k.
         stamp_ns: stamp of the frame.
         table: parameters as columns.
         two_thresholds: whether OTE is on.
@@ -138,8 +140,12 @@ def extract(
         bernoulli.evidence,
         bernoulli.heading_odds,
         measurement,
-        source,
+        measurements.source,
+        measurements.position,
+        measurements.yaw,
         stamp_ns,
+        table.reported_position,
+        table.reported_heading,
         table.sign_known,
         table.knots,
         table.knot_evidence,
@@ -248,7 +254,11 @@ def read_tracks(
     heading_odds: Array,
     measurement: Index,
     source: Index,
+    position: Array,
+    measured_yaw: Array,
     stamp_ns: int,
+    reported_position: Array,
+    reported_heading: Array,
     sign_known: NDArray[np.bool_],
     knots: Index,
     knot_evidence: Array,
@@ -273,31 +283,33 @@ def read_tracks(
     detection: Index,
 ) -> None:
     """Write the columns of `Tracks` of the objects at the front of `rows`, calibrated where there are `knots`."""
+    state = np.empty((identity_out.shape[0], STATE))
     for k in range(identity_out.shape[0]):
         n = rows[k]
+        c = label[n]
         identity_out[k], label_out[k] = identity[n], label[n]
         existence_out[k], score_out[k] = existence[n], score[n]
-        v, phi = mean[n, V], mean[n, PHI]
-        center[k, 0], center[k, 1], center[k, 2] = mean[n, X], mean[n, Y], auxiliary[n, 3]
+        copy_state(mean, covariance, n, state, covariance_out, k)
+        m = measurement[n]
+        if m >= 0:
+            x, y, z_phi = position[m, 0], position[m, 1], measured_yaw[m]
+            follow_box(x, y, z_phi, reported_position[c], reported_heading[c], state[k], covariance_out[k])
+        v, phi = state[k, V], state[k, PHI]
+        center[k, 0], center[k, 1], center[k, 2] = state[k, X], state[k, Y], auxiliary[n, 3]
         for s in range(3):
             size[k, s] = auxiliary[n, s]
-        for s in range(STATE):
-            for t in range(STATE):
-                covariance_out[k, s, t] = covariance[n, s, t]
-        yaw[k], yaw_rate[k], acceleration[k] = phi, mean[n, OMEGA], mean[n, A]
+        yaw[k], yaw_rate[k], acceleration[k] = phi, state[k, OMEGA], state[k, A]
         heading_confidence[k] = 1.0
-        if sign_known[label[n]]:
-            p = sign_probability(heading_odds[n])
-            heading_confidence[k] = p
-            covariance_out[k, PHI, PHI] += p * (1.0 - p) * math.pi**2
+        if sign_known[c]:
+            heading_confidence[k] = sign_probability(heading_odds[n])
+            covariance_out[k, PHI, PHI] += doubt(heading_confidence[k])
         velocity[k, 0], velocity[k, 1] = v * math.cos(phi), v * math.sin(phi)
         age[k], time_since_detection[k] = (stamp_ns - born_ns[n]) * 1e-9, (stamp_ns - seen_ns[n]) * 1e-9
-        detection[k] = source[measurement[n]] if measurement[n] >= 0 else -1
+        detection[k] = source[m] if m >= 0 else -1
     calibrate_rows(
-        rows,
-        label,
-        evidence,
-        mean,
+        label_out,
+        evidence[rows[: identity_out.shape[0]]],
+        yaw,
         knots,
         knot_evidence,
         knot_existence,

@@ -11,8 +11,9 @@ where the object is detected; a missed frame leaves h as it is. Where h falls be
 -v, -a and -h, that is x -> T x with T = diag(1, 1, -1, 1, 1, -1) beside the pi, and P -> T P T. Both states describe
 the same motion, so nothing that is predicted or associated depends on the turn.
 
-A track tells the probability 1 / (1 + e^-h) of its heading, and the variance of a heading that is right with it:
-P_phi + p (1 - p) pi^2. Without `heading_sign` in the profile the sign stays that of the birth.
+A track tells the probability p = 1 / (1 + e^-h) that its heading is right, and in the variance of the heading what the
+doubt adds to it, p (1 - p) pi^2 beyond what stands outside an interval of 95 % anyway. Without `heading_sign` in the
+profile the sign stays that of the birth.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
+
+TAIL: Final = 0.025
+"""Probability beyond an interval of 95 %, on either side."""
 
 CERTAIN: Final = 2.0
 """Standard deviations by which a speed has to be above v_0 to say which way is forward."""
@@ -87,3 +91,13 @@ def turn_around(mean: Array, covariance: Array) -> None:
 def sign_probability(odds: float) -> float:
     """Return 1 / (1 + e^-h), the probability that the object faces along phi; h is not negative."""
     return 1.0 / (1.0 + math.exp(-odds))
+
+
+@kernel
+def doubt(probability: float) -> float:
+    """Return the variance that the doubt about the sign adds to a heading, rad^2.
+
+    The two headings have the variance p (1 - p) pi^2 about their mean. A doubt of less than `TAIL` lies outside an
+    interval of 95 %, so that much is left out, and headings that are nearly certain have an interval that holds.
+    """
+    return max(probability * (1.0 - probability) - TAIL * (1.0 - TAIL), 0.0) * math.pi**2

@@ -61,6 +61,16 @@ class MeasurementNoise(_Table):
     heading: Positive = Field(description="of phi, rad")
 
 
+class ReportedNoise(_Table):
+    """Noise of the detector for the boxes that tracks report (`optipmb.reported`).
+
+    An entry that is not below that of `measurement_noise` reports the state as it is.
+    """
+
+    position: Positive = Field(description="standard deviation of x and of y, m")
+    heading: Positive = Field(description="of phi, rad")
+
+
 class BirthSpread(_Table):
     """Birth covariance P^0 of a newborn object, as standard deviations."""
 
@@ -167,6 +177,9 @@ class ClassParameters(_Table):
     )
     process_noise: ProcessNoise = Field(description="Q")
     measurement_noise: MeasurementNoise = Field(description="R")
+    reported_noise: ReportedNoise | None = Field(
+        default=None, description="R' of the boxes that tracks report; without it they are those of the state"
+    )
     birth: BirthSpread = Field(description="P^0")
     motion: Literal["ctra", "cv"] = Field(
         default="ctra",

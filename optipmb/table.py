@@ -31,6 +31,8 @@ class ClassTable:
         noise_heading: (C,) of z_phi.
         acceleration_time: (C,) time constant of the acceleration, s, infinite where it is constant.
         constant_velocity: (C,) whether the motion model is that of constant velocity.
+        reported_position: (C,) variance that R_x of `optipmb.reported` leaves for z_x and z_y; zero without it.
+        reported_heading: (C,) for z_phi.
         birth_known: (C, 6) standard deviations of P^0 when the detection brings a velocity.
         birth_unknown: (C, 6) when it does not.
         sign_known: (C,) whether the sign of the heading is followed; the next four are zero where not.
@@ -77,6 +79,8 @@ class ClassTable:
     noise_position: Array
     noise_velocity: Array
     noise_heading: Array
+    reported_position: Array
+    reported_heading: Array
     birth_known: Array
     birth_unknown: Array
     sign_known: NDArray[np.bool_]
@@ -166,6 +170,8 @@ class ClassTable:
             noise_position=column(lambda p: p.measurement_noise.position),
             noise_velocity=column(lambda p: p.measurement_noise.velocity),
             noise_heading=column(lambda p: p.measurement_noise.heading),
+            reported_position=column(lambda p: _left_over(p, "position")),
+            reported_heading=column(lambda p: _left_over(p, "heading")),
             birth_known=spread(lambda p: p.birth.speed),
             birth_unknown=spread(lambda p: p.birth.unknown_speed),
             sign_known=np.array([one is not None for one in signs], np.bool_),
@@ -182,3 +188,11 @@ class ClassTable:
             knot_along=curve(lambda one: one.along),
             knot_across=curve(lambda one: one.across),
         )
+
+
+def _left_over(parameters: ClassParameters, name: str) -> float:
+    """R_x of `optipmb.reported`: 1 / (1 / R' - 1 / R), zero where boxes are reported as they are."""
+    if parameters.reported_noise is None:
+        return 0.0
+    precision = getattr(parameters.reported_noise, name) ** -2 - getattr(parameters.measurement_noise, name) ** -2
+    return float(1.0 / precision) if precision > 0.0 else 0.0

@@ -217,7 +217,7 @@ class Tracker:
         times.append(clock())
 
         # Track extraction
-        tracks = extract(objects, survivors.measurement, measurements.source, now, table, two_thresholds=modules.ote)
+        tracks = extract(objects, survivors.measurement, measurements, now, table, two_thresholds=modules.ote)
         times.append(clock())
 
         born = len(survivors) - survivors.known

@@ -26,6 +26,7 @@ from oracle_formulas import (
     moment_match,
     periods,
     predict,
+    report,
     ukf_update,
 )
 from scipy.optimize import linear_sum_assignment
@@ -49,6 +50,7 @@ class Bernoulli:
     extracted: bool = False
     confirmed: bool = False
     detection: int = -1
+    measurement: Measurement | None = None
 
 
 @dataclass
@@ -266,11 +268,11 @@ class Oracle:
                 b.heading_odds, b.mean, b.covariance = follow_sign(
                     c, b.heading_odds, periods_since, z, b.mean, b.covariance
                 )
-                b.seen_ns, b.detection = now, z.source
+                b.seen_ns, b.detection, b.measurement = now, z.source, z
             else:
                 r = b.existence
                 b.existence = r * (1 - p_d[i]) / (1 - r + r * (1 - p_d[i]))
-                b.score, b.detection = 0.0, -1
+                b.score, b.detection, b.measurement = 0.0, -1, None
                 b.evidence = follow_evidence(c, b.evidence, 1.0 if b.born_ns == now else since, None)
             if b.existence >= c.min_existence and periods(b.seen_ns, now, self.nominal) <= c.max_misses:
                 survivors.append(b)
@@ -285,7 +287,7 @@ class Oracle:
             b = Bernoulli(h.mean, h.covariance, h.r, z.label, z.auxiliary.copy(), now, now, score)
             b.evidence = follow_evidence(self.classes[z.label], 0.0, 1.0, z.score)
             b.heading_odds, b.mean, b.covariance = follow_sign(self.classes[z.label], 0.0, 1.0, z, b.mean, b.covariance)
-            b.id, b.detection = self.next_id, z.source
+            b.id, b.detection, b.measurement = self.next_id, z.source, z
             self.bernoulli.append(b)
             self.next_id += 1
 
@@ -324,8 +326,9 @@ class Oracle:
             b.extracted = b.extracted or taken
             if not taken:
                 continue
-            x, y, v, phi, omega, a = b.mean
-            existence, score, covariance = calibrate(c, b)
+            mean, covariance = report(c, b.measurement, b.mean, b.covariance)
+            x, y, v, phi, omega, a = mean
+            existence, score, covariance = calibrate(c, b, mean, covariance)
             sign, doubt = confidence(c, b.heading_odds)
             covariance = covariance + np.diag([0.0, 0.0, 0.0, doubt, 0.0, 0.0])
             b.confirmed = existence >= (c.confirm_until if b.confirmed else c.confirm_from)

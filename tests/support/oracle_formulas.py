@@ -246,18 +246,36 @@ def follow_sign(c: Any, odds: float, since: float, z: Measurement, m: Array, P: 
 def confidence(c: Any, odds: float) -> tuple[float, float]:
     """Probability that the heading is right, and the variance that the doubt adds."""
     p = 1.0 if c.heading_sign is None else 1 / (1 + math.exp(-odds))
-    return p, p * (1 - p) * math.pi**2
+    return p, max(p * (1 - p) - 0.025 * 0.975, 0.0) * math.pi**2
 
 
-def calibrate(c: Any, b: Any) -> tuple[float, float, Array]:
+def report(c: Any, z: Measurement | None, m: Array, P: Array) -> tuple[Array, Array]:
+    """The state that is told: its box updated once more with the noise that is left between R and R'."""
+    if z is None or c.reported_noise is None:
+        return m, P
+    less, noise = c.reported_noise, c.measurement_noise
+    names = ["position", "position", "heading"]
+    used = [i for i, name in enumerate(names) if getattr(less, name) < getattr(noise, name)]
+    left = [1 / (getattr(less, names[i]) ** -2 - getattr(noise, names[i]) ** -2) for i in used]
+    H = np.eye(6)[[[0, 1, 3][i] for i in used]]
+    nu = np.array([z.xy[0] - m[0], z.xy[1] - m[1], fold(z.yaw - m[3])])[used]
+    G = H @ P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(left))
+    K = H.T @ G  # nothing of it for speed, turn rate and acceleration
+    mean = m + K @ nu
+    mean[3] = wrap(mean[3])
+    rest = np.eye(6) - K @ H
+    return mean, rest @ P @ rest.T + K @ np.diag(left) @ K.T
+
+
+def calibrate(c: Any, b: Any, m: Array, P: Array) -> tuple[float, float, Array]:
     """Existence, score and covariance of a track as they are told: curves over the evidence, level at their ends."""
     if c.calibration is None:
-        return b.existence, b.score, b.covariance
+        return b.existence, b.score, P
     known = c.calibration
     existence, along, across = (
         float(np.interp(b.evidence, known.evidence, column)) for column in (known.existence, known.along, known.across)
     )
-    turn = np.array([[math.cos(b.mean[3]), -math.sin(b.mean[3])], [math.sin(b.mean[3]), math.cos(b.mean[3])]])
-    covariance = b.covariance.copy()
+    turn = np.array([[math.cos(m[3]), -math.sin(m[3])], [math.sin(m[3]), math.cos(m[3])]])
+    covariance = P.copy()
     covariance[:2, :2] += turn @ np.diag([along**2, across**2]) @ turn.T
     return existence, (b.evidence + 14.0) / 28.0 if known.score_of_evidence else b.score, covariance

@@ -117,8 +117,10 @@ def test_driving_says_which_way_is_forward() -> None:
 
 
 def test_the_doubt_is_in_the_variance_and_ends() -> None:
-    """The heading of a newborn has p (1 - p) pi^2 more variance than its state; a long followed one hardly any."""
-    parameters = one_class()
+    """The heading of a newborn has p (1 - p) pi^2 more variance but for a tail; in the end nothing is added."""
+    document = one_class().model_dump()
+    document["classes"]["Car"]["reported_noise"] = None
+    parameters = optipmb.parse_parameters(document)
     tracker, density = optipmb.Tracker(parameters), optipmb.Tracker.initial()
     for k in range(20):
         result = tracker.step(density, boxes(parameters, 0.1 * k, (1.0 * k, 0.0)))
@@ -126,8 +128,9 @@ def test_the_doubt_is_in_the_variance_and_ends() -> None:
         p = float(result.tracks.heading_confidence[0])
         added = result.tracks.covariance[0, 3, 3] - density.bernoulli.covariance[0, 3, 3]
         assert p == pytest.approx(1.0 / (1.0 + math.exp(-density.bernoulli.heading_odds[0])))
-        assert added == pytest.approx(p * (1 - p) * math.pi**2, abs=1e-12)
+        assert added == pytest.approx(max(p * (1 - p) - 0.025 * 0.975, 0.0) * math.pi**2, abs=1e-12)
     assert p > 0.999
+    assert added == 0.0
 
 
 def test_the_sign_fades_with_time_and_not_with_frames() -> None:

@@ -276,30 +276,39 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
     rng = np.random.default_rng(0)
     mean, auxiliary, born, seen = rng.normal(0, 3, (9, 6)), rng.uniform(1, 5, (9, 4)), stamps(rng, 9), stamps(rng, 9)
     rows, measurement, source = np.array([1, 4, 8]), np.arange(9) % 3 - 1, np.array([50, 60])
+    position, yaw = rng.normal(0, 3, (2, 2)), rng.uniform(-3, 3, 2)
+    less = SimpleNamespace(position=0.1, heading=0.2)
+    noise = SimpleNamespace(position=0.3, heading=0.3)
+    left = [np.array([1 / (r**-2 - 0.3**-2), 0.0, 0.0, 1 / (r**-2 - 0.3**-2)]) for r in (0.1, 0.2)]
     shapes = [(3, 3), (3, 3), (3,), (3,), (3, 2), (3,), (3,), (3,), (3,)]
     out = [np.empty(shape) for shape in shapes]
     detection = np.empty(3, np.int64)
     identity, label, r, score = np.arange(9) * 3, rng.integers(0, 4, 9), rng.uniform(0, 1, 9), rng.uniform(0, 1, 9)
-    covariance = rng.normal(0, 1, (9, 6, 6))
+    root = rng.normal(0, 1, (9, 6, 6))
+    covariance = root @ root.transpose(0, 2, 1)
     ids, labels, told = np.empty(3, np.int64), np.empty(3, np.int64), [np.empty(3), np.empty(3), np.empty((3, 6, 6))]
     evidence, odds, followed = rng.normal(0, 3, 9), rng.uniform(0, 3, 9), np.array([True, False, True, False])
     known = identity, label, mean, covariance, r, score, auxiliary, born, seen, evidence, odds
     bends = np.sort(rng.normal(0, 2, (4, 3)), axis=1)
     curves = bends, rng.uniform(0, 1, (4, 3)), rng.uniform(0, 1, (4, 3)), rng.uniform(0, 1, (4, 3)), np.full(4, True)
     knots = np.full(4, 3 if calibrated else 0)
-    given = *known, measurement, source, NOW, followed, knots, *curves
+    given = *known, measurement, source, position, yaw, NOW, *left, followed, knots, *curves
     read_tracks(rows, *given, ids, labels, *out[:7], *told, *out[7:], detection)
-    wanted_told = [column[rows] for column in (r, score, covariance)]
-    calibrate_rows(rows, label, evidence, mean, knots, *curves, *wanted_told)
+    x, spread = np.empty((3, 6)), np.empty((3, 6, 6))
+    for k, n in enumerate(rows):
+        m = measurement[n]
+        z = None if m < 0 else textbook.Measurement(position[m], None, yaw[m], np.ones(4), 0, 0.9, 0)
+        c = SimpleNamespace(reported_noise=less if left[0][label[n]] else None, measurement_noise=noise)
+        x[k], spread[k] = textbook.report(c, z, mean[n], covariance[n])
+    wanted_told = [r[rows], score[rows], spread]
+    calibrate_rows(label[rows], evidence[rows], x[:, 3].copy(), knots, *curves, *wanted_told)
     facing = np.where(followed[label[rows]], 1 / (1 + np.exp(-odds[rows])), 1.0)
-    wanted_told[2][:, 3, 3] += facing * (1 - facing) * np.pi**2
+    wanted_told[2][:, 3, 3] += np.maximum(facing * (1 - facing) - 0.025 * 0.975, 0) * np.pi**2
     assert np.array_equal(wanted_told[0], r[rows]) != calibrated
-    np.testing.assert_allclose(told[2], wanted_told[2], rtol=1e-12)
-    told[2], wanted_told[2] = told[2][:, :3, :3], wanted_told[2][:, :3, :3]
-    copies = zip((ids, labels, *told), (identity[rows], label[rows], *wanted_told), strict=True)
+    np.testing.assert_allclose(told[2], wanted_told[2], rtol=1e-9, atol=1e-12)
+    copies = zip((ids, labels, *told[:2]), (identity[rows], label[rows], *wanted_told[:2]), strict=True)
     for copy, column in copies:
         np.testing.assert_array_equal(copy, column)
-    x = mean[rows]
     heading = np.column_stack([np.cos(x[:, 3]), np.sin(x[:, 3])])
     wanted = [
         np.column_stack([x[:, :2], auxiliary[rows, 3]]),
@@ -310,7 +319,7 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
     ]
     wanted += [x[:, 4], x[:, 5], (NOW - born[rows]) * 1e-9, (NOW - seen[rows]) * 1e-9]
     for found, expected in zip(out, wanted, strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-15)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(detection, np.append(source, -1)[measurement[rows]])
 
 

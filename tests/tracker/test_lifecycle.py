@@ -17,7 +17,7 @@ SIMPLE = {
     "detection_floor": 0.5, "birth_score": 0.5, "adaptive_birth_rate": 2.0, "undetected_birth_rate": 1.0,
     "clutter_rate": 0.5, "area": 5000.0, "poisson_steps": 2, "extract_new": 0.6, "extract_known": 0.9,
     "extract_misses": 3, "max_misses": 6, "min_existence": 1e-3, "birth_heading_speed": 0.0,
-    "heading_sign": None,
+    "heading_sign": None, "reported_noise": None,
 }  # fmt: skip
 
 
