@@ -259,8 +259,8 @@ def report(c: Any, z: Measurement | None, m: Array, P: Array) -> tuple[Array, Ar
     left = [1 / (getattr(less, names[i]) ** -2 - getattr(noise, names[i]) ** -2) for i in used]
     H = np.eye(6)[[[0, 1, 3][i] for i in used]]
     nu = np.array([z.xy[0] - m[0], z.xy[1] - m[1], fold(z.yaw - m[3])])[used]
-    G = H @ P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(left))
-    K = H.T @ G  # nothing of it for speed, turn rate and acceleration
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(left))
+    K[[2, 4, 5]] = 0.0  # nothing of it for speed, turn rate and acceleration
     mean = m + K @ nu
     mean[3] = wrap(mean[3])
     rest = np.eye(6) - K @ H

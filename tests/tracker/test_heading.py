@@ -92,7 +92,8 @@ def one_class(**changes: float) -> optipmb.Parameters:
 def test_a_track_that_was_born_backwards_turns() -> None:
     """A first box turned by pi is outvoted by the second and third, and the velocity over ground stays what it was."""
     parameters = one_class(motion=0.0)
-    tracker, density = optipmb.Tracker(parameters), optipmb.Tracker.initial()
+    tracker = optipmb.Tracker(parameters)
+    density = tracker.initial()
     said = []
     for k in range(12):
         frame = boxes(parameters, 0.1 * k, (1.0 * k, 0.0), yaw=math.pi if k == 0 else 0.0)
@@ -109,7 +110,8 @@ def test_a_track_that_was_born_backwards_turns() -> None:
 def test_driving_says_which_way_is_forward() -> None:
     """A car whose boxes all face backwards is turned by its motion, where motion counts for more."""
     parameters = one_class(motion=3.0)
-    tracker, density = optipmb.Tracker(parameters), optipmb.Tracker.initial()
+    tracker = optipmb.Tracker(parameters)
+    density = tracker.initial()
     for k in range(15):
         result = tracker.step(density, boxes(parameters, 0.1 * k, (1.0 * k, 0.0), yaw=math.pi))
         density = result.density
@@ -121,7 +123,8 @@ def test_the_doubt_is_in_the_variance_and_ends() -> None:
     document = one_class().model_dump()
     document["classes"]["Car"]["reported_noise"] = None
     parameters = optipmb.parse_parameters(document)
-    tracker, density = optipmb.Tracker(parameters), optipmb.Tracker.initial()
+    tracker = optipmb.Tracker(parameters)
+    density = tracker.initial()
     for k in range(20):
         result = tracker.step(density, boxes(parameters, 0.1 * k, (1.0 * k, 0.0)))
         density = result.density
@@ -138,7 +141,8 @@ def test_the_sign_fades_with_time_and_not_with_frames() -> None:
     parameters = one_class(motion=0.0)
     found = []
     for rate in (1, 4):
-        tracker, density = optipmb.Tracker(parameters), optipmb.Tracker.initial()
+        tracker = optipmb.Tracker(parameters)
+        density = tracker.initial()
         for k in range(10 * rate + 1):
             density = tracker.step(density, boxes(parameters, 0.1 * k / rate, (0.0, 0.0))).density
         found.append(float(density.bernoulli.heading_odds[0]))
@@ -156,7 +160,7 @@ def test_a_turned_state_describes_the_same_motion(seed: int) -> None:
 
     def predicted(m: Array, p: Array) -> tuple[Array, Array]:
         out, spread = np.empty(6), np.empty((6, 6))
-        predict_state(m, p, 0.5, noise, np.empty((6, 6)), np.empty((12, 6)), out, spread)
+        predict_state(m, p, 0.5, noise, math.inf, False, np.empty((6, 6)), np.empty((12, 6)), out, spread)
         return out, spread
 
     straight = predicted(mean, covariance)

@@ -300,6 +300,7 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
         z = None if m < 0 else textbook.Measurement(position[m], None, yaw[m], np.ones(4), 0, 0.9, 0)
         c = SimpleNamespace(reported_noise=less if left[0][label[n]] else None, measurement_noise=noise)
         x[k], spread[k] = textbook.report(c, z, mean[n], covariance[n])
+    x[:, 3] = [textbook.wrap(angle) for angle in x[:, 3]]
     wanted_told = [r[rows], score[rows], spread]
     calibrate_rows(label[rows], evidence[rows], x[:, 3].copy(), knots, *curves, *wanted_told)
     facing = np.where(followed[label[rows]], 1 / (1 + np.exp(-odds[rows])), 1.0)

@@ -35,6 +35,7 @@ _NUSCENES = {
 _METRES = frozenset({"amotp", "motp"})
 _COUNTS = frozenset({"gt", "tp", "fp", "fn", "ids", "frag"})
 _HOTA = ("HOTA", "DetA", "AssA")
+_DIRECTIONS = ("along", "across", "height", "heading", "length", "width", "tall")
 _GOSPA = ("GOSPA", "localisation", "missed", "false", "OSPA")
 
 
@@ -79,6 +80,7 @@ def figure_tables(figures: "Sequence[ClassFigures]", cutoff: float) -> Iterator[
         yield _titled(
             "Errors of positions against their covariances: the NEES of a consistent tracker is 2", _nees(figures)
         )
+        yield from _errors(figures)
         yield _titled(
             "Existence probability against the share of tracks that are objects, by tenths", _reliability(figures)
         )
@@ -133,6 +135,33 @@ def _nees(figures: "Sequence[ClassFigures]") -> Table:
             *(_shown(found[name], plain=True) for name in ("error", "expected_error")),
         )
     return table
+
+
+def _errors(figures: "Sequence[ClassFigures]") -> Iterator[RenderableType]:
+    """Yield a table of errors by range and speed, tracks above their detections, and one of headings."""
+    found = [(one.name, one.errors) for one in figures if one.errors is not None]
+    boxes = _empty(("class", "boxes", "", *_DIRECTIONS))
+    headings = _empty(("class", "boxes", "backward", "det. backward", "NEES", "in 95 %"))
+    notes = list(dict.fromkeys(errors.without for _, errors in found if errors.without))
+    for name, errors in found:
+        for place, (group, rows) in enumerate(errors.groups()):
+            values: Mapping[str, Any] = errors.figures(rows)
+            head = f"  {group}" if place else name
+            turned, heading = values["backward"], values["heading"]
+            if values["boxes"]:
+                for kind in ("track", "detection"):
+                    label = (head, str(values["boxes"])) if kind == "track" else ("", "")
+                    boxes.add_row(*label, kind[:5], *(_shown(values[kind][key], plain=True) for key in _DIRECTIONS))
+            if heading["boxes"]:
+                told = (_shown(heading["NEES"], plain=True), _shown(heading["coverage"]))
+                both = (_shown(heading["backward"]), _shown(turned["detection"]))
+                headings.add_row(head, str(heading["boxes"]), *both, *told)
+    if boxes.row_count:
+        yield _titled("Errors of tracks that exist with 50 % or more, and of their detections: m, rad", boxes)
+    if headings.row_count:
+        yield _titled("Headings: share that is backward, and errors against the variance (NEES 1)", headings)
+    for note in notes:
+        yield Text(f"No errors of detections: {note}")
 
 
 def _reliability(figures: "Sequence[ClassFigures]") -> Table:

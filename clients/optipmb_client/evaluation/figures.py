@@ -15,6 +15,7 @@ from optipmb_client.datasets.nuscenes import CLASS_RANGE, NuScenesSequence
 from optipmb_client.evaluation.ab3dmot import IOU_LIMITS, Ab3dmotResult, ab3dmot_rules, evaluate_ab3dmot
 from optipmb_client.evaluation.calibration import CalibrationResult, evaluate_calibration
 from optipmb_client.evaluation.cases import Case, Rules, prepare
+from optipmb_client.evaluation.errors import ErrorResult, evaluate_errors
 from optipmb_client.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate_gospa
 from optipmb_client.evaluation.hota import HotaResult, evaluate_hota
 from optipmb_client.evaluation.hota_2d import hota_2d_rules
@@ -79,6 +80,8 @@ class ClassFigures:
     """Of the tracks from the best threshold on."""
     calibration: CalibrationResult | None
     """Where the tracks were kept with all columns."""
+    errors: ErrorResult | None
+    """Likewise."""
 
     def summary(self) -> dict[str, object]:
         """Return the figures by name; None for those that are not there."""
@@ -89,6 +92,7 @@ class ClassFigures:
             "hota_centre": {key: one.hota.summary() if one else None for key, one in parts.items()},
             "gospa": {key: one.gospa.summary() if one else None for key, one in parts.items()},
             "calibration": self.calibration.summary() if self.calibration else None,
+            "errors": self.errors.summary() if self.errors else None,
         }
 
 
@@ -145,6 +149,7 @@ def evaluate_figures(
         protocol = tuple(evaluate_ab3dmot(cases.boxes, limit) for limit in settings.limits if local)
         threshold = thresholds.get(name, protocol[0].threshold if protocol else -np.inf)
         kept = [(one.truth, one.tracks, one.full) for one in recordings if one.full is not None]
+        whole = [(one.sequence, one.truth, one.tracks, one.full) for one in recordings if one.full is not None]
         figures.append(
             ClassFigures(
                 name=name,
@@ -152,6 +157,7 @@ def evaluate_figures(
                 everything=cases.evaluate(-np.inf),
                 best=cases.evaluate(threshold) if np.isfinite(threshold) else None,
                 calibration=evaluate_calibration(kept, name, cases.near) if kept else None,
+                errors=evaluate_errors(whole, name, cases.near) if whole else None,
             )
         )
     return figures
