@@ -212,6 +212,7 @@ def _state(state: FilterState) -> dict[str, Any]:
         "starts": state.starts,
         "generation": state.generation,
         "course": [cursor.epoch, cursor.seq, cursor.era, cursor.generation, cursor.newest_ns, cursor.floor_ns],
+        "jumped": [cursor.jumped, cursor.jumped_ns],
         "last": None if state.last is None else [state.last.epoch, state.last.seq, state.last.stamp_ns],
         "tracked": None if state.tracked is None else list(state.tracked),
         "tracks": state.tracks,
@@ -301,6 +302,7 @@ def _read_state(one: Document, stream: str, parameters: optipmb.Parameters, *, e
     session = one.identity("session")
     convert.density_of(density, stream=stream, session=session, parameters=parameters)  # it can be asked for
     cursor = one.row("course", 6)
+    jumped = None if one.absent("jumped") else one.row("jumped", 2)  # an earlier version had none
     last = None if one.absent("last") else one.row("last", 3)
     tracked = None if one.absent("tracked") else one.row("tracked", 2)
     where = one.document("whereabouts")
@@ -316,6 +318,8 @@ def _read_state(one: Document, stream: str, parameters: optipmb.Parameters, *, e
             cursor.count("3"),
             cursor.whole("4"),
             cursor.optional("5", cursor.whole),
+            0 if jumped is None else jumped.count("0"),
+            0 if jumped is None else jumped.whole("1"),
         ),
         last=None if last is None else FrameId(last.epoch("0"), last.whole("1"), last.whole("2")),
         tracked=None if tracked is None else (tracked.epoch("0"), tracked.whole("1")),

@@ -23,10 +23,25 @@ CODES: Final = {
     ),
     "duplicate_epoch": ("A publisher that another one has replaced still sends.", "Stop one of the two publishers."),
     "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or give more processors."),
-    "refused": ("No room for another session, or a change that needs a restart.", "Raise `max_sessions`; see `path`."),
+    "refused": (
+        "No room for another session, or a change that needs a restart.",
+        "Raise `max_sessions` or quotas; see `path`.",
+    ),
+    "quota": (
+        "The node, or its site, sends more than its quota of messages or bytes; the message is refused.",
+        "Send less, or raise `node_rate`, `node_mb_s`, `site_rate`, `site_mb_s`.",
+    ),
     "astray": (
         "The sensor cannot have got there since its last frame; the frame is refused.",
         "Check the localisation; if it is right, raise `max_speed`.",
+    ),
+    "time_jump": (
+        "The stamp lies far from those before it; the frame is refused until several in a row agree.",
+        "Check the sensor's clock.",
+    ),
+    "restarted": (
+        "The session began anew: its tracks have ended, ids go on. `received` says why, and how far the stamps jumped.",
+        "After a `jump` or `pose`: check clock and localisation. A `publisher` that was restarted later: nothing.",
     ),
     "overload": (
         "The frame needs more computing than one may, or the frames of the stream did; it is refused.",

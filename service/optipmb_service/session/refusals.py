@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from optipmb_service.session.problems import problem_of
+from optipmb_service.session.timeline import JUMP_FRAMES
 from optipmb_service.session.values import SECOND
 
 if TYPE_CHECKING:
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     import optipmb
     from optipmb_service.session.state import Entry
     from optipmb_service.session.timeline import FrameId
-    from optipmb_service.session.values import Policy
+    from optipmb_service.session.values import Begun, Policy
 
 
 class Refusals:
@@ -47,6 +48,17 @@ class Refusals:
         received = "nothing" if pose is None else ", ".join(f"{value:.1f}" for value in pose.translation)
         expected = f"a position within reach of the last one at {policy.max_speed:g} m/s"
         return self._problem("astray", entry.frame_id, "pose.translation", expected, received)
+
+    def unconfirmed(self, entry: Entry) -> schemas.Problem:
+        """A stamp far from the others."""
+        received = f"{entry.place.jump_ns / SECOND:+.3f} s"
+        expected = f"a stamp near the one before, or {JUMP_FRAMES} frames in a row that agree on the jump"
+        return self._problem("time_jump", entry.frame_id, "stamp_ns", expected, received)
+
+    def restarted(self, entry: Entry, begun: Begun) -> schemas.Problem:
+        """A session that began anew: all its tracks have ended."""
+        received = f"{begun.reason}, {begun.jump_ns / SECOND:+.3f} s"
+        return self._problem("restarted", entry.frame_id, "", "a stream that goes on", received)
 
     def effort(self, frame_id: FrameId, error: optipmb.EffortError) -> schemas.Problem:
         """A frame that needs too much computing."""

@@ -148,7 +148,7 @@ class ReorderWindow:
         later: Entry | None = None
         for entry in reversed(self._entries):
             if later is not None and later.place.generation == entry.place.generation:
-                elapsed += later.frame_id.stamp_ns - entry.frame_id.stamp_ns
+                elapsed += later.time_ns - entry.time_ns
             weight += entry.weight
             if number >= most or weight > most_bytes or (span_ns is not None and elapsed > span_ns) or span_ns == 0:
                 break

@@ -51,8 +51,11 @@ class SessionReporting:
 
     def begun(self, outcomes: Sequence[Outcome], before: str, session: str) -> list[Output]:
         """Tell of the life that frames began, the last one if there were several; of none when the id is as before."""
-        begins = next((one.begins for one in reversed(outcomes) if one.begins), None)
-        return [] if begins is None or session == before else [Begun(session, begins.reason, begins.jump_ns)]
+        last = next((one for one in reversed(outcomes) if one.begins), None)
+        if last is None or last.begins is None or session == before:
+            return []
+        begun = Begun(session, last.begins.reason, last.begins.jump_ns)
+        return [begun] if begun.reason == "first" else [begun, self.complain.restarted(last.entry, begun)]
 
     def tracked(
         self, outcomes: Sequence[Outcome], parameters: optipmb.Parameters, ticket: Any, took_ns: int, run: int
@@ -82,6 +85,8 @@ class SessionReporting:
         unknown = self.complain.unknown(outcome.entry.frame_id, outcome.unknown, parameters)
         if outcome.tracks is not None:
             return list(unknown)
+        if outcome.entry.place.opens is Verdict.UNCONFIRMED:
+            return [*unknown, self.complain.unconfirmed(outcome.entry)]
         if outcome.effort is not None:
             return [*unknown, self.complain.effort(outcome.entry.frame_id, outcome.effort)]
         return [*unknown, self.complain.astray(outcome.entry, self._policy)]
@@ -95,7 +100,7 @@ class SessionReporting:
             late=deliveries.late,
             inserted=deliveries.inserted,
             corrected=deliveries.corrected,
-            refused=deliveries.refused + counts.astray + counts.effort,
+            refused=deliveries.refused + counts.astray + counts.effort + counts.unconfirmed,
             gaps=counts.gaps,
             new_epochs=counts.new_epochs,
             clouds_used=counts.clouds_used,

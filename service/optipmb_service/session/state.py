@@ -29,6 +29,7 @@ class FrameCounts:
         clouds_missed: that waited for a cloud in vain.
         astray: refused because the sensor cannot have been there.
         effort: refused because they need too much computing.
+        unconfirmed: refused because their stamps jumped and no others agreed.
         repaired: covariances that had lost rank in rounding and were repaired.
     """
 
@@ -39,6 +40,7 @@ class FrameCounts:
     clouds_missed: int = 0
     astray: int = 0
     effort: int = 0
+    unconfirmed: int = 0
     repaired: int = 0
 
 
@@ -124,6 +126,11 @@ class Entry:
     def order(self) -> tuple[int, int, int]:
         """The key by which frames are processed."""
         return self.place.order(self.frame_id)
+
+    @property
+    def time_ns(self) -> int:
+        """The stamp by which it is ordered."""
+        return self.place.time_ns(self.frame_id)
 
 
 def size_of(message: schemas.Detections, points: schemas.Points | None) -> int:

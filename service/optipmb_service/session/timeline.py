@@ -4,7 +4,8 @@ Conventions. A frame is known by its `FrameId`: the epoch of its publisher (new 
 number in that epoch, and the sensor's stamp in nanoseconds. Two clocks occur and are never mixed: sensor stamps, and
 the local monotonic clock (`now_ns`), which serves only for waiting.
 
-A stream is cut into *eras*: a new one begins with every publisher epoch and with every jump of the stamps. A
+A stream is cut into *eras*: a new one begins with every publisher epoch and with every jump of the stamps that several
+frames agree on. A
 *generation* is what one density lives through: eras that only continue another share it, a restart begins the next
 one. Where the cuts lie follows from the frames in their publisher's order, epoch by epoch and number by number
 (`Cursor.follow`); within an era frames are processed by stamp, equal stamps by sequence number.
@@ -24,6 +25,9 @@ from typing import Final
 WINDOW: Final = 1024
 """How many sequence numbers back a frame of an epoch is remembered; older unseen ones count as late."""
 
+JUMP_FRAMES: Final = 3
+"""Frames of one epoch that must agree on a jump of the stamps before it is believed."""
+
 EPOCHS: Final = 32
 """How many publisher epochs are remembered."""
 
@@ -40,6 +44,8 @@ class Verdict(StrEnum):
     """The publisher was restarted and its stamps go on: the density is kept, sequence numbers begin anew."""
     RESTART = "restart"
     """The stamps jumped, ahead or back: this session begins anew with this frame."""
+    UNCONFIRMED = "unconfirmed"
+    """The stamp jumped, and the frames before it do not agree: it has a place, and is refused when its turn comes."""
     INSERTED = "inserted"
     """Frames behind it came before it, and it is inside the window: it is put in its place."""
     DUPLICATE = "duplicate"
@@ -81,7 +87,8 @@ class Placement:
         era: the era that it belongs to.
         generation: counts restarts; a frame of a higher generation than the one before it starts the session anew.
         floor_ns: in an era that continues another, the stamp that the other one reached; None elsewhere.
-        opens: whether it begins its era, and how: first, new_epoch, restart; next where it does not.
+        opens: whether it begins its era, and how: first, new_epoch, restart; next where it does not, unconfirmed where
+            its stamp jumped and nothing follows from it yet.
         jump_ns: how far its stamp lies from the newest one before it in its publisher's order.
     """
 
@@ -90,10 +97,16 @@ class Placement:
     floor_ns: int | None
     opens: Verdict
     jump_ns: int
+    at_ns: int | None = None
+    """The stamp by which a frame is ordered whose own cannot be believed."""
+
+    def time_ns(self, frame_id: FrameId) -> int:
+        """Return the stamp by which the frame is ordered."""
+        return frame_id.stamp_ns if self.at_ns is None else self.at_ns
 
     def order(self, frame_id: FrameId) -> tuple[int, int, int]:
         """Return the key by which frames are processed."""
-        return self.era, frame_id.stamp_ns, frame_id.seq
+        return self.era, self.time_ns(frame_id), frame_id.seq
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +120,8 @@ class Cursor:
         generation: number of restarts.
         newest_ns: highest stamp of the era.
         floor_ns: see `Placement`.
+        jumped: frames in a row whose stamps jumped, the last one as far as the ones before it.
+        jumped_ns: stamp of the last of these.
     """
 
     epoch: bytes | None = None
@@ -115,6 +130,8 @@ class Cursor:
     generation: int = 0
     newest_ns: int = 0
     floor_ns: int | None = None
+    jumped: int = 0
+    jumped_ns: int = 0
 
     def follow(self, frame_id: FrameId, gap_limit_ns: int) -> Placement:
         """Return the place of the frame that comes next in its publisher's order."""
@@ -123,15 +140,28 @@ class Cursor:
         jump_ns = frame_id.stamp_ns - self.newest_ns
         if frame_id.epoch != self.epoch and 0 < jump_ns <= gap_limit_ns:
             return Placement(self.era + 1, self.generation, self.newest_ns, Verdict.NEW_EPOCH, jump_ns)
+        if frame_id.epoch == self.epoch and abs(jump_ns) > gap_limit_ns and self._agreeing(frame_id) < JUMP_FRAMES:
+            return Placement(
+                self.era, self.generation, self.floor_ns, Verdict.UNCONFIRMED, jump_ns, at_ns=self.newest_ns
+            )
         if frame_id.epoch != self.epoch or abs(jump_ns) > gap_limit_ns:
             return Placement(self.era + 1, self.generation + 1, None, Verdict.RESTART, jump_ns)
         return Placement(self.era, self.generation, self.floor_ns, Verdict.NEXT, jump_ns)
 
     def after(self, frame_id: FrameId, place: Placement) -> Cursor:
         """Return the course after a frame at its place."""
+        if place.opens is Verdict.UNCONFIRMED:
+            jumped = self._agreeing(frame_id)
+            return replace(self, seq=max(self.seq, frame_id.seq), jumped=jumped, jumped_ns=frame_id.stamp_ns)
         newest_ns = max(self.newest_ns, frame_id.stamp_ns) if place.era == self.era else frame_id.stamp_ns
         seq = max(self.seq, frame_id.seq) if frame_id.epoch == self.epoch else frame_id.seq
         return Cursor(frame_id.epoch, seq, place.era, place.generation, newest_ns, place.floor_ns)
+
+    def _agreeing(self, frame_id: FrameId) -> int:
+        """Return how many frames in a row say that the clock is where this one says: their stamps go on from there."""
+        step_ns = frame_id.stamp_ns - self.jumped_ns
+        agrees = self.jumped > 0 and 0 < step_ns <= abs(frame_id.stamp_ns - self.newest_ns)
+        return self.jumped + 1 if agrees else 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,7 +288,7 @@ class Timeline:
         place = self.tip.follow(frame_id, self.gap_limit_ns)
         if not self._free(frame_id, place):
             return self._refuse(frame_id, Verdict.LATE)
-        behind = place.era == self.tip.era and frame_id.stamp_ns < self.tip.newest_ns
+        behind = place.era == self.tip.era and place.time_ns(frame_id) < self.tip.newest_ns
         epochs, frame_ids, tip = (
             self._remember(frame_id, number),
             (*self.frame_ids, frame_id),

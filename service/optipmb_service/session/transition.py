@@ -54,7 +54,7 @@ class Outcome:
 
     Attributes:
         entry: the frame.
-        tracks: its tracks, without their delivery part; None: it was refused, as astray or for its effort.
+        tracks: its tracks, without their delivery part; None: it was refused.
         begins: whether a life began with it.
         unknown: the classes that the profile lacks, with the number of objects of each, when not reported before.
         effort: why the frame was refused, when it needs more computing than a frame may.
@@ -99,6 +99,10 @@ class Transition:
             Exception: whatever the tracker raises.
         """
         frame_id, place = entry.frame_id, entry.place
+        if place.opens is Verdict.UNCONFIRMED:
+            # What comes after is judged, and put in order, as if it had not been there.
+            passed = _passed(before, entry, before.pose_history, unconfirmed=1)
+            return replace(passed, last=before.last), Outcome(entry, None, None, {})
         begins = _begins(before, entry)
         known = PoseHistory() if begins else before.pose_history
         pose_history, where = judge(known, frame_id.stamp_ns, position_of(entry.message), self._policy)
@@ -171,20 +175,27 @@ class Transition:
 
 
 def _passed(
-    before: FilterState, entry: Entry, pose_history: PoseHistory, *, astray: int = 0, effort: int = 0
+    before: FilterState,
+    entry: Entry,
+    pose_history: PoseHistory,
+    *,
+    astray: int = 0,
+    effort: int = 0,
+    unconfirmed: int = 0,
 ) -> FilterState:
     """Return the state after a frame that is refused."""
-    counts = _counted(before.counts, entry, astray=astray, effort=effort)
+    counts = _counted(before.counts, entry, astray=astray, effort=effort, unconfirmed=unconfirmed)
     cursor = before.cursor.after(entry.frame_id, entry.place)
     return replace(before, cursor=cursor, last=entry.frame_id, counts=counts, pose_history=pose_history)
 
 
-def _counted(
+def _counted(  # noqa: PLR0913 - all keywords, each a count
     before: FrameCounts,
     entry: Entry,
     *,
     astray: int = 0,
     effort: int = 0,
+    unconfirmed: int = 0,
     tracked: int = 0,
     gap: int = 0,
     used: bool = False,
@@ -199,6 +210,7 @@ def _counted(
         clouds_missed=before.clouds_missed + entry.missed,
         astray=before.astray + astray,
         effort=before.effort + effort,
+        unconfirmed=before.unconfirmed + unconfirmed,
         repaired=before.repaired + repaired,
     )
 

@@ -36,7 +36,7 @@ def test_the_same_messages_give_the_same_bytes() -> None:
 
     def run() -> list[bytes]:
         one, outputs = session(), []
-        for seq in (0, 1, 2, 2, 5, 6, 90, 91):
+        for seq in (0, 1, 2, 2, 5, 6, 90, 91, 92, 93):
             outputs += one.on_points(SENSOR.points(seq), 0)
             outputs += one.on_detections(SENSOR.detections(seq), 0)
         outputs += one.on_detections(replace(SENSOR, epoch=b"f" * 16).detections(0), 0)
@@ -321,3 +321,24 @@ def test_equal_stamps_are_tracked() -> None:
     outputs += one.on_detections(SENSOR.detections(1, stamp_ns=SENSOR.stamp_ns(0)), 0)
     assert [message.seq for message in tracks(outputs)] == [0, 1]
     assert SENSOR.stamp_ns(1) - SENSOR.stamp_ns(0) == SECOND // 10
+
+
+def test_a_stamp_ahead_ends_no_track() -> None:
+    """One stamp six seconds ahead, twice: both frames are refused with a problem, and the tracks go on."""
+    one = session()
+    before = tracks(feed(one, range(5)))[-1]
+    for seq in (5, 7):
+        ahead = one.on_detections(SENSOR.detections(seq, stamp_ns=SENSOR.stamp_ns(seq) + 6 * SECOND), 0)
+        assert ([problem.code for problem in problems(ahead)], tracks(ahead)) == (["time_jump"], [])
+        after = tracks(feed(one, [seq + 1]))[0]
+        assert (after.session, list(after.id)) == (before.session, list(before.id))
+    assert (one.counters.refused, one.counters.new_epochs) == (2, 0)
+
+
+def test_a_jump_that_frames_agree_on_is_told() -> None:
+    """Three frames in a row an hour ahead begin a new session, which is a problem of its own kind."""
+    one = session()
+    feed(one, range(5))
+    outputs = feed(one, range(5, 9), replace(SENSOR, start_s=SENSOR.start_s + 3600))
+    assert [problem.code for problem in problems(outputs)] == ["time_jump", "time_jump", "restarted"]
+    assert (begun(outputs), len(tracks(outputs))) == (["jump"], 2)

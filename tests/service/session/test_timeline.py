@@ -26,7 +26,8 @@ def judge_all(marks: list[FrameId], *, window: bool = False) -> tuple[list[Decis
         decision, timeline = timeline.judge(one)
         decisions.append(decision)
         if decision.verdict.admitted and not window:
-            cursor, floor = cursor.after(one, decision.place), one
+            cursor = cursor.after(one, decision.place)
+            floor = floor if decision.verdict is Verdict.UNCONFIRMED else one
             timeline = timeline.settle(cursor, floor, frozenset(timeline.frame_ids))
     return decisions, timeline
 
@@ -61,7 +62,7 @@ def test_time_never_goes_back_in_a_generation(arrived: list[FrameId]) -> None:
     stamps: dict[int, int] = {}
     places: dict[int, tuple[int, int]] = {}
     for one, decision in zip(arrived, decisions, strict=True):
-        if decision.verdict.admitted:
+        if decision.verdict.admitted and decision.verdict is not Verdict.UNCONFIRMED:
             era, generation = decision.place.era, decision.place.generation
             assert one.stamp_ns >= stamps.get(generation, 0)
             assert (one.stamp_ns, one.seq) > places.get(era, (-1, -1))
@@ -93,7 +94,7 @@ def test_places_do_not_depend_on_arrival(order: list[FrameId]) -> None:
 def test_the_frame_between_undoes_a_jump() -> None:
     """Frames that were lost between others made a jump of them; when they come after all there was none."""
     late = [mark(0, 0), mark(2, 8), mark(1, 4)]
-    assert verdicts(late, window=True) == [Verdict.FIRST, Verdict.RESTART, Verdict.INSERTED]
+    assert verdicts(late, window=True) == [Verdict.FIRST, Verdict.UNCONFIRMED, Verdict.INSERTED]
     _, timeline = judge_all(late, window=True)
     assert {place.generation for place in timeline.places().values()} == {0}
 
@@ -143,23 +144,46 @@ def test_a_frame_behind_a_processed_one_is_late() -> None:
 
 
 def test_a_jump_restarts_the_session() -> None:
-    """A clock set by an hour, ahead or back, begins a new generation; small steps back are late frames."""
+    """A clock set by an hour, ahead or back, begins a new generation once three frames agree; small steps are late."""
     for to in (3600, -3600):
-        decisions, _ = judge_all([mark(0, 7200), mark(1, 7200.1), mark(2, 7200.2 + to), mark(3, 7200.3 + to)])
-        assert [d.verdict for d in decisions] == [Verdict.FIRST, Verdict.NEXT, Verdict.RESTART, Verdict.NEXT]
-        assert [d.place.generation for d in decisions] == [0, 0, 1, 1]
+        jumped = [mark(seq, 7200 + seq / 10 + to) for seq in range(2, 6)]
+        decisions, _ = judge_all([mark(0, 7200), mark(1, 7200.1), *jumped])
+        assert [d.verdict for d in decisions] == [
+            Verdict.FIRST,
+            Verdict.NEXT,
+            Verdict.UNCONFIRMED,
+            Verdict.UNCONFIRMED,
+            Verdict.RESTART,
+            Verdict.NEXT,
+        ]
+        assert [d.place.generation for d in decisions] == [0, 0, 0, 0, 1, 1]
     assert verdicts([mark(0, 10), mark(1, 10.1), mark(2, 9), mark(3, 10.2)])[2:] == [Verdict.LATE, Verdict.NEXT]
 
 
 def test_the_gap_limit_itself_is_no_jump() -> None:
-    """A step of exactly the limit continues, one nanosecond more restarts."""
+    """A step of exactly the limit continues, one nanosecond more is a jump."""
     assert verdicts([mark(0, 0), mark(1, 5)])[1] is Verdict.NEXT
-    assert verdicts([mark(0, 0), FrameId(A, 1, LIMIT + 1)])[1] is Verdict.RESTART
+    assert verdicts([mark(0, 0), FrameId(A, 1, LIMIT + 1)])[1] is Verdict.UNCONFIRMED
+
+
+def test_stamps_that_do_not_agree_are_no_jump() -> None:
+    """One stamp ahead, twice, or several that contradict each other: the others go on in their generation."""
+    twice = [mark(0, 0), mark(1, 6.1), mark(2, 0.2), mark(3, 6.3), mark(4, 0.4)]
+    jumped = Verdict.UNCONFIRMED
+    assert verdicts(twice) == [Verdict.FIRST, jumped, Verdict.NEXT, jumped, Verdict.NEXT]
+    wild = [mark(0, 1000), mark(1, 5000), mark(2, 100), mark(3, 9000), mark(4, 50), mark(5, 1000.5)]
+    assert verdicts(wild) == [Verdict.FIRST, jumped, jumped, jumped, jumped, Verdict.NEXT]
+
+
+def test_frames_further_apart_than_the_limit_go_on() -> None:
+    """A stream slower than the limit is not refused for ever: its frames agree with each other."""
+    assert Verdict.RESTART in verdicts([mark(seq, 10.0 * seq) for seq in range(4)])
 
 
 def test_an_old_frame_is_no_jump() -> None:
     """A frame held up for a minute somewhere is late, not a reason to begin anew; so is what was sent before a jump."""
-    assert verdicts([mark(0, 0), mark(2, 60), mark(1, 0.1), mark(3, 60.1)])[1:] == [
+    after = [mark(2, 60), mark(3, 60.1), mark(4, 60.2)]
+    assert verdicts([mark(0, 0), *after, mark(1, 0.1), mark(5, 60.3)])[3:] == [
         Verdict.RESTART,
         Verdict.LATE,
         Verdict.NEXT,
@@ -172,8 +196,9 @@ def test_what_was_sent_before_a_jump_goes_before_it() -> None:
     """A straggler from before a jump belongs to the era before it, as long as the window reaches there."""
     _, timeline = judge_all([mark(0, 0), mark(5, 6), mark(4, 1.5)], window=True)
     assert [place.era for place in timeline.places().values()] == [1, 1, 1]
-    _, timeline = judge_all([mark(0, 0), mark(5, 60), mark(4, 1.5)], window=True)
-    assert [place.era for place in timeline.places().values()] == [1, 1, 2]
+    after = [mark(5, 60), mark(6, 60.1), mark(7, 60.2)]
+    _, timeline = judge_all([mark(0, 0), *after, mark(4, 1.5)], window=True)
+    assert [place.era for place in timeline.places().values()] == [1, 1, 1, 1, 2]
 
 
 def test_a_restarted_publisher_continues_the_density() -> None:
