@@ -111,6 +111,7 @@ class Problem(Message):
     seq: Count | None = Field(default=None, description="Number of the frame, when known.")
     stamp_ns: Stamp | None = Field(default=None, description="Stamp of the frame, when known.")
     count: Count = Field(default=1, description="How many equal problems this one stands for.")
+    reported_ns: Stamp | None = Field(default=None, description="When it was reported, ns since 1970 UTC.")
 
     @classmethod
     def of(cls, error: MessageError, *, stream: str, instance: str) -> "Problem":

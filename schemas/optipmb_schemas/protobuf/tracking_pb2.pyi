@@ -188,7 +188,7 @@ class Tracks(_message.Message):
     def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
 
 class Problem(_message.Message):
-    __slots__ = ("stream", "instance", "code", "path", "expected", "received", "message", "seq", "stamp_ns", "count")
+    __slots__ = ("stream", "instance", "code", "path", "expected", "received", "message", "seq", "stamp_ns", "count", "reported_ns")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
     CODE_FIELD_NUMBER: _ClassVar[int]
@@ -199,6 +199,7 @@ class Problem(_message.Message):
     SEQ_FIELD_NUMBER: _ClassVar[int]
     STAMP_NS_FIELD_NUMBER: _ClassVar[int]
     COUNT_FIELD_NUMBER: _ClassVar[int]
+    REPORTED_NS_FIELD_NUMBER: _ClassVar[int]
     stream: str
     instance: str
     code: str
@@ -209,7 +210,8 @@ class Problem(_message.Message):
     seq: int
     stamp_ns: int
     count: int
-    def __init__(self, stream: _Optional[str] = ..., instance: _Optional[str] = ..., code: _Optional[str] = ..., path: _Optional[str] = ..., expected: _Optional[str] = ..., received: _Optional[str] = ..., message: _Optional[str] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., count: _Optional[int] = ...) -> None: ...
+    reported_ns: int
+    def __init__(self, stream: _Optional[str] = ..., instance: _Optional[str] = ..., code: _Optional[str] = ..., path: _Optional[str] = ..., expected: _Optional[str] = ..., received: _Optional[str] = ..., message: _Optional[str] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., count: _Optional[int] = ..., reported_ns: _Optional[int] = ...) -> None: ...
 
 class SessionState(_message.Message):
     __slots__ = ("stream", "session", "state", "profile", "epoch", "seq", "stamp_ns", "received", "frames", "duplicates", "late", "inserted", "corrected", "refused", "shed", "gaps", "new_epochs", "clouds_used", "clouds_missed", "repaired", "clouds_refused", "tracks", "bernoullis", "poissons", "next_id", "queue", "digest")

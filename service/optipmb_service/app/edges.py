@@ -36,9 +36,9 @@ def monitoring(settings: Settings, source: Monitored) -> Iterator[None]:
     if not settings.http:
         yield
         return
-    from optipmb_service.http import Server, application, page  # noqa: PLC0415 - a third of a second that only this needs
+    from optipmb_service.http import KnownHosts, Server, application, page  # noqa: PLC0415 - a third of a second that only this needs
 
-    server = Server(application(source, page(source)), settings.http)
+    server = Server(KnownHosts(application(source, page(source)), settings.http_hosts), settings.http)
     log.info("http", address=server.address)
     try:
         yield

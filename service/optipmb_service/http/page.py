@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from starlette.requests import Request
     from starlette.routing import BaseRoute
+    from starlette.types import Receive, Scope, Send
 
 PERIOD_S: Final = 0.1
 """A viewer gets no more than one frame in this time."""
@@ -90,6 +91,21 @@ def _status(watched: Watched) -> Callable[[Request], Response]:
     return endpoint
 
 
+class _Counted(StreamingResponse):
+    """Events for one viewer, and what is called when they end, however they do."""
+
+    def __init__(self, events: AsyncIterator[str], leave: Callable[[], None]) -> None:
+        super().__init__(events, media_type="text/event-stream", headers=HEADERS)
+        self._leave = leave
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer."""
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._leave()
+
+
 class _Viewers:
     """Those who look at a stream now."""
 
@@ -106,14 +122,17 @@ class _Viewers:
             return PlainTextResponse(str(error), status_code=400, headers=HEADERS)
         if self._count >= VIEWERS:
             return PlainTextResponse(f"{VIEWERS} viewers are here already", status_code=503, headers=HEADERS)
-        return StreamingResponse(self._events(stream), media_type="text/event-stream", headers=HEADERS)
+        self._count += 1  # before anything is awaited: those who come together are counted one by one
+        return _Counted(self._events(stream), self._leave)
+
+    def _leave(self) -> None:
+        self._count -= 1
 
     async def _events(self, stream: str) -> AsyncIterator[str]:
         newest = Newest(asyncio.get_running_loop())
         release = await asyncio.to_thread(self._watched.tap, stream, newest.put)
         if release is None:
             return
-        self._count += 1
         try:
             yield ": hello\n\n"  # the headers go with the first piece: the viewer knows that it is connected
             while self._watched.state() != "stopping":
@@ -127,5 +146,4 @@ class _Viewers:
                     yield f"data: {text}\n\n"
                 await asyncio.sleep(PERIOD_S)
         finally:
-            self._count -= 1
             asyncio.get_running_loop().run_in_executor(None, release)  # not awaited: the viewer's task may be cancelled

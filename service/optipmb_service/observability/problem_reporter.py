@@ -1,14 +1,14 @@
 """Reports problems to people and programs, at a bounded rate whatever arrives.
 
 The first problem of a kind is published and logged at once; what follows becomes one summary a second that counts them
-all. Kinds that come and go without end (garbage on ever new keys) share a total rate. Nothing here reads a clock or
-sends anything.
+all. Kinds that come and go without end (garbage on ever new keys) share a total rate. Nothing here sends anything.
 """
 
 from __future__ import annotations
 
 import re
 import threading
+import time
 from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -73,9 +73,16 @@ class ProblemReporter:
     Args:
         publish: sends a problem on its stream's key.
         log: writes a line about a problem; the second argument is how many it stands for.
+        wall: the time, ns since 1970, that problems are reported with.
     """
 
-    def __init__(self, publish: Callable[[schemas.Problem], None], log: Callable[[schemas.Problem, int], None]) -> None:
+    def __init__(
+        self,
+        publish: Callable[[schemas.Problem], None],
+        log: Callable[[schemas.Problem, int], None],
+        wall: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._wall = wall
         self._publish = publish
         self._log = log
         self._lock = threading.Lock()
@@ -135,6 +142,7 @@ class ProblemReporter:
         log = log and self._logged.take(now_ns)
         if problem is None or not (publish or log):
             return None
+        problem = problem.model_copy(update={"reported_ns": self._wall()})
         told = _Summary(problem, published=kind.gathered if publish else 0, logged=kind.unlogged if log else 0)
         if publish:
             kind.gathered, kind.published_ns = 0, now_ns

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import pytest
 from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
-from optipmb_service.http import Server, application
+from optipmb_service.http import KnownHosts, Server, application
 from optipmb_service.observability.metrics import METRICS, NAMESPACE
 from optipmb_service.runtime.ports import HttpError
 from prometheus_client.parser import text_string_to_metric_families
@@ -92,7 +92,7 @@ def get(address: str, path: str) -> tuple[int, str]:
 @contextmanager
 def served(source: Said, *routes: Route) -> Iterator[str]:
     """The application on a free port; gives its address."""
-    server = Server(application(source, routes), "127.0.0.1:0")
+    server = Server(KnownHosts(application(source, routes), ["tracker.example.org"]), "127.0.0.1:0")
     try:
         yield server.address
     finally:
@@ -123,6 +123,29 @@ def test_health_follows_the_heartbeat() -> None:
         assert (get(address, "/healthz")[0], ask(address, ready=False)[0]) == (200, True)
         source.age_s = 11.0
         assert (get(address, "/healthz")[0], ask(address, ready=False)[0]) == (503, False)
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("127.0.0.1:8080", 200),
+        ("[::1]:8080", 200),
+        ("LOCALHOST", 200),
+        ("service-1:8080", 200),
+        ("Tracker.Example.org:8080", 200),
+        ("stranger.example.org", 421),
+        ("127.0.0.1.example.org:8080", 421),
+        ("", 421),
+    ],
+)
+def test_a_host_that_is_not_the_service_s_is_refused(host: str, status: int) -> None:
+    """A name that a stranger lets point here gets no answer; addresses, plain names and those of the settings do."""
+    with served(Said()) as address:
+        name, _, port = address.rpartition(":")
+        connection = http.client.HTTPConnection(name, int(port), timeout=10)
+        connection.request("GET", "/healthz", headers={"host": host})
+        assert connection.getresponse().status == status
+        connection.close()
 
 
 @pytest.mark.parametrize("state", ["starting", "stopping"])

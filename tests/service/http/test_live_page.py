@@ -63,6 +63,8 @@ class Watched:
     def __init__(self) -> None:
         self.taps: dict[int, Callable[[str, bytes, str], None]] = {}
         self.now = "ready"
+        self.gate = threading.Event()
+        self.gate.set()
         self._changed = threading.Condition()
 
     def state(self) -> str:
@@ -78,6 +80,7 @@ class Watched:
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
         """Keep what is to be called."""
         assert stream == STREAM
+        assert self.gate.wait(DEADLINE_S)
         number = id(receive)
         with self._changed:
             self.taps[number] = receive
@@ -220,6 +223,18 @@ def test_there_is_room_for_so_many_viewers(watched: Watched, address: str) -> No
         watched.wait_taps(VIEWERS - 1)
         with looking(address):
             watched.wait_taps(VIEWERS)
+
+
+def test_viewers_that_come_together_are_counted_one_by_one(watched: Watched, address: str) -> None:
+    """More than there is room for, all before the first has its tap: those beyond the limit are asked to come back."""
+    watched.gate.clear()
+    with contextlib.ExitStack() as stack:
+        path = f"/live?stream={STREAM}"
+        answers = [stack.enter_context(asked(address, path)) for _ in range(VIEWERS + 4)]
+        assert sorted(one.status for one in answers) == [200] * VIEWERS + [503] * 4
+        watched.gate.set()
+        watched.wait_taps(VIEWERS)
+    watched.wait_taps(0)
 
 
 def test_wrong_streams_and_a_service_that_starts_are_told(watched: Watched, address: str) -> None:

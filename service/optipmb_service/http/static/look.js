@@ -43,9 +43,18 @@ function list(status) {
   at("problems-title").hidden = !status.problems || status.problems.length === 0;
   at("problems").replaceChildren(...(status.problems || []).slice(-5).reverse().map((problem) => {
     const often = problem.count > 1 ? ` (${problem.count} times)` : "";
-    return made("li", `${problem.stream} ${problem.message}${often}`);
+    const item = made("li", ` ${problem.stream} ${problem.message}${often}`);
+    if (problem.reported_ns) item.prepend(made("time", ago(Date.now() / 1e3 - problem.reported_ns / 1e9)), " ");
+    item.prepend(made("code", problem.code), " ");
+    return item;
   }));
   if (!chosen && status.sessions.length > 0) choose(status.sessions[0].stream);
+}
+
+function ago(seconds) {
+  if (seconds < 1) return "just now";
+  const [size, unit] = [[86400, "d"], [3600, "h"], [60, "min"], [1, "s"]].find(([size]) => seconds >= size);
+  return `${Math.floor(seconds / size)} ${unit} ago`;
 }
 
 // One stream
