@@ -269,6 +269,19 @@ class Settings(BaseSettings):
     max_sessions: int = Field(
         default=1000, ge=1, le=100_000, description="streams tracked at once; further ones are refused"
     )
+    node_sessions: int = Field(
+        default=64, ge=0, le=100_000, description="streams of one node (`site/node`) tracked at once; 0: no limit"
+    )
+    node_rate: int = Field(default=2000, ge=0, le=1_000_000, description="messages a second of one node; 0: no limit")
+    node_mb_s: int = Field(default=500, ge=0, le=100_000, description="megabytes a second of one node; 0: no limit")
+    site_sessions: int = Field(
+        default=0, ge=0, le=100_000, description="streams of one site tracked at once; 0: no limit"
+    )
+    site_rate: int = Field(default=0, ge=0, le=1_000_000, description="messages a second of one site; 0: no limit")
+    site_mb_s: int = Field(default=0, ge=0, le=100_000, description="megabytes a second of one site; 0: no limit")
+    keep_days: float = Field(
+        default=30.0, ge=0, le=36_500, description="checkpoints of a stream that was silent for this long go; 0: never"
+    )
     idle_s: float = Field(
         default=600.0, gt=0, description="a session without a message for this long is closed and freed"
     )
@@ -309,6 +322,11 @@ class Settings(BaseSettings):
     http: Annotated[str, AfterValidator(_address)] = Field(
         default="",
         description="where the live page, `/healthz`, `/readyz` and `/metrics` are, as `127.0.0.1:8080`; default: none",
+    )
+    http_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)] = Field(
+        default=(),
+        description="names with a dot by which the HTTP endpoint may be asked; addresses and names without a dot always"
+        " may; `*`: any",
     )
     http_streams: int = Field(
         default=100, ge=0, le=10_000, description="streams that have series of their own in the metrics, by name"

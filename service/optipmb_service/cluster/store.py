@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
+import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
@@ -53,6 +54,9 @@ class Store(Protocol):
     def streams(self) -> tuple[str, ...]:
         """Return the streams that have a checkpoint, by name."""
 
+    def expire(self, age_s: float) -> int:
+        """Forget the streams of which nothing was saved for so long; returns how many."""
+
     def set_aside(self, stream: str, reason: str) -> None:
         """Move the newest checkpoint of a stream to those set aside; the one before it is the newest then."""
 
@@ -71,6 +75,7 @@ CREATE TABLE IF NOT EXISTS aside (
     number INTEGER PRIMARY KEY, stream TEXT NOT NULL, reason TEXT NOT NULL, data BLOB NOT NULL
 );
 CREATE TABLE IF NOT EXISTS owners (stream TEXT PRIMARY KEY, owner TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS written (stream TEXT PRIMARY KEY, at REAL NOT NULL);
 """
 
 _NEWEST: Final = "SELECT data FROM checkpoints WHERE stream = ? ORDER BY number DESC LIMIT 1"
@@ -87,13 +92,15 @@ class SqliteStore:
     Args:
         path: the file; made when it is not there.
         owner: who this process is, for `claim`.
+        clock: seconds since 1970.
 
     Raises:
         StoreError: it cannot be opened, or is no such file.
     """
 
-    def __init__(self, path: Path, owner: str = "") -> None:
+    def __init__(self, path: Path, owner: str = "", clock: Callable[[], float] = time.time) -> None:
         self._path = path
+        self._clock = clock
         self._owner = owner
         self._lock = threading.Lock()
         self._connection: sqlite3.Connection | None = None
@@ -126,6 +133,7 @@ class SqliteStore:
                     "SELECT coalesce(max(number), 0) FROM checkpoints WHERE stream = ?", (stream,)
                 ).fetchone()
                 connection.execute("INSERT INTO checkpoints VALUES (?, ?, ?)", (stream, last + 1, data))
+                connection.execute("INSERT OR REPLACE INTO written VALUES (?, ?)", (stream, self._clock()))
                 connection.execute(
                     "DELETE FROM checkpoints WHERE stream = ? AND number <= ?", (stream, last + 1 - KEPT)
                 )
@@ -142,6 +150,16 @@ class SqliteStore:
         with self._use() as connection:
             rows = connection.execute("SELECT DISTINCT stream FROM checkpoints ORDER BY stream").fetchall()
         return tuple(row[0] for row in rows)
+
+    def expire(self, age_s: float) -> int:
+        """Forget the streams of which nothing was saved for so long; one of an earlier version counts from now."""
+        now_s = self._clock()
+        old = "(SELECT stream FROM written WHERE at < ?)"
+        with self._transaction() as connection:
+            connection.execute("INSERT OR IGNORE INTO written SELECT DISTINCT stream, ? FROM checkpoints", (now_s,))
+            for table in ("checkpoints", "owners"):
+                connection.execute(f"DELETE FROM {table} WHERE stream IN {old}", (now_s - age_s,))  # noqa: S608 - constants
+            return connection.execute("DELETE FROM written WHERE at < ?", (now_s - age_s,)).rowcount
 
     def set_aside(self, stream: str, reason: str) -> None:
         """Move the newest checkpoint of a stream to those set aside; the one before it is the newest then."""
@@ -232,6 +250,11 @@ class MemoryStore:
     def streams(self) -> tuple[str, ...]:
         """Return the streams that have a checkpoint."""
         return tuple(sorted(stream for stream, kept in self._kept.items() if kept))
+
+    def expire(self, age_s: float) -> int:
+        """Keep all: it does not outlive its process."""
+        del age_s
+        return 0
 
     def set_aside(self, stream: str, reason: str) -> None:
         """Move the newest checkpoint of a stream to those set aside."""

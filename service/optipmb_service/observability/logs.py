@@ -36,10 +36,11 @@ EVENTS: Final = {
     "session_quarantined": "Tracking a stream raised `error`: its frames are refused until a reset or another start of "
     "the publisher. Its last frames are saved; report them.",
     "stream_degraded": "A message took `took_s` of processor time; the stream's messages are refused for `refused_s`.",
-    "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` elsewhere, lacking `memory`, or "
-    "`superseded` by another instance.",
+    "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` elsewhere, lacking `memory`,"
+    " `evicted` for a stream of another site, or `superseded` by another instance.",
     "checkpoint_torn": "A checkpoint cannot be read; it is set aside and the one before it is used.",
     "checkpoint_refused": "Another instance has taken the stream over; this one's checkpoint was not written.",
+    "checkpoints_expired": "The checkpoints of so many streams went: nothing was saved of them for `keep_days`.",
     "checkpoint_failed": "The checkpoint of one stream cannot be made: a fault of the service, report it."
     " The stream goes on, others are kept; the state is `degraded`.",
     "store_failed": "Checkpoints cannot be written (disk full, read-only?): tracking goes on, the state is `degraded`.",

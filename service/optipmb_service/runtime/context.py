@@ -74,7 +74,7 @@ class ActorContext:
         standby_ns: how long packets wait for a takeover.
         budget: bytes that may wait for takeovers, over all streams.
         dump: saves what is needed to see an error of a session again; returns the file.
-        room: whether a further session has room.
+        room: why a further stream has no room; empty when it has.
         admit: asked before a session begins; returns what the stream had before, None when there is no room.
         release: called when a session has ended, or was not begun, with what a later one has to know.
         discard: called when an actor without a session has nothing left to do.
@@ -100,7 +100,7 @@ class ActorContext:
     standby_ns: int
     budget: ByteBudget
     dump: Callable[[str, bytes], str]
-    room: Callable[[], bool]
+    room: Callable[[str], str]
     admit: Callable[[str], Lineage | None]
     release: Callable[[str, Lineage], None]
     discard: Callable[[Actor], None]

@@ -37,6 +37,9 @@ STORE_FILE: Final = "sessions.db"
 FAILED_NS: Final = 60 * 1_000_000_000
 """How long after the last failure a stream's checkpoint is called failing; it is tried every second while it sends."""
 
+DAY_S: Final = 86_400.0
+EXPIRE_EVERY_NS: Final = 3600 * 1_000_000_000
+
 MAX_FAILED: Final = 1024
 """Streams whose failure is remembered."""
 
@@ -126,6 +129,7 @@ class CheckpointWriter:
         interval_s: time between two rounds.
         may_write: whether this process owns a stream and may write for it now.
         owns: whether it owns it, perhaps with a write lease that has lapsed.
+        keep_s: age at which the checkpoints of a stream go; 0: never.
         report: called with a stream whose checkpoint cannot be made, and why.
     """
 
@@ -138,7 +142,10 @@ class CheckpointWriter:
         may_write: Callable[[str], bool],
         report: Callable[[str, str], None] = lambda *_: None,
         owns: Callable[[str], bool] = lambda _: False,
+        keep_s: float = 0.0,
     ) -> None:
+        self._keep_s = keep_s
+        self._expires_ns = time.monotonic_ns()
         self._owns = owns
         self._report = report
         self._store = store
@@ -236,9 +243,22 @@ class CheckpointWriter:
         while not self._ended.is_set():
             self._hurry.wait(max(0.0, self._interval_s - SETTLE_S))
             self._hurry.clear()
+            self._expire()
             self._gather()
             if not self._ended.wait(SETTLE_S):
                 self._write()
+
+    def _expire(self) -> None:
+        """Forget what has been silent for too long, now and then."""
+        now_ns = time.monotonic_ns()
+        if not self._keep_s or now_ns < self._expires_ns:
+            return
+        self._expires_ns = now_ns + EXPIRE_EVERY_NS
+        try:
+            if gone := self._store.expire(self._keep_s):
+                log.info("checkpoints_expired", streams=gone)
+        except StoreError as error:
+            self._failed(error)
 
     def _write(self) -> None:
         """Write all that is pending; what the store refuses, and what must wait for a write lease, stays pending."""
@@ -328,4 +348,4 @@ def open_persistence(
         # Tracking without memory is better than none; the status says that it is so.
         log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
         return NoPersistence(str(error))
-    return CheckpointWriter(store, settings.checkpoint_s, may_write, report, owns)
+    return CheckpointWriter(store, settings.checkpoint_s, may_write, report, owns, settings.keep_days * DAY_S)

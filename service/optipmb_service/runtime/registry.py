@@ -20,6 +20,7 @@ from optipmb_service.cluster.ownership import RoleChange
 from optipmb_service.runtime import dumps
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.context import Actor, ActorContext, Ownership
+from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
 from optipmb_service.runtime.stream_actor import StreamActor
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import SECOND, Lineage, MessageCounters, Policy
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 MAX_UNPROVEN: Final = 256
-"""Lanes at once of streams that have not sent a valid message yet."""
+"""Actors at once of streams that have not sent a valid message yet."""
 
 MAX_LIVES: Final = 65_536
 """Streams without a session whose past is remembered."""
@@ -48,6 +49,15 @@ DUMPS: Final = "quarantine"
 MAX_DUMPS: Final = 32
 
 MEGABYTE: Final = 2**20
+
+EVICT_IDLE_S: Final = 30.0
+"""Silence after which a session is closed for a stream that has none, when there is no more room."""
+
+REFUSED_NS: Final = SECOND // 10
+"""How long a stream without room is refused without another look."""
+
+EVICT_EVERY_NS: Final = SECOND
+"""A session is asked to close no more often than this."""
 
 PARTS: Final = 4
 """What a stream's memory is divided into: mailbox, clouds, frames held, window."""
@@ -104,6 +114,12 @@ class Registry:
         self._streams: dict[str, str] = {}
         self._past = MessageCounters()
         self._metrics = metrics
+        self._full: dict[str, tuple[int, str]] = {}
+        self._evicting: dict[str, int] = {}
+        self._quotas = Quotas(
+            Quota(settings.node_sessions, settings.node_rate, settings.node_mb_s * MEGABYTE),
+            Quota(settings.site_sessions, settings.site_rate, settings.site_mb_s * MEGABYTE),
+        )
         self._mailboxes = ByteBudget(settings.memory_mb * MEGABYTE // 2)
         self._context = ActorContext(
             instance=settings.instance,
@@ -134,7 +150,7 @@ class Registry:
             standby_ns=round(settings.standby_s * SECOND),
             dump=lambda stream, dump: _save(settings.folder, stream, dump),
             budget=ByteBudget(settings.standby_mb * MEGABYTE),
-            room=lambda: self._sessions < settings.max_sessions,
+            room=self._room,
             admit=self._admit,
             release=self._release,
             discard=self._discard,
@@ -159,13 +175,13 @@ class Registry:
     def frame(self, packet: Packet) -> None:
         """Hand detections to their stream; never waits."""
         self._metrics.received("detections", packet.size)
-        if (stream := self._stream_of(packet)) is not None:
+        if (stream := self._stream_of(packet)) is not None and not self._over_quota(stream, packet, frame=True):
             self._offer(stream, lambda actor: actor.mailbox.offer_frame(packet))
 
     def cloud(self, packet: Packet) -> None:
         """Hand a point cloud to its stream; never waits."""
         self._metrics.received("points", packet.size)
-        if (stream := self._stream_of(packet)) is not None:
+        if (stream := self._stream_of(packet)) is not None and not self._over_quota(stream, packet, frame=False):
             self._offer(stream, lambda actor: actor.mailbox.offer_cloud(packet))
 
     def command(self, stream: str, command: Callable[[StreamActor], None], *, urgent: bool) -> bool:
@@ -269,7 +285,45 @@ class Registry:
         if time.monotonic_ns() - actor.meter.active_ns > self._settings.idle_s * SECOND:
             actor.close_session("idle")
 
-    # Lanes
+    # Actors
+
+    def _over_quota(self, stream: str, packet: Packet, *, frame: bool) -> bool:
+        """Refuse a message for which its node, or site, has no more quota."""
+        exceeded = self._quotas.exceeded(stream, packet.size, packet.now_ns)
+        if not exceeded:
+            return False
+        with self._lock:
+            self._past += MessageCounters(received=frame, refused=frame, clouds_refused=not frame)
+        self._report("quota", stream, exceeded, "more")
+        return True
+
+    def _room(self, stream: str) -> str:
+        """Return why a further stream has no room; empty when it has. A refusal is remembered for a moment."""
+        now_ns = time.monotonic_ns()
+        until_ns, why = self._full.get(stream, (0, ""))
+        if now_ns >= until_ns:
+            why = self._look_for_room(stream)
+            if len(self._full) >= MAX_UNPROVEN:
+                self._full.clear()
+            if why:
+                self._full[stream] = now_ns + REFUSED_NS, why
+        return why
+
+    def _look_for_room(self, stream: str) -> str:
+        actors = self.actors()
+        if full := self._quotas.full(stream, (actor.stream for actor in actors)):
+            return full
+        if self._sessions < self._settings.max_sessions:
+            return ""
+        tracked = [(actor.stream, actor.meter.active_ns) for actor in actors]
+        victim = victim_of(stream, tracked, time.monotonic_ns(), round(EVICT_IDLE_S * SECOND))
+        if victim is None:
+            return f"at most {self._settings.max_sessions} streams at once"
+        if self._evicting.get(victim, 0) < time.monotonic_ns():
+            self._evicting = {victim: time.monotonic_ns() + EVICT_EVERY_NS}
+            self._report("refused", victim, f"at most {self._settings.max_sessions} streams at once", "another site's")
+            self.command(victim, lambda actor: actor.close_session("evicted"), urgent=True)
+        return "a moment: another session is being closed"
 
     def _offer(self, stream: str, offer: Callable[[StreamActor], bool | None]) -> bool:
         while True:
@@ -295,7 +349,7 @@ class Registry:
 
     @property
     def _unproven(self) -> int:
-        """Lanes of streams that have not sent a valid message, as far as is known; called with the lock."""
+        """Actors of streams that have not sent a valid message, as far as is known; called with the lock."""
         if len(self._actors) < MAX_UNPROVEN:
             return 0
         return sum(not actor.proven for actor in self._actors.values())

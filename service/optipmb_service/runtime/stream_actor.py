@@ -42,7 +42,7 @@ BATCH: Final = 8
 """Items that the thread takes before the other streams have their turn."""
 
 TURN_NS: Final = 5_000_000
-"""Processor time after which they have it in any case."""
+"""Time after which they have it in any case."""
 
 
 class StreamActor:
@@ -86,13 +86,13 @@ class StreamActor:
 
     def work(self) -> bool:
         """Take some of what waits; True: come again."""
-        ends_ns = time.thread_time_ns() + TURN_NS
+        ends_ns = time.monotonic_ns() + TURN_NS
         for _ in range(BATCH):
             taken = self.mailbox.take(urgent=self._paused)
             if taken is None:
                 break
             self._guard(self._handle, *taken)
-            if time.thread_time_ns() >= ends_ns:
+            if time.monotonic_ns() >= ends_ns:
                 break
         paused = self._paused
         if not paused:
@@ -271,7 +271,7 @@ class StreamActor:
             if coordinator.elsewhere(self.stream):
                 # Another instance tracks it, which decodes and complains; here it is kept for a takeover, if there is
                 # room for one.
-                if self._context.room():
+                if not self._context.room(self.stream):
                     coordinator.request(self.stream)
                     self._takeover.add(packet, frame=frame)
                 return
@@ -349,12 +349,11 @@ class StreamActor:
     # Sessions; to be called by the worker alone
 
     def _admitted(self, *, frame: bool) -> bool:
-        if self._context.room():
+        why = self._context.room(self.stream)
+        if not why:
             return True
         self._accounts.refuse(self.session, frame=frame)
-        self._report(
-            "refused", "", "a stream that is tracked already", "a new one; the service carries no more sessions"
-        )
+        self._report("refused", "", why, "another one; there is room for no more sessions")
         return False
 
     def _load(self) -> None:

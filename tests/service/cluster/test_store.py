@@ -158,3 +158,17 @@ def test_killed_while_saving_leaves_whole_batches(tmp_path: Path) -> None:
         for stream in store.streams():
             store.delete(stream)
         store.close()
+
+
+def test_what_was_silent_for_long_expires(tmp_path: Path) -> None:
+    """Checkpoints of which nothing was saved for an age go, with their owners; newer ones stay."""
+    now = [1000.0]
+    store = SqliteStore(tmp_path / "store.db", "one", lambda: now[0])
+    store.claim(["a/b/old", "a/b/new"])
+    store.save({"a/b/old": b"1", "a/b/new": b"1"})
+    now[0] += 500
+    store.save({"a/b/new": b"2"})
+    now[0] += 600
+    assert store.expire(1000.0) == 1
+    assert (store.streams(), store.load("a/b/new")) == (("a/b/new",), b"2")
+    store.close()

@@ -1,0 +1,87 @@
+"""What one node and one site may have: sessions, messages, bytes; and whose session goes when there is no room."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from optipmb_schemas import Keys
+from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
+from router import SECOND, Node, Sensor, until
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+KEYS = Keys()
+IDLE_NS = 30 * SECOND
+
+
+def test_a_rate_is_a_bucket_of_a_second() -> None:
+    """A burst of a second's worth passes, then what the rate lets through; other nodes of the site have their own."""
+    quotas = Quotas(Quota(messages=10), Quota())
+    taken = [quotas.exceeded("site/node/lidar", 100, 0) for _ in range(12)]
+    assert taken == [""] * 10 + ["node site/node: at most 10 messages a second"] * 2
+    assert quotas.exceeded("site/node/camera", 100, 0)
+    assert not quotas.exceeded("site/other/lidar", 100, 0)
+    assert [bool(quotas.exceeded("site/node/lidar", 1, SECOND // 10)) for _ in range(2)] == [False, True]
+
+
+def test_bytes_are_counted_over_a_site() -> None:
+    """Nodes of one site share its bytes; a large message is paid for afterwards."""
+    quotas = Quotas(Quota(), Quota(bytes=1000))
+    assert not quotas.exceeded("site/a/lidar", 3000, 0)
+    assert quotas.exceeded("site/b/lidar", 1, SECOND) == "site site: at most 1000 bytes a second"
+    assert not quotas.exceeded("site/b/lidar", 1, 4 * SECOND)
+    assert not quotas.exceeded("yard/b/lidar", 1, 0)
+
+
+def test_sessions_are_counted_per_node_and_site() -> None:
+    """A node with its share of streams gets no further one, and a site likewise."""
+    quotas = Quotas(Quota(sessions=2), Quota(sessions=3))
+    tracked = ["site/a/1", "site/a/2"]
+    assert quotas.full("site/a/3", tracked) == "node site/a: at most 2 streams at once"
+    assert quotas.full("site/b/1", tracked) == ""
+    assert quotas.full("site/c/1", [*tracked, "site/b/1"]) == "site site: at most 3 streams at once"
+
+
+def test_the_least_recently_used_makes_room() -> None:
+    """A silent session goes first; else one of the site that has most, and never one of a site that has no more."""
+    now_ns = 100 * SECOND
+    silent = [("a/n/1", 99 * SECOND), ("b/n/1", 60 * SECOND), ("a/n/2", 98 * SECOND)]
+    assert victim_of("c/n/1", silent, now_ns, IDLE_NS) == "b/n/1"
+    busy = [("a/n/1", 99 * SECOND), ("b/n/1", 97 * SECOND), ("a/n/2", 98 * SECOND)]
+    assert victim_of("c/n/1", busy, now_ns, IDLE_NS) == "a/n/2"
+    assert victim_of("a/n/3", busy, now_ns, IDLE_NS) is None
+    assert victim_of("b/n/2", busy, now_ns, IDLE_NS) is None
+
+
+def test_one_site_does_not_keep_the_others_out(start: Callable[..., Any]) -> None:
+    """A site opens all sessions; another site's stream gets one all the same, the first site's oldest is closed."""
+    service, endpoint = start(max_sessions=3)
+    greedy = [Sensor(f"greedy/node/{number}") for number in range(3)]
+    modest = Sensor("modest/node/lidar")
+    with Node(endpoint) as node:
+        for sensor in greedy:
+            node.send(sensor.detections(0))
+            node.tracks(sensor.stream, 1)
+        for seq in range(40):
+            node.send(modest.detections(seq))
+            if any(key == KEYS.tracks(modest.stream) for key, _, _ in list(node.tracks_seen.items)):
+                break
+            until(lambda seq=seq: service._registry.totals().received > 3 + seq, "it is received")  # type: ignore[misc]
+        node.tracks(modest.stream, 1)
+        assert node.problem(greedy[0].stream, "refused").expected == "at most 3 streams at once"
+        node.send(greedy[0].detections(1))
+        assert node.problem(greedy[0].stream, "refused")
+        assert modest.stream in {one.stream for one in service.status().sessions}
+
+
+def test_a_flood_is_refused_and_counted(start: Callable[..., Any]) -> None:
+    """A node beyond its rate gets a problem, its messages count as refused, and another node is tracked."""
+    service, endpoint = start(node_rate=20)
+    flood, other = Sensor("site/flood/lidar"), Sensor("site/other/lidar")
+    with Node(endpoint) as node:
+        node.send(*(flood.detections(seq) for seq in range(100)), other.detections(0))
+        assert "node site/flood: at most 20 messages" in node.problem(flood.stream, "quota").expected
+        node.tracks(other.stream, 1)
+        until(lambda: service.status().received == 101, "all are counted")
+        assert service.status().refused > 0
