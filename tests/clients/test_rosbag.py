@@ -103,7 +103,7 @@ def test_a_bag_of_tracks_says_what_is_known_of_them(bag: Path, tmp_path: Path) -
     done = optipmb("track", bag, "--profile", "scene", "--out", tmp_path / "tracks.mcap")
     assert done.returncode == 0, done.stderr
     found = decoded(tmp_path / "tracks.mcap")
-    assert set(found) == {f"/detector/boxes/tracks{end}" for end in ("", "/detections", "/markers")}
+    assert set(found) == {f"/detector/boxes/tracks{end}" for end in ("", "/detections", "/markers", "/predicted")}
     messages = found["/detector/boxes/tracks"]
     objects = [one for _, message in messages for one in message.objects]
     assert (len(messages), len(objects)) == (20, len(table))
@@ -138,6 +138,12 @@ def test_a_bag_of_tracks_says_what_is_known_of_them(bag: Path, tmp_path: Path) -
     detections = [one for _, message in found["/detector/boxes/tracks/detections"] for one in message.detections]
     assert [int(one.id) for one in detections] == table.id.tolist()
     assert [one.results[0].hypothesis.score for one in detections] == table.score.tolist()
+    predicted = [one for _, message in found["/detector/boxes/tracks/predicted"] for one in message.objects]
+    assert [bytes(one.object_id.uuid) for one in predicted] == [bytes(one.object_id.uuid) for one in objects]
+    for row, one in enumerate(predicted):
+        (path,) = one.kinematics.predicted_paths
+        assert (len(path.path), path.time_step.sec, path.time_step.nanosec) == (7, 0, 500_000_000)
+        np.testing.assert_allclose([path.path[0].position.x, path.path[0].position.y], table.center[row, :2])
     for _, message in found["/detector/boxes/tracks/markers"]:
         assert message.markers[0].action == 3
         assert {one.header.frame_id for one in message.markers} == {"map"}

@@ -14,7 +14,7 @@ import zenoh.ext
 from optipmb_client.datasets import DataSequence, open_dataset
 from optipmb_client.offline import read_profile, track_sequence
 from optipmb_schemas.ros2.arrays import CLOUD
-from optipmb_schemas.ros2.tracks import DETECTION_ARRAY, MARKERS, TRACKED
+from optipmb_schemas.ros2.tracks import TOPICS, TRACKED
 from optipmb_schemas.ros2.types import own_types
 from optipmb_service.ros2 import graph
 from ros2_client import Ros2Client, hash_by_sdk
@@ -137,18 +137,13 @@ def told(client: Ros2Client, text: str) -> str:
 def ready_client(service: ServiceProcess) -> Ros2Client:
     """Start a node that listens to what the bridge publishes; returns when the bridge is heard."""
     client = Ros2Client(service.endpoint, DOMAIN)
-    for topic, kind in (
-        (TRACKS, TRACKED),
-        (f"{TRACKS}/detections", DETECTION_ARRAY),
-        (f"{TRACKS}/markers", MARKERS),
-        ("/diagnostics", DIAGNOSTICS),
-    ):
+    for topic, kind in (*((TRACKS + end, kind) for end, kind in TOPICS.items()), ("/diagnostics", DIAGNOSTICS)):
         client.subscribe(topic, kind)
     client.wait("/diagnostics", bool)
     return client
 
 
-@pytest.mark.parametrize("kind", [TRACKED, DETECTION_ARRAY, MARKERS, DIAGNOSTICS, TF, CLOUD, bags.AUTOWARE])
+@pytest.mark.parametrize("kind", [*TOPICS.values(), DIAGNOSTICS, TF, CLOUD, bags.AUTOWARE])
 def test_hashes_of_types_are_those_of_another_library(kind: str) -> None:
     """Two programs compute the same hash of every type that is used live."""
     assert own_types().hash_of(kind) == hash_by_sdk(kind)

@@ -2,14 +2,17 @@
 
 import math
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from optipmb_schemas import MessageError
 from optipmb_schemas.ros2.arrays import boxes_of, points_of
+from optipmb_schemas.ros2.tracks import TrackColumns, predicted_paths
 from optipmb_schemas.ros2.transforms import TransformError, Transforms
 from optipmb_schemas.ros2.types import own_types
+
+from optipmb.motion import ctra_displacement
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -218,3 +221,23 @@ def test_other_shapes_become_boxes() -> None:
     for changes in ({"type": 2}, {"type": 7}):
         with pytest.raises(MessageError, match=r"objects\[0\].shape"):
             boxes_of(autoware(**changes))
+
+
+def test_paths_are_those_of_the_motion_model() -> None:
+    """The path of an object is what CTRA of the tracker says; one that brakes stops and does not go back."""
+    tracks = SimpleNamespace(
+        yaw=np.array([0.3, 0.0, math.pi]),
+        center=np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]),
+        velocity=np.array([[8 * math.cos(0.3), 8 * math.sin(0.3)], [3.0, 0.0], [0.0, 0.0]]),
+        yaw_rate=np.array([0.4, 0.0, 0.0]),
+        acceleration=np.array([1.0, -2.0, 0.0]),
+    )
+    places, headings = predicted_paths(cast("TrackColumns", tracks))
+    assert places.shape == (7, 3, 2)
+    for step in range(7):
+        along, across = ctra_displacement(8.0, 0.4, 1.0, 0.5 * step)
+        turn = np.array([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]])
+        np.testing.assert_allclose(places[step, 0], turn @ [along, across] + [1.0, 2.0], atol=1e-3)
+        assert headings[step, 0] == pytest.approx(0.3 + 0.2 * step)
+    assert places[-1, 1, 0] == pytest.approx(2.25, abs=1e-2)
+    assert places[:, 2].tolist() == [[5.0, 0.0]] * 7

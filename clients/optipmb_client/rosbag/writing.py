@@ -1,15 +1,15 @@
-"""Tracks as a bag: one MCAP file with `TrackedObjects`, `Detection3DArray` and markers, as all of ROS 2 reads them.
+"""Tracks as a bag: one MCAP file with objects, detections with ids, and markers, as all of ROS 2 reads them.
 
-Topics stand below that of the detections: `…/tracks`, `…/tracks/detections`, `…/tracks/markers`. A message is received,
-as far as the bag is concerned, when its detections were. The file appears whole at `close`, or not at all.
+Topics stand below that of the detections: `…/tracks` and, below it, `detections`, `markers`, `predicted`. A message is
+received, as far as the bag is concerned, when its detections were. The file appears whole at `close`, or not at all.
 """
 
 import shutil
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self, cast
+from typing import TYPE_CHECKING, Self, cast
 
-from optipmb_schemas.ros2.tracks import DETECTION_ARRAY, MARKERS, TRACKED, detection_array, markers, tracked_objects
+from optipmb_schemas.ros2.tracks import TOPICS, messages
 from optipmb_schemas.ros2.types import own_types
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 
     from optipmb_client.results.full import FullRows
 
-__all__ = ["TOPICS", "BagResultWriter"]
-
-TOPICS: Final = {"/tracks": TRACKED, "/tracks/detections": DETECTION_ARRAY, "/tracks/markers": MARKERS}
-"""Ends of the topics' names, and their types."""
+__all__ = ["BagResultWriter"]
 
 
 class BagResultWriter:
@@ -64,7 +61,7 @@ class BagResultWriter:
                 self._next = next(self._input, None)
             self._topics = {
                 end: self._writer.add_connection(
-                    plan.topic + end,
+                    f"{plan.topic}/tracks{end}",
                     kind,
                     msgdef=self._types.definition(kind),
                     rihs01=self._types.hash_of(kind),
@@ -82,12 +79,7 @@ class BagResultWriter:
         frame = self._plan.frames[index]
         self._copy_until(frame.received_ns)
         world, types, stamp_ns = self._plan.world, self._types, frame.stamp_ns
-        messages: dict[str, Any] = {
-            "/tracks": tracked_objects(types, full, stamp_ns, world, self._plan.topic),
-            "/tracks/detections": detection_array(types, full, stamp_ns, world),
-            "/tracks/markers": markers(types, full, stamp_ns, world),
-        }
-        for end, message in messages.items():
+        for end, message in messages(types, full, stamp_ns, world, self._plan.topic):
             self._writer.write(self._topics[end], frame.received_ns, types.write(message))
 
     def close(self) -> None:

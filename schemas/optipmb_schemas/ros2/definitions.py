@@ -81,6 +81,21 @@ TrackedObjectKinematics kinematics
 Shape shape
 """
 
+_PREDICTED_KINEMATICS: Final = """\
+geometry_msgs/PoseWithCovariance initial_pose_with_covariance
+geometry_msgs/TwistWithCovariance initial_twist_with_covariance
+geometry_msgs/AccelWithCovariance initial_acceleration_with_covariance
+PredictedPath[] predicted_paths
+"""
+
+_PREDICTED: Final = """\
+unique_identifier_msgs/UUID object_id
+float32 existence_probability
+ObjectClassification[] classification
+PredictedObjectKinematics kinematics
+Shape shape
+"""
+
 DEFINITIONS: Final = {
     "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
     "vision_msgs/msg/ObjectHypothesisWithPose": (
@@ -95,6 +110,12 @@ DEFINITIONS: Final = {
     "autoware_perception_msgs/msg/TrackedObjectKinematics": _TRACKED_KINEMATICS,
     "autoware_perception_msgs/msg/TrackedObject": _TRACKED,
     "autoware_perception_msgs/msg/TrackedObjects": "std_msgs/Header header\nTrackedObject[] objects\n",
+    "autoware_perception_msgs/msg/PredictedPath": (
+        "geometry_msgs/Pose[] path\nbuiltin_interfaces/Duration time_step\nfloat32 confidence\n"
+    ),
+    "autoware_perception_msgs/msg/PredictedObjectKinematics": _PREDICTED_KINEMATICS,
+    "autoware_perception_msgs/msg/PredictedObject": _PREDICTED,
+    "autoware_perception_msgs/msg/PredictedObjects": "std_msgs/Header header\nPredictedObject[] objects\n",
 } | {
     f"{package}/msg/{name}": text
     for package in ("autoware_perception_msgs", "autoware_auto_perception_msgs")

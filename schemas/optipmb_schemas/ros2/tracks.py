@@ -1,4 +1,4 @@
-"""Tracks as ROS 2 messages: `TrackedObjects` of Autoware, `Detection3DArray` with ids, and markers for RViz.
+"""Tracks as ROS 2 messages: Autoware's tracked and predicted objects, `Detection3DArray`, and markers for RViz.
 
 All in the world frame, under the name that the caller gives it. What the messages have room for:
 
@@ -6,12 +6,15 @@ All in the world frame, under the name that the caller gives it. What the messag
   estimated; their entries are 0.
 - twist and acceleration: in the frame of the object, x forward, as Autoware has them; covariance of the speed along x
   and of the turn rate about z, and of the acceleration along x.
+- predicted paths, in `PredictedObjects` alone: the box at every 0.5 s of the next 3 s if turn rate and acceleration
+  stay; a braking object stops and does not go back.
 - existence probability, class (probability 1: a track keeps its class), box, and a UUID whose last eight bytes are the
   track's id, big endian, and whose first eight are a digest of the stream's name.
 """
 
 import hashlib
 import math
+from collections.abc import Iterator
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -20,18 +23,31 @@ from numpy.typing import NDArray
 from optipmb_schemas.ros2.definitions import CLASS_NAMES, UNKNOWN_CLASS
 from optipmb_schemas.ros2.types import Types
 
-__all__ = ["DETECTION_ARRAY", "MARKERS", "TRACKED", "TrackColumns", "detection_array", "markers", "tracked_objects"]
+__all__ = ["TOPICS", "TRACKED", "TrackColumns", "messages", "predicted_paths"]
 
 TRACKED: Final = "autoware_perception_msgs/msg/TrackedObjects"
 DETECTION_ARRAY: Final = "vision_msgs/msg/Detection3DArray"
 MARKERS: Final = "visualization_msgs/msg/MarkerArray"
+
+PREDICTED: Final = "autoware_perception_msgs/msg/PredictedObjects"
+
+TOPICS: Final = {"": TRACKED, "/detections": DETECTION_ARRAY, "/markers": MARKERS, "/predicted": PREDICTED}
+"""Types of the messages by what their topics' names end with, below the topic of the tracks."""
+
+HORIZON_S: Final = 3.0
+STEP_NS: Final = 500_000_000
+SUBSTEPS: Final = 20
+"""Of a step; with midpoints of 25 ms the error is below a millimetre."""
+
+FACES: Final = 0.95
+"""Least confidence of a heading whose sign counts as known."""
 
 STANDING: Final = 0.3
 """Speed in m/s below which an object counts as standing, and has no arrow."""
 
 _CLASSES: Final = {name: number for number, name in CLASS_NAMES.items()} | {"cyclist": 6, "van": 1}
 """Autoware's numbers by lower-case class names, KITTI's among them."""
-_SIGN_KNOWN: Final = 2
+_SIGN_UNKNOWN, _SIGN_KNOWN = 1, 2
 _SIZE: Final = 6
 _X, _Y, _SPEED, _HEADING, _TURN, _ACCELERATION = range(_SIZE)
 _ADD, _DELETE_ALL = 0, 3
@@ -91,8 +107,8 @@ class TrackColumns(Protocol):
     def covariance(self) -> Floats: ...  # noqa: D102 - (N, 6, 6) of x, y, speed, heading, turn rate, acceleration
 
 
-def tracked_objects(types: Types, tracks: TrackColumns, stamp_ns: int, frame: str, stream: str) -> Any:
-    """Return the tracks of one frame as `autoware_perception_msgs/TrackedObjects`.
+def messages(types: Types, tracks: TrackColumns, stamp_ns: int, frame: str, stream: str) -> Iterator[tuple[str, Any]]:
+    """Yield the messages of one frame with what their topics' names end with (`TOPICS`).
 
     Args:
         types: makes the messages.
@@ -101,59 +117,133 @@ def tracked_objects(types: Types, tracks: TrackColumns, stamp_ns: int, frame: st
         frame: ROS's name of the world frame.
         stream: name of the stream; the same track of the same stream has the same UUID.
     """
-    package = TRACKED.rpartition("/")[0]
-    key = hashlib.blake2b(stream.encode(), digest_size=8).digest()
-    objects = []
-    for row, identity in enumerate(tracks.id.tolist()):
+    header = _header(types, stamp_ns, frame)
+    objects = _Objects(types, tracks, stream)
+    rows = range(len(tracks.id))
+    yield "", types.new(TRACKED, header=header, objects=[objects.tracked(row) for row in rows])
+    yield "/detections", detection_array(types, tracks, stamp_ns, frame)
+    yield "/markers", markers(types, tracks, stamp_ns, frame)
+    yield "/predicted", types.new(PREDICTED, header=header, objects=[objects.predicted(row) for row in rows])
+
+
+def predicted_paths(tracks: TrackColumns) -> tuple[Floats, Floats]:
+    """Return where the tracks are at each step of the horizon if turn rate and acceleration stay (CTRA).
+
+    Returns:
+        Places (K, N, 2) and headings (K, N), K steps of 0.5 s; the first is the present.
+    """
+    heading, place = tracks.yaw.copy(), tracks.center[:, :2].copy()
+    speed = np.cos(heading) * tracks.velocity[:, 0] + np.sin(heading) * tracks.velocity[:, 1]
+    forward = speed >= 0
+    dt = STEP_NS / 1e9 / SUBSTEPS
+    places, headings = [place.copy()], [heading.copy()]
+    for _ in range(round(HORIZON_S * 1e9 / STEP_NS)):
+        for _ in range(SUBSTEPS):
+            later = speed + dt * tracks.acceleration
+            later = np.where(forward, np.maximum(later, 0.0), np.minimum(later, 0.0))
+            along, middle = 0.5 * (speed + later) * dt, heading + 0.5 * dt * tracks.yaw_rate
+            place = place + along[:, None] * np.column_stack([np.cos(middle), np.sin(middle)])
+            heading = heading + dt * tracks.yaw_rate * (later != 0.0)
+            speed = later
+        places.append(place.copy())
+        headings.append(heading.copy())
+    return np.array(places), np.array(headings)
+
+
+class _Objects:
+    """Makes Autoware's objects from the rows of tracks."""
+
+    def __init__(self, types: Types, tracks: TrackColumns, stream: str) -> None:
+        self._types = types
+        self._tracks = tracks
+        self._key = hashlib.blake2b(stream.encode(), digest_size=8).digest()
+        self._places, self._headings = predicted_paths(tracks)
+        self._package = TRACKED.rpartition("/")[0]
+        confidence = getattr(tracks, "heading_confidence", None)
+        self._faces = np.ones(len(tracks.id), dtype=np.bool_) if confidence is None else confidence >= FACES
+
+    def tracked(self, row: int) -> Any:
+        """Return a `TrackedObject`."""
+        pose, twist, acceleration = self._motion(row)
+        moving = self._types.new(
+            f"{self._package}/TrackedObjectKinematics",
+            pose_with_covariance=pose,
+            twist_with_covariance=twist,
+            acceleration_with_covariance=acceleration,
+            orientation_availability=_SIGN_KNOWN if self._faces[row] else _SIGN_UNKNOWN,
+            is_stationary=math.hypot(*self._tracks.velocity[row].tolist()) < STANDING,
+        )
+        return self._types.new(f"{self._package}/TrackedObject", **self._what(row), kinematics=moving)
+
+    def predicted(self, row: int) -> Any:
+        """Return a `PredictedObject` with one path."""
+        pose, twist, acceleration = self._motion(row)
+        z = float(self._tracks.center[row, 2])
+        path = self._types.new(
+            f"{self._package}/PredictedPath",
+            path=[
+                _pose(self._types, [*place[row].tolist(), z], float(heading[row]))
+                for place, heading in zip(self._places, self._headings, strict=True)
+            ],
+            time_step=self._types.new("builtin_interfaces/msg/Duration", sec=STEP_NS // 10**9, nanosec=STEP_NS % 10**9),
+            confidence=1.0,
+        )
+        moving = self._types.new(
+            f"{self._package}/PredictedObjectKinematics",
+            initial_pose_with_covariance=pose,
+            initial_twist_with_covariance=twist,
+            initial_acceleration_with_covariance=acceleration,
+            predicted_paths=[path],
+        )
+        return self._types.new(f"{self._package}/PredictedObject", **self._what(row), kinematics=moving)
+
+    def _what(self, row: int) -> dict[str, Any]:
+        """Return the fields that say what it is."""
+        tracks, types = self._tracks, self._types
+        number = _CLASSES.get(tracks.labels[int(tracks.label[row])].lower(), UNKNOWN_CLASS)
+        uuid = np.frombuffer(self._key + int(tracks.id[row]).to_bytes(8, "big"), dtype=np.uint8)
+        return {
+            "object_id": types.new("unique_identifier_msgs/msg/UUID", uuid=uuid),
+            "existence_probability": float(tracks.existence[row]),
+            "classification": [types.new(f"{self._package}/ObjectClassification", label=number, probability=1.0)],
+            "shape": types.new(
+                f"{self._package}/Shape",
+                type=0,
+                footprint=types.new("geometry_msgs/msg/Polygon", points=[]),
+                dimensions=_vector(types, *tracks.size[row].tolist()),
+            ),
+        }
+
+    def _motion(self, row: int) -> tuple[Any, Any, Any]:
+        """Return pose, twist and acceleration with their covariances."""
+        tracks, types = self._tracks, self._types
         covariance = tracks.covariance[row]
         yaw, (east, north) = float(tracks.yaw[row]), tracks.velocity[row].tolist()
         cos, sin = math.cos(yaw), math.sin(yaw)
-        moving = types.new(
-            f"{package}/TrackedObjectKinematics",
-            pose_with_covariance=types.new(
-                "geometry_msgs/msg/PoseWithCovariance",
-                pose=_pose(types, tracks.center[row].tolist(), yaw),
-                covariance=_spread(covariance, {0: _X, 1: _Y, 5: _HEADING}),
-            ),
-            twist_with_covariance=types.new(
-                "geometry_msgs/msg/TwistWithCovariance",
-                twist=types.new(
-                    "geometry_msgs/msg/Twist",
-                    linear=_vector(types, cos * east + sin * north, cos * north - sin * east, 0.0),
-                    angular=_vector(types, 0.0, 0.0, float(tracks.yaw_rate[row])),
-                ),
-                covariance=_spread(covariance, {0: _SPEED, 5: _TURN}),
-            ),
-            acceleration_with_covariance=types.new(
-                "geometry_msgs/msg/AccelWithCovariance",
-                accel=types.new(
-                    "geometry_msgs/msg/Accel",
-                    linear=_vector(types, float(tracks.acceleration[row]), 0.0, 0.0),
-                    angular=_vector(types, 0.0, 0.0, 0.0),
-                ),
-                covariance=_spread(covariance, {0: _ACCELERATION}),
-            ),
-            orientation_availability=_SIGN_KNOWN,
-            is_stationary=math.hypot(east, north) < STANDING,
+        pose = types.new(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=_pose(types, tracks.center[row].tolist(), yaw),
+            covariance=_spread(covariance, {0: _X, 1: _Y, 5: _HEADING}),
         )
-        number = _CLASSES.get(tracks.labels[int(tracks.label[row])].lower(), UNKNOWN_CLASS)
-        uuid = np.frombuffer(key + identity.to_bytes(8, "big"), dtype=np.uint8)
-        objects.append(
-            types.new(
-                f"{package}/TrackedObject",
-                object_id=types.new("unique_identifier_msgs/msg/UUID", uuid=uuid),
-                existence_probability=float(tracks.existence[row]),
-                classification=[types.new(f"{package}/ObjectClassification", label=number, probability=1.0)],
-                kinematics=moving,
-                shape=types.new(
-                    f"{package}/Shape",
-                    type=0,
-                    footprint=types.new("geometry_msgs/msg/Polygon", points=[]),
-                    dimensions=_vector(types, *tracks.size[row].tolist()),
-                ),
-            )
+        twist = types.new(
+            "geometry_msgs/msg/TwistWithCovariance",
+            twist=types.new(
+                "geometry_msgs/msg/Twist",
+                linear=_vector(types, cos * east + sin * north, cos * north - sin * east, 0.0),
+                angular=_vector(types, 0.0, 0.0, float(tracks.yaw_rate[row])),
+            ),
+            covariance=_spread(covariance, {0: _SPEED, 5: _TURN}),
         )
-    return types.new(TRACKED, header=_header(types, stamp_ns, frame), objects=objects)
+        acceleration = types.new(
+            "geometry_msgs/msg/AccelWithCovariance",
+            accel=types.new(
+                "geometry_msgs/msg/Accel",
+                linear=_vector(types, float(tracks.acceleration[row]), 0.0, 0.0),
+                angular=_vector(types, 0.0, 0.0, 0.0),
+            ),
+            covariance=_spread(covariance, {0: _ACCELERATION}),
+        )
+        return pose, twist, acceleration
 
 
 def detection_array(types: Types, tracks: TrackColumns, stamp_ns: int, frame: str) -> Any:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import optipmb_schemas as schemas
 import structlog
 from optipmb_schemas.ros2.arrays import CLOUD
-from optipmb_schemas.ros2.tracks import DETECTION_ARRAY, MARKERS, TRACKED
+from optipmb_schemas.ros2.tracks import TOPICS
 from optipmb_schemas.ros2.types import own_types
 
 from optipmb_service import __version__
@@ -160,7 +160,7 @@ class _Process:
                     )
                 )
             base = stream.tracks_topic
-            for end, kind in (("", TRACKED), ("/detections", DETECTION_ARRAY), ("/markers", MARKERS)):
+            for end, kind in TOPICS.items():
                 ours.append((self._one(graph.PUBLISHER, base + end, kind, OFFERED), None))
         if ros2.diagnostics:
             ours.append((self._one(graph.PUBLISHER, ros2.diagnostics, DIAGNOSTICS, OFFERED), None))

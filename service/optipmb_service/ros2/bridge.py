@@ -197,11 +197,9 @@ class Bridge:
         if arrived is not None:
             stream.counts.latency_ms = 1e3 * (self._clock() - arrived)
         stream.counts.tracks += 1
-        types, stamp_ns, world = self._types, message.stamp_ns, stream.world
-        base = stream.topics.tracks_topic
-        self._sink.publish(base, tracks.tracked_objects(types, message, stamp_ns, world, stream.name))
-        self._sink.publish(f"{base}/detections", tracks.detection_array(types, message, stamp_ns, world))
-        self._sink.publish(f"{base}/markers", tracks.markers(types, message, stamp_ns, world))
+        made = tracks.messages(self._types, message, message.stamp_ns, stream.world, stream.name)
+        for end, one in made:
+            self._sink.publish(stream.topics.tracks_topic + end, one)
 
     def take_problem(self, problem: schemas.Problem) -> None:
         """Take in a problem that the service tells of a stream."""
