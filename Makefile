@@ -9,10 +9,14 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints
-.PHONY: help docs release demo test bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests schemas wheel clean tune ablate
+.PHONY: help docs release demo test bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check lowest pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
-	@echo "make test    everything that CI runs: lint, types, tests, schemas, wheel, demo"
+	@echo "make test    lint, types, schemas, tests, wheel"
+	@echo "make check   lint, types, and the tests nearest to what changed since SINCE=main, in less than a minute"
+	@echo "make lowest  test the wheel with the oldest packages that it may be installed with"
+	@echo "make pythons test the wheel with every Python newer than 3.11 that this machine has"
+	@echo "make repeat  run make test N=10 times in fresh clones, with LOAD=0 processes that compute beside it"
 	@echo "make bench   time the tracker, its kernels, the codec and the service, beside the saved baseline"
 	@echo "make figures measure the tracker's figures of docs/performance.md, beside other trackers, and write the page"
 	@echo "make load    measure what the service carries on this machine, as docs/performance.md has it"
@@ -48,8 +52,8 @@ demo: $(DEMO)/bin/optipmb
 containers: install
 	$(BIN)/python docker/containers.py $(OPTIONAL)
 
-test: lint types tests schemas wheel
-	$(MAKE) demo
+# The demonstration is among the tests (tests/e2e/test_demo.py); CI also runs the command, which installs less.
+test: lint types schemas tests wheel
 
 # For figures, nothing else should run on the machine. SERVICE holds options of the service, SECONDS how long a run takes.
 load: install
@@ -62,10 +66,36 @@ lint: install
 types: install
 	$(BIN)/mypy
 
-# What only computes runs on two processors; what watches processes and clocks runs alone.
+# Kernels are compiled once, before processes that would each compile them. JOBS is more than two processors: many tests
+# wait for other processes. Those that measure memory and times run after the others, one by one.
+JOBS ?= 4
 tests: install
-	$(BIN)/pytest -n 2 --dist loadfile -m "not alone"
+	$(BIN)/optipmb warm-up
+	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not alone"
 	$(BIN)/pytest -m alone
+
+# For a developer: style, types, and the tests nearest to what changed since SINCE (a commit; files not committed count).
+SINCE ?= main
+check: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python tests/nearest.py $(SINCE)
+
+# The wheel with the oldest packages that pyproject.toml allows; and with every newer Python that is here.
+lowest: install
+	mkdir -p out
+	$(BIN)/python tests/lowest.py >out/lowest.txt
+	sh tests/elsewhere.sh $(PYTHON) $(BIN) $(CURDIR)/out/lowest.txt
+
+pythons: install
+	sh tests/pythons.sh $(BIN)
+
+# As often as N says, each time in a fresh clone, with LOAD processes computing beside it: tests that pass now and then fail here.
+N ?= 10
+LOAD ?= 0
+repeat:
+	sh tests/repeat.sh $(N) $(LOAD)
 
 schemas: install
 	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md schemas/json

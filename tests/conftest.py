@@ -6,6 +6,8 @@ import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import hypothesis
+
 if TYPE_CHECKING:
     import pytest
 
@@ -14,19 +16,12 @@ HERE = Path(__file__).parent
 # What a shell starts in the background ignores it, and hands that on to what it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-ALONE = (
-    "docker",
-    "e2e",
-    "service/test_command.py",
-    "service/test_durable.py",
-    "service/test_http.py",
-    "service/test_live_page.py",
-    "service/test_memory.py",
-    "service/test_moves.py",
-    "service/test_network.py",
-    "service/test_private.py",
-)
-"""Folders and files whose tests watch processes, memory and clocks (`-m alone`); what only computes runs two by two."""
+ALONE = ("e2e/test_load.py", "e2e/test_soak.py", "service/runtime/test_memory.py")
+"""Files whose tests measure memory and times (`-m alone`); all others wait for conditions and run side by side."""
+
+# The same examples in every run; `--hypothesis-profile default` looks at others.
+hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None)
+hypothesis.settings.load_profile("same")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

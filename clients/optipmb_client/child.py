@@ -39,6 +39,7 @@ os.execv(sys.executable, [sys.executable, "-m", "optipmb_service", *sys.argv[2:]
 """
 
 _LOG_LINES = 5
+_FIRST_PORT, _EPHEMERAL_PORT = 20_000, 32_768
 
 
 class ServiceProcess:
@@ -144,6 +145,12 @@ class ServiceProcess:
 
 
 def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """Return a port that nobody has: the child binds it seconds later, and the system must not give it away till then.
+
+    It gives away those of its ephemeral range, for outgoing connections, so this is one below.
+    """
+    while True:
+        port = _FIRST_PORT + secrets.randbelow(_EPHEMERAL_PORT - _FIRST_PORT)
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port

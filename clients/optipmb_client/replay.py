@@ -30,8 +30,8 @@ __all__ = ["Pace", "ReplayedSequence", "replay"]
 
 CLOUD_WAIT_S = 10.0  # a cloud may be late on a busy machine; tracking without it would change the result
 CACHED_CLOUDS = 16  # for a service that is killed and restarted meanwhile; it keeps no more of a stream by default
-STRAGGLERS_S = 2.0  # how long frames that were overtaken by later ones may still be recovered
-POINTS_WANTED_S = 5.0  # how long to wait until the service's subscription to clouds has come to this session
+STRAGGLERS_S = 5.0  # how long frames that were overtaken by later ones may still be recovered
+POINTS_WANTED_S = 20.0  # how long to wait until the service's subscription to clouds has come to this session
 TICK_S = 0.2  # how often a waiting thread looks whether it shall stop
 KEPT_PROBLEMS = 20
 

@@ -176,7 +176,7 @@ def test_help_does_not_load_the_tracker() -> None:
         "import sys; from optipmb_client.cli import run; run(['--help']); "
         "sys.exit(','.join({'numba', 'matplotlib', 'optipmb', 'scipy'} & set(sys.modules)) or 0)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -193,7 +193,7 @@ def test_a_signal_ends_a_replay_cleanly(endpoint: str, tmp_path: Path, number: i
             assert time.monotonic() < deadline, "no frame was sent"
             time.sleep(0.01)  # the fake has no event for its first frame
         process.send_signal(number)
-        out, err = process.communicate(timeout=20)
+        out, err = process.communicate(timeout=120)
     assert process.returncode == status, err
     assert out == ""
     assert "Traceback" not in err

@@ -304,7 +304,7 @@ def test_the_viewer_is_served_to_a_browser(incident: Path) -> None:
         ends = time.monotonic() + DEADLINE_S
         while True:
             try:
-                with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=5) as page:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=60) as page:
                     assert b"<html" in page.read(2000).lower()
                 break
             except OSError:

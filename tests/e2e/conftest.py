@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 from optipmb_client.child import ServiceProcess
 
-START_S = 180.0  # the first start on a machine compiles
+START_S = 240.0  # the first start on a machine compiles
 
 
 @pytest.fixture(scope="module")

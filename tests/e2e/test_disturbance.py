@@ -2,7 +2,6 @@
 
 import os
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Self
@@ -31,7 +30,7 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def replay(service: ServiceProcess, out: Path) -> Any:
     """Replay the scene at twice the recorded rate, that is for three seconds."""
     return result_of(
-        optipmb("replay", *SCENE, "--speed", 2, "--connect", service.endpoint, "--out", out, "--json", timeout=120)
+        optipmb("replay", *SCENE, "--speed", 2, "--connect", service.endpoint, "--out", out, "--json", timeout=240)
     )
 
 
@@ -55,7 +54,7 @@ class Disturbance:
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
-        self._thread.join(30.0)
+        self._thread.join(120.0)
         assert not self._thread.is_alive()
 
 
@@ -107,7 +106,7 @@ def test_garbage_on_every_key(service: ServiceProcess, link: Connection, expecte
                 if number % 10 == 0:
                     for what in ("state", "parameters", "reset"):
                         if what != "reset" or stream == "a/b/c":  # a reset is valid without a payload
-                            link.query(keys.query(stream, what), payload, encoding_of(SessionParameters), timeout=5.0)
+                            link.query(keys.query(stream, what), payload, encoding_of(SessionParameters), timeout=60.0)
 
         with Disturbance(disturb) as disturbance:
             result = replay(service, tmp_path)
@@ -115,7 +114,7 @@ def test_garbage_on_every_key(service: ServiceProcess, link: Connection, expecte
     assert disturbance.count > 50
     assert result["missing"] == 0
     assert (tmp_path / "0000.txt").read_bytes() == expected
-    (status,) = find_services(link, patience_s=10.0)
+    (status,) = find_services(link, patience_s=60.0)
     assert status.refused > 100
     assert status.problems
 
@@ -180,11 +179,9 @@ def test_two_publishers_of_one_stream(
 
 def test_the_service_has_survived(service: ServiceProcess, link: Connection) -> None:
     """After all that the service runs, answers, and ends with status 0 when asked to."""
-    deadline = time.monotonic() + 10.0
-    (status,) = find_services(link, patience_s=10.0)
+    (status,) = find_services(link, patience_s=60.0)
     assert status.instance == service.instance
     assert status.state in {"ready", "running"}
     link.close()
     assert service.stop() == 0
-    assert time.monotonic() < deadline + 10.0
     assert not os.path.exists(f"/proc/{service.process.pid}")  # noqa: PTH110  a path of the kernel's, not of ours

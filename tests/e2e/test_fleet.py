@@ -106,7 +106,7 @@ def test_who_stands_by_takes_over(tmp_path: Path, capsys: pytest.CaptureFixture[
         print(f"\ntakeover after a kill {at_once_s:.2f} s, after a freeze {lease_s:.2f} s (lease 2 s)")  # noqa: T201 - the figure
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(600)
 def test_terminated_in_the_middle(tmp_path: Path) -> None:
     """Fault 18: SIGTERM among frames under way: status 0 in time, and the next process goes on to the byte."""
     with Fleet(tmp_path) as fleet, Node(fleet.endpoint) as node:
@@ -116,13 +116,13 @@ def test_terminated_in_the_middle(tmp_path: Path) -> None:
         status, seconds = service.end()
         assert status == 0
         assert '"drained": false' not in service.errors
-        assert seconds < 10.0
+        assert seconds < 60.0
         node.send(*(SENSOR.detections(seq) for seq in range(50, 60)))
         fleet.service("a")
         check(node, 60, owner="a")
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(600)
 def test_clouds_of_before_the_start_are_used(tmp_path: Path) -> None:
     """Fault 1: a service that starts late gets frames and clouds from the caches of a publisher that keeps clouds."""
     box = {"label": ["car"], "center": [[0, 0, 1]], "size": [[4, 2, 1.5]], "yaw": [0], "score": [0.9]}
@@ -139,7 +139,7 @@ def test_clouds_of_before_the_start_are_used(tmp_path: Path) -> None:
     assert used == [True] * 5
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(600)
 def test_a_router_that_is_killed(tmp_path: Path) -> None:
     """Fault 16: no router for longer than the lease: the owner looks, goes on, recovers all, applies nothing twice."""
     with Fleet(tmp_path, lease_s=1.0) as fleet, Node(fleet.endpoint) as node:
@@ -155,7 +155,7 @@ def test_a_router_that_is_killed(tmp_path: Path) -> None:
         assert state.duplicates + state.frames == state.received
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(600)
 def test_a_full_disk(tmp_path: Path) -> None:
     """Fault 19: no byte more can be written: tracking goes on, the status says degraded; with room again it is ready.
 

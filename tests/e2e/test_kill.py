@@ -45,7 +45,8 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
     moments = random.Random(SEED)
     outages: list[float] = []
     repeated = 0
-    settings = {"profile": "kitti", "cloud_wait_s": 30, "recovery_wait_s": 10, "checkpoint_s": 0.2}
+    waits = {"cloud_wait_s": 30, "recovery_wait_s": 10, "checkpoint_s": 0.2}
+    settings = {"profile": "kitti", "queue_clouds": FRAMES, "stream_mb": 1024} | waits
     with Fleet(tmp_path, **settings) as fleet, Connection(fleet.endpoint) as connection:
         service = fleet.service("one")
         for round_ in range(KILLS):

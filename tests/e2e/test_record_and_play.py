@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FRAMES = 15
 SCENE = ("--dataset", "scene", "--option", f"frames={FRAMES}", "--option", "vehicles=8", "--option", "pedestrians=2")
 FOUR = ("--sequences", "0000", "0001", "0002", "0003", "--streams", 4)
-DEADLINE_S = 60.0
+DEADLINE_S = 120.0
 
 
 @contextlib.contextmanager
@@ -161,7 +161,7 @@ def test_a_killed_recording_still_plays(service: ServiceProcess, tmp_path: Path)
 def test_kitti(service: ServiceProcess, tmp_path: Path) -> None:
     """Real detections, with the clouds that there are."""
     data = ("--dataset", "kitti", "--root", kitti_root(), "--detections", "pointrcnn")
-    path = recorded_replay(service, tmp_path, (*data, "--sequences", "0000", "0003", "--streams", 2))
+    path = recorded_replay(service, tmp_path, (*data, "--sequences", "0002", "0003", "--streams", 2))
     play_into_another(path, tmp_path)
 
 

@@ -120,7 +120,7 @@ def _watched(
 
 def _when_all_is_done(connection: Connection, sent: int) -> ServiceStatus:
     """The status when all that was sent has been received and accounted for."""
-    ends = time.monotonic() + 20.0
+    ends = time.monotonic() + 60.0
     while True:
         (status,) = find_services(connection)
         accounted = status.frames + status.duplicates + status.late + status.refused + status.shed

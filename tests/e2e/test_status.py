@@ -28,7 +28,7 @@ def test_streams_at_work_are_shown(service: ServiceProcess, tmp_path: Path) -> N
     assert status["instance"] == service.instance
     (session,) = [session for session in status["sessions"] if session["stream"] == stream]
     assert session["profile"] == received.tracks.profile
-    assert 10.0 < session["rate_hz"] < 40.0
+    assert 0.0 < session["rate_hz"] < 40.0
     assert 0.0 < session["latency_p50_ms"] <= session["latency_p99_ms"]
     assert session["frames"] >= 30
     assert session["shed"] == session["gaps"] == 0

@@ -28,9 +28,9 @@ STREAMS = [f"yard/node-{number}/lidar" for number in range(6)]
 VICTIMS = {worker_of(f"kill/{name}/lidar", 2): f"kill/{name}/lidar" for name in "abcd"}
 FRAMES = 12
 DEADLINE_S = 60.0
-END_S = 4.0
-LONGEST_SILENCE_S = 15.0
-"""Three times the default of `stuck_s`."""
+END_S = 60.0
+LONGEST_SILENCE_S = 60.0
+"""The default of `stuck_s`, and the start of a process on a machine that is busy with other things."""
 OPTIONS = ("--workers", "2", "--instance", "pair")
 
 
@@ -190,7 +190,7 @@ def test_workers_end_with_their_parent() -> None:
         children = descendants(service.process.pid)
         assert len(children) == 2
         service.process.kill()
-        assert wait_until_ended(children, 15.0) == set()
+        assert wait_until_ended(children, 60.0) == set()
 
 
 def test_what_cannot_start_says_so_once() -> None:

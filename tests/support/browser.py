@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from selenium.webdriver import Chrome
 
-DEADLINE_S = 30.0
+DEADLINE_S = 90.0
 
 
 @contextlib.contextmanager

@@ -28,4 +28,4 @@ def result_of(done: "subprocess.CompletedProcess[str]") -> Any:
 def kill(process: "subprocess.Popen[str]") -> None:
     """End a process as a crash would, and clear away its pipes."""
     process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=30)
+    process.communicate(timeout=120)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
-START_S = 20.0
+START_S = 60.0
 
 _ROUTER = """
 import sys, threading

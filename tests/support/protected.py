@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 MAKE = Path(__file__).parents[2] / "docker" / "security" / "make.py"
-DEADLINE_S = 20.0
+DEADLINE_S = 60.0
+REFUSAL_MS = 1500
+"""How long a link that must not be had is asked for."""
 
 
 def make(out: Path, *options: str) -> subprocess.CompletedProcess[str]:
@@ -83,15 +85,16 @@ class Party:
 
     Args:
         config: the file.
+        patience_ms: how long it tries to link.
         changes: values over those of the file.
 
     Raises:
         zenoh.ZError: it cannot link to the router.
     """
 
-    def __init__(self, config: Path, **changes: Any) -> None:
+    def __init__(self, config: Path, *, patience_ms: int = int(1000 * DEADLINE_S), **changes: Any) -> None:
         values = zenoh.Config.from_file(config)
-        for name, value in (changes | {"connect/timeout_ms": 1500}).items():
+        for name, value in (changes | {"connect/timeout_ms": patience_ms}).items():
             values.insert_json5(name.replace("__", "/"), json.dumps(value))
         self.session = zenoh.open(values)
         self.seen: list[tuple[str, bytes]] = []
@@ -139,7 +142,7 @@ class Party:
 
     def tokens(self, pattern: str) -> set[str]:
         """The liveliness tokens that it sees."""
-        replies = self.session.liveliness().get(pattern, timeout=3.0)
+        replies = self.session.liveliness().get(pattern, timeout=DEADLINE_S)
         return {str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None}
 
     def ask(self, key: str, timeout: float = 3.0) -> list[bytes]:

@@ -118,7 +118,10 @@ class Replay:
             detections = connection.cached_sender(
                 KEYS.detections(recording.stream), encoding_of(Detections), cache=len(recording.frames)
             )
-            points = connection.plain_sender(KEYS.points(recording.stream), encoding_of(Points), cache=16)
+            # Clouds too are kept: what was tracked with its cloud before a kill must be tracked with it again.
+            points = connection.plain_sender(
+                KEYS.points(recording.stream), encoding_of(Points), cache=len(recording.frames)
+            )
             self._senders.append((detections, points))
         self._threads = [
             threading.Thread(target=self._send, args=(recording, *senders), daemon=True)
@@ -168,7 +171,7 @@ class Replay:
 
     def state(self, stream: str) -> SessionState:
         """Ask for the state of a stream."""
-        (answer,) = self._connection.query(KEYS.query(stream, "state"), timeout=5.0)
+        (answer,) = self._connection.query(KEYS.query(stream, "state"), timeout=60.0)
         return decode(answer.payload, SessionState)
 
     def _send(self, recording: Recording, detections: object, points: object) -> None:

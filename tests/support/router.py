@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 SECOND = 1_000_000_000
-DEADLINE_S = 20.0
+DEADLINE_S = 60.0
 PERIOD_S = 0.1
 
 _T = TypeVar("_T", bound=Message)
@@ -187,7 +187,7 @@ class Node:
 
     def alive(self, pattern: str) -> list[str]:
         """Keys of the liveliness tokens under a pattern."""
-        replies = self.session.liveliness().get(pattern, timeout=5.0)
+        replies = self.session.liveliness().get(pattern, timeout=60.0)
         return sorted(str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None)
 
     def watch_alive(self, pattern: str) -> Collected:

@@ -1,16 +1,38 @@
 """Zenoh routers and plain clients inside the test's own process, for tests that need a network and no service."""
 
+import fcntl
 import json
+import os
 import socket
+import tempfile
+from pathlib import Path
+from typing import IO, Final
 
 import zenoh
 
+PORTS: Final = range(10_000, 20_000)
+"""Below those that the system gives to outgoing connections, and to whom asks for any: these are nobody's by chance."""
+
+_taken: list[IO[bytes]] = []
+
 
 def free_endpoint() -> str:
-    """An endpoint on the loopback interface where nobody listens."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    """An endpoint on the loopback interface where nobody listens, which no other test gets before this process ends."""
+    first = os.getpid() * 61 + len(_taken)
+    for number in range(len(PORTS)):
+        port = PORTS[(first + number) % len(PORTS)]
+        lock = (Path(tempfile.gettempdir()) / f"optipmb-test-port-{port}").open("wb")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # whose connections are closing is free
+                probe.bind(("127.0.0.1", port))
+        except OSError:
+            lock.close()
+            continue
+        _taken.append(lock)
+        return f"tcp/127.0.0.1:{port}"
+    raise AssertionError("no port is free")
 
 
 def open_router(endpoint: str) -> zenoh.Session:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from types import TracebackType
 
-READY_S = 120.0
+READY_S = 240.0
 """The first start after an installation compiles the kernels."""
 
 
@@ -70,7 +70,7 @@ class ServiceProcess:
         assert line is not None, f"ended without a ready line: {self.errors}"
         return line
 
-    def wait_log(self, event: str, deadline_s: float = 30.0) -> None:
+    def wait_log(self, event: str, deadline_s: float = 120.0) -> None:
         """Wait for a log event."""
         ends = time.monotonic() + deadline_s
         pause = threading.Event()
@@ -78,14 +78,14 @@ class ServiceProcess:
             assert time.monotonic() < ends, f"no {event} in {self.errors}"
             pause.wait(0.01)
 
-    def end(self, *numbers: signal.Signals, deadline_s: float = 10.0) -> tuple[int, float]:
+    def end(self, *numbers: signal.Signals, deadline_s: float = 60.0) -> tuple[int, float]:
         """Send signals (SIGTERM unless named); return the exit status and the seconds until the end."""
         began = time.monotonic()
         for number in numbers or (signal.SIGTERM,):
             self.process.send_signal(number)
         return self.wait_end(deadline_s), time.monotonic() - began
 
-    def wait_end(self, deadline_s: float = 30.0) -> int:
+    def wait_end(self, deadline_s: float = 120.0) -> int:
         """Return the exit status of a process that ends by itself; everything it has written is then there."""
         status = self.process.wait(deadline_s)
         for thread in self._threads:

@@ -51,7 +51,7 @@ def test_a_stream_that_is_moved_while_its_owner_is_sought(
         assert not left.is_set()
         may_look.set()
         assert [tracks.seq for tracks in node.tracks(SENSOR.stream, FRAMES)] == list(range(FRAMES))
-        assert left.wait(20.0)
+        assert left.wait(60.0)
         until(lambda: node.alive(KEYS.all_owners()) == [], "the stream has no owner")
         assert service.status().sessions == ()
 

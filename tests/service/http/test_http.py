@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 KEYS = Keys()
 SENSOR = Sensor()
-END_S = 2.0
+END_S = 30.0
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 
@@ -79,7 +79,7 @@ class Said:
 def get(address: str, path: str) -> tuple[int, str]:
     """Status and body of an answer."""
     host, _, port = address.rpartition(":")
-    connection = http.client.HTTPConnection(host, int(port), timeout=10)
+    connection = http.client.HTTPConnection(host, int(port), timeout=60)
     try:
         connection.request("GET", path)
         response = connection.getresponse()
@@ -294,7 +294,7 @@ def test_the_health_command() -> None:
 
     def health(*options: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "optipmb_service", "health", *options]
-        return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
     source = Said(now="starting")
     with served(source) as address:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 STREAM = "yard/gate/lidar"
-DEADLINE_S = 20.0
+DEADLINE_S = 60.0
 
 
 def tracks(seq: int) -> bytes:

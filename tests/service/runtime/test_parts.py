@@ -110,13 +110,13 @@ def test_workers_take_turns() -> None:
 
     class Gate:
         def work(self) -> bool:
-            return gate.wait(20) and False
+            return gate.wait(60) and False
 
     scheduler.submit(Gate())
     scheduler.submit(Work("long", 3))
     scheduler.submit(Work("short", 2))
     gate.set()
-    assert done.wait(20)
+    assert done.wait(60)
     assert turns == ["long", "short", "long", "short", "long"]
     assert scheduler.close(5)
 
@@ -128,11 +128,11 @@ def test_a_stuck_worker_does_not_keep_the_scheduler() -> None:
     class Stuck:
         def work(self) -> bool:
             entered.set()
-            return gate.wait(20) and False
+            return gate.wait(60) and False
 
     scheduler = Scheduler()
     scheduler.submit(Stuck())
-    assert entered.wait(20)
+    assert entered.wait(60)
     assert not scheduler.close(0.05)
     gate.set()
 

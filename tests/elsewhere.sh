@@ -1,0 +1,30 @@
+#!/bin/sh
+# Installs the wheel into a fresh environment, other than the one it was developed in, and runs tests against it there.
+# Called as: sh tests/elsewhere.sh PYTHON BIN [CONSTRAINTS]
+#   PYTHON       interpreter that makes the fresh environment
+#   BIN          folder of an environment with `build`
+#   CONSTRAINTS  versions to install; the newest that pyproject.toml allows by default
+set -eu
+python=$1
+case $2 in /*) bin=$2 ;; *) bin=$PWD/$2 ;; esac
+root=$(cd "$(dirname "$0")/.." && pwd)
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT INT TERM
+constraints=${3:-/dev/null}
+
+"$bin/python" -m build --wheel --outdir "$work/dist" "$root" >"$work/build.log" 2>&1 || { cat "$work/build.log"; exit 1; }
+"$python" -m venv "$work/venv"
+"$work/venv/bin/python" -m pip install --quiet --disable-pip-version-check --constraint "$constraints" \
+  "$(ls "$work"/dist/optipmb-*.whl)[evaluation,plot,record,tune]" hypothesis pytest pytest-asyncio pytest-timeout pytest-xdist
+"$work/venv/bin/python" -m pip check --disable-pip-version-check
+mkdir "$work/away" && cd "$work/away" # nothing of the source tree is importable from here, but for what tests share
+unset PYTHONPATH
+"$work/venv/bin/optipmb" warm-up
+"$work/venv/bin/python" -m pytest -c "$root/pyproject.toml" --rootdir "$root" -o cache_dir="$work/cache" -q -n 2 --dist loadfile \
+  "$root"/tests/schemas/test_codec.py "$root"/tests/schemas/test_roundtrip.py "$root"/tests/schemas/test_rules.py \
+  "$root"/tests/tracker/test_behaviour.py "$root"/tests/tracker/test_lifecycle.py "$root"/tests/tracker/test_twins.py \
+  "$root"/tests/service/session "$root"/tests/service/zenoh "$root"/tests/service/http/test_http.py \
+  "$root"/tests/clients/test_api.py "$root"/tests/clients/test_cli.py "$root"/tests/clients/test_mcap_files.py \
+  "$root"/tests/clients/test_tuning_search.py "$root"/tests/e2e/test_processes.py
+"$work/venv/bin/python" --version
+echo "the wheel works there"

@@ -1,0 +1,88 @@
+"""Runs the tests nearest to what changed: `python tests/nearest.py COMMIT`, which may be a branch.
+
+A test file is near when it imports a module that changed; when no test does, those that import a module that imports
+one, and so on. Tests that changed run too. Files are compared with where the branch left COMMIT; files that are not
+committed count. (Tools that watch which lines a test runs cannot see into compiled kernels.)
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = (".", "schemas", "service", "clients", "tests/support", "benchmarks", "docker")
+"""Folders that imports are looked up in."""
+SLOW = ("e2e", "docker")
+"""Tests of whole systems run only when they changed themselves."""
+
+
+def main(since: str) -> int:
+    """Choose the tests and run them; returns the exit status."""
+    tests = sorted(ROOT.glob("tests/*/**/test_*.py"))
+    changed = _changed(since)
+    imports = {path: _imports(path) for path in _modules() | set(tests)}
+    near = _nearest(changed, imports, {path for path in tests if path.relative_to(ROOT / "tests").parts[0] not in SLOW})
+    chosen = sorted(near | (changed & set(tests)))
+    if not chosen:
+        print("no test is near to what changed")
+        return 0
+    print(f"{len(chosen)} of {len(tests)} test files:", *(str(path.relative_to(ROOT)) for path in chosen), flush=True)
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", *map(str, chosen)]
+    return subprocess.run(command, cwd=ROOT, check=False).returncode
+
+
+def _changed(since: str) -> set[Path]:
+    base = _git("merge-base", since, "HEAD") or ["HEAD"]
+    names = _git("diff", "--name-only", base[0]) + _git("ls-files", "--others", "--exclude-standard")
+    return {ROOT / name for name in names if name.endswith(".py") and (ROOT / name).exists()}
+
+
+def _git(*words: str) -> list[str]:
+    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S607
+    return done.stdout.splitlines()
+
+
+def _modules() -> set[Path]:
+    folders = ("optipmb", "schemas", "service", "clients", "tests/support", "benchmarks", "docker")
+    return {path for folder in folders for path in (ROOT / folder).rglob("*.py")}
+
+
+def _imports(path: Path) -> set[Path]:
+    """Return the files that a file imports."""
+    found: set[Path] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {file for one in node.names if (file := _file(one.name))}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names = (node.module, *(f"{node.module}.{one.name}" for one in node.names))
+            found |= {file for name in names if (file := _file(name))}
+    return found
+
+
+def _file(name: str) -> Path | None:
+    for source in SOURCES:
+        place = ROOT / source / Path(*name.split("."))
+        for file in (place.with_suffix(".py"), place / "__init__.py"):
+            if file.is_file():
+                return file
+    return None
+
+
+def _nearest(changed: set[Path], imports: dict[Path, set[Path]], tests: set[Path]) -> set[Path]:
+    """Return the tests at the least distance from the changed modules."""
+    reached = changed - tests
+    while reached:
+        importers = {path for path, found in imports.items() if found & reached} - reached
+        if near := importers & tests:
+            return near
+        if not importers:
+            break
+        reached |= importers
+    return set()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

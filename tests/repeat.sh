@@ -1,0 +1,38 @@
+#!/bin/sh
+# Runs `make test` again and again in fresh clones of this repository, and says how often it passed and how long it took.
+# Called as: sh tests/repeat.sh TIMES LOAD
+#   LOAD  processes that compute all the time beside it
+# The environment is made once, because installing is not what is tested. The data beside this repository are used.
+set -eu
+times=$1
+load=$2
+root=$(cd "$(dirname "$0")/.." && pwd)
+work=$(mktemp -d)
+busy=
+trap 'kill $busy 2>/dev/null || true; rm -rf "$work"' EXIT INT TERM
+KITTI_ROOT=${KITTI_ROOT:-$(ls -d "$root"/../*/data/kitti 2>/dev/null | head -1)}
+NUSCENES_ROOT=${NUSCENES_ROOT:-$(ls -d "$root"/../*/data/nuscenes 2>/dev/null | head -1)}
+export KITTI_ROOT NUSCENES_ROOT
+[ -d "$KITTI_ROOT" ] || unset KITTI_ROOT
+[ -d "$NUSCENES_ROOT" ] || unset NUSCENES_ROOT
+for _ in $(seq "$load"); do
+  sh -c 'while :; do :; done' &
+  busy="$busy $!"
+done
+passed=0
+for number in $(seq "$times"); do
+  git clone --quiet "$root" "$work/$number"
+  make -s -C "$work/$number" install
+  began=$(date +%s)
+  if make -C "$work/$number" test >"$work/$number.log" 2>&1; then
+    passed=$((passed + 1))
+    result=passed
+  else
+    result="failed:"
+  fi
+  echo "$number: $result $(($(date +%s) - began)) s $(grep -E '^(FAILED|ERROR)' "$work/$number.log" | head -5 | tr '\n' ' ')"
+  [ "$result" = passed ] || cp "$work/$number.log" "$root/out/repeat-$number.log" 2>/dev/null || tail -50 "$work/$number.log"
+  rm -rf "$work/$number"
+done
+echo "$passed of $times passed, $load processes beside it"
+[ "$passed" = "$times" ]
