@@ -118,7 +118,7 @@ def test_publisher_and_subscriber_at_different_gateways(gateways: list[GatewayPr
     ):
         for k in range(20):
             publisher.publish(stamp_ns=10**18 + k * 10**8, label=["car" if k < 19 else "unicorn"], **car)
-        received = [message.seq for message, _ in zip(tracks, range(20), strict=False)]
+        received = [message.seq for _, message in zip(range(20), tracks, strict=False)]
     assert received == list(range(20))
     assert problems == ["unknown_class"]
 

@@ -1,0 +1,178 @@
+"""`Subscribe` and `QueryTracks`: what is asked for, in order, and no slow reader in anybody's way."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING, Any
+
+import grpc
+import numpy as np
+import pytest
+from gateway import detections, frame
+from grpc_status import rpc_status
+from optipmb_schemas import Tracks, encode
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from gateway import GatewayProcess
+
+
+def tracked(stub: Any, stream: str, frames: Iterable[int] = range(30)) -> list[Any]:
+    """Have frames tracked; return the tracks that came back."""
+    return [one.tracks for one in stub.Track(detections(frame(seq, stream)) for seq in frames)]
+
+
+def subscribed(stub: Any, **asked: Any) -> Any:
+    """A subscription that is in force."""
+    call = stub.Subscribe(pb.SubscribeRequest(**asked))
+    call.initial_metadata()
+    return call
+
+
+def taken(call: Any, number: int) -> list[Any]:
+    """The next responses of a subscription, which then ends."""
+    responses = [next(call) for _ in range(number)]
+    call.cancel()
+    return responses
+
+
+def test_tracks_come_as_they_are_published(stub: Any, stream: str) -> None:
+    """A subscription to a pattern gets every frame once, byte-equal to what its publisher gets back."""
+    site, node, _ = stream.split("/")
+    call = subscribed(stub, pattern=f"{site}/{node}/*", queue=1024)
+    published = tracked(stub, stream)
+    received = [one.tracks for one in taken(call, 30)]
+    assert received == published
+
+
+def test_history_comes_first_and_once(stub: Any, stream: str) -> None:
+    """With history a late subscriber first gets what the service keeps, then what is new, without repetition."""
+    tracked(stub, stream, range(20))
+    call = subscribed(stub, pattern=stream, history=True)
+    early = [next(call).tracks.seq for _ in range(20)]
+    tracked(stub, stream, range(20, 30))
+    assert early + [one.tracks.seq for one in taken(call, 10)] == list(range(30))
+
+
+def test_without_history_only_new_frames_come(stub: Any, stream: str) -> None:
+    """Without it the first frame is one that was published afterwards."""
+    tracked(stub, stream, range(20))
+    call = subscribed(stub, pattern=stream)
+    tracked(stub, stream, range(20, 30))
+    assert taken(call, 1)[0].tracks.seq == 20
+
+
+def test_filters(stub: Any, stream: str) -> None:
+    """Classes, confirmation, an area and columns are chosen by the gateway; what is left is as it was."""
+    full = convert.from_proto(tracked(stub, stream)[-1], Tracks)
+
+    def last(**chosen: Any) -> Any:
+        responses = stub.QueryTracks(pb.QueryTracksRequest(pattern=stream, filter=pb.TrackFilter(**chosen)))
+        return [one.tracks for one in responses][-1]
+
+    def centers(tracks: Any) -> Any:
+        return np.frombuffer(tracks.center.data).reshape(-1, 3)
+
+    assert convert.from_proto(last(), Tracks) == full
+    (row,) = np.flatnonzero(full.label == full.labels.index("pedestrian"))
+    assert (centers(last(classes=["pedestrian"])) == full.center[[row]]).all()
+    assert list(last(classes=["bus"]).id.shape) == [0]
+    assert (centers(last(confirmed_only=True)) == full.center).all()
+    square = pb.Polygon(x=[0, 10, 10, 0], y=[15, 15, 25, 25])
+    assert (centers(last(area=square)) == full.center[[row]]).all()
+    few = last(fields=["center", "existence"])
+    assert {field.name for field, _ in few.ListFields() if field.message_type is pb.Array.DESCRIPTOR} == {
+        "id", "center", "existence",
+    }  # fmt: skip
+    assert last(min_existence=1.0).id.shape[0] == int((full.existence >= 1.0).sum())
+
+
+def test_the_first_frame_of_an_object_is_not_confirmed(stub: Any, stream: str) -> None:
+    """Tracks detected once are left out of confirmed ones, the frame comes all the same."""
+    call = subscribed(stub, pattern=stream, filter=pb.TrackFilter(confirmed_only=True))
+    tracked(stub, stream, range(3))
+    counts = [one.tracks.id.shape[0] for one in taken(call, 3)]
+    assert counts[0] == 0
+    assert counts[2] == 2
+
+
+def test_the_rate_is_bounded_in_sensor_time(stub: Any, stream: str) -> None:
+    """At 2 Hz every fifth frame of a sensor of 10 Hz comes, however fast they were sent."""
+    call = subscribed(stub, pattern=stream, max_rate_hz=2.0)
+    tracked(stub, stream)
+    assert [one.tracks.seq for one in taken(call, 6)] == [0, 5, 10, 15, 20, 25]
+
+
+def test_query_by_time(stub: Any, stream: str) -> None:
+    """Frames of a range of stamps, both ends included, in their order; 50 of a stream are kept."""
+    tracked(stub, stream, range(80))
+    first, last = (frame(seq, stream).stamp_ns for seq in (50, 60))
+    ranged = stub.QueryTracks(pb.QueryTracksRequest(pattern=stream, from_ns=first, to_ns=last))
+    assert [one.tracks.seq for one in ranged] == list(range(50, 61))
+    everything = stub.QueryTracks(pb.QueryTracksRequest(pattern=stream))
+    assert [one.tracks.seq for one in everything] == list(range(30, 80))
+
+
+@pytest.mark.parametrize(
+    ("asked", "path"),
+    [
+        ({"pattern": "garage/**"}, "pattern"),
+        ({"filter": pb.TrackFilter(fields=["colour"])}, "filter.fields[0]"),
+        ({"filter": pb.TrackFilter(min_existence=2.0)}, "filter.min_existence"),
+        ({"filter": pb.TrackFilter(area=pb.Polygon(x=[0, 1], y=[0, 1]))}, "filter.area"),
+        ({"filter": pb.TrackFilter(area=pb.Polygon(x=[0, 1, 2], y=[0, float("nan"), 1]))}, "filter.area"),
+        ({"max_rate_hz": -1.0}, "max_rate_hz"),
+        ({"max_rate_hz": float("nan")}, "max_rate_hz"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_refused(stub: Any, asked: dict[str, Any], path: str) -> None:
+    """The status is INVALID_ARGUMENT, its details name the field."""
+    with pytest.raises(grpc.RpcError) as raised:
+        list(stub.Subscribe(pb.SubscribeRequest(**{"pattern": "garage/*/*", **asked})))
+    assert raised.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+    status = rpc_status.from_call(raised.value)
+    assert status is not None
+    assert path.encode() in status.details[0].value
+
+
+def test_a_queue_above_the_bound_is_refused(stub: Any) -> None:
+    """It is RESOURCE_EXHAUSTED."""
+    with pytest.raises(grpc.RpcError) as raised:
+        list(stub.Subscribe(pb.SubscribeRequest(pattern="a/b/c", queue=100_000)))
+    assert raised.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+def test_a_slow_reader_gets_the_newest_and_is_told_what_it_missed(gateway: GatewayProcess, stream: str) -> None:
+    """Frames delivered and frames said to be skipped add up; the last frame is there; others get everything."""
+    stub = gateway.stub()
+    many = {"label": np.zeros(300, dtype=int), "center": np.random.default_rng(1).uniform(-90, 90, (300, 3))}
+    many |= {"size": np.tile([4.5, 1.9, 1.6], (300, 1)), "yaw": np.zeros(300), "score": np.full(300, 0.9)}
+    asleep = subscribed(gateway.stub(), pattern=stream, queue=4)
+    awake = subscribed(gateway.stub(), pattern=stream, queue=1024)
+    received: list[Any] = []
+    reader = threading.Thread(target=lambda: received.extend(taken(awake, 200)))
+    reader.start()
+    list(stub.Track(detections(frame(seq, stream, **many)) for seq in range(200)))
+    reader.join(60)
+    assert [one.tracks.seq for one in received] == list(range(200))
+    assert sum(one.skipped for one in received) == 0
+    late, skipped = [], 0
+    while not late or late[-1] < 199:
+        response = next(asleep)
+        late.append(response.tracks.seq)
+        skipped += response.skipped
+    asleep.cancel()
+    assert skipped > 0
+    assert len(late) + skipped == 200
+    assert late == sorted(late)
+
+
+def test_what_is_left_of_a_frame_is_a_message(stub: Any, stream: str) -> None:
+    """Filtered by rows alone, tracks are still what the models accept."""
+    tracked(stub, stream)
+    asked = pb.QueryTracksRequest(pattern=stream, filter=pb.TrackFilter(classes=["car"]))
+    for one in stub.QueryTracks(asked):
+        assert encode(convert.from_proto(one.tracks, Tracks))
