@@ -118,6 +118,24 @@ def viewer(prefix: str, name: str) -> Role:
     )
 
 
+def gateway(prefix: str, name: str) -> Role:
+    """Give a gRPC gateway: it does for its callers what they may do, and looks at their certificates itself."""
+    inputs = recoverable(f"{prefix}/*/*/*/detections", f"{prefix}/*/*/*/points")
+    outputs = recoverable(f"{prefix}/*/*/*/tracks", f"{prefix}/*/*/*/problems")
+    questions = (f"{prefix}/*/*/*/q/*", f"{prefix}/service/*/q/status")
+    presence = (f"{prefix}/service/*/alive",)
+    return Role(
+        f"gateway/{name}",
+        f"gateway/{name}",
+        sends=((WRITE + TOKEN + ANSWER, inputs), (READ + ASK, outputs), (ASK, questions), (READ, presence)),
+        receives=(
+            (READ + ASK + ANSWER, recoverable(f"{prefix}/**")),
+            (WRITE + TOKEN, outputs),
+            (TOKEN, presence),
+        ),
+    )
+
+
 def access_control(roles: list[Role]) -> dict[str, Any]:
     """Give the router's table of who may do what; whoever is not in it may do nothing."""
     rules, subjects, policies = [], [], []
@@ -300,6 +318,7 @@ def make(options: argparse.Namespace) -> list[str]:
         *(service(prefix, _named(name)) for name in options.service),
         *(viewer(prefix, _named(name)) for name in options.viewer),
     ]
+    gateways = [gateway(prefix, _named(host)) for host in options.gateway]
     endpoints = [options.connect or f"tls/{options.router[0]}:{PORT}"]
     authority = Authority(out / "authority", options.days)
     told = []
@@ -314,17 +333,25 @@ def make(options: argparse.Namespace) -> list[str]:
         return options.at or str((out / place).absolute())
 
     bounds = limits(prefix, options.megabytes, options.rate)
-    router = zenoh_router(at("router"), bounds, access_control(roles))
+    router = zenoh_router(at("router"), bounds, access_control(roles + gateways))
     machine(f"router/{options.router[0]}", "router", tuple(options.router), router)
     for role in roles:
         machine(role.name, role.folder, (), zenoh_client(at(role.folder), endpoints))
+    for role, host in zip(gateways, options.gateway, strict=True):
+        machine(role.name, role.folder, (host,), zenoh_client(at(role.folder), endpoints))
+        names = json.dumps([one.name for one in roles], indent=2) + "\n"
+        (out / role.folder / "names.json").write_text(names, encoding="utf-8")
     return told
 
 
 def _named(name: str, chunks: int = 1) -> str:
     parts = name.split("/")
     good = len(parts) == chunks and all(CHUNK.fullmatch(part) and part not in {".", ".."} for part in parts)
-    if not good or parts[0] in {"service", "owner", "viewer", "router"} or len(name) > MAX_NAME - len("service/"):
+    if (
+        not good
+        or parts[0] in {"service", "owner", "viewer", "router", "gateway"}
+        or len(name) > MAX_NAME - len("service/")
+    ):
         shape = "site/node" if chunks > 1 else "a name"
         raise MakeError(f"expected {shape} of letters, digits and _ . -, received {name!r}")
     return name
@@ -377,6 +404,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--service", action="append", default=[], metavar="NAME", help="a tracking service")
     parser.add_argument("--node", action="append", default=[], metavar="SITE/NODE", help="a perception node")
     parser.add_argument("--viewer", action="append", default=[], metavar="NAME", help="one who reads everything")
+    parser.add_argument("--gateway", action="append", default=[], metavar="HOST", help="a gRPC gateway, on this host")
     parser.add_argument("--connect", metavar="ENDPOINT", help="where clients connect; default: tls/ROUTER:7447")
     parser.add_argument("--at", metavar="DIR", help="where each machine will have its folder; default: where it is now")
     parser.add_argument("--prefix", default="optipmb/v1", help="first chunks of every key")

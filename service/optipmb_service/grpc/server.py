@@ -98,7 +98,7 @@ class Server:
             *OPTIONS,
             ("grpc.max_receive_message_length", most),
             ("grpc.max_send_message_length", -1),
-            ("grpc.max_concurrent_streams", settings.grpc_calls),
+            ("grpc.max_concurrent_streams", settings.grpc_calls + 1),  # one more is refused, and does not wait
         )
         self._server = grpc.aio.server(options=options)
         self._health = health.aio.HealthServicer()

@@ -198,7 +198,9 @@ class Session:
             outputs += self.reset("parameters")
         elif changes:
             head = self._processed.head
-            self._begin(replace(head, session=self._processed.transition.name(None, head.starts)))
+            # What was begun with the old profile has its classes.
+            empty = optipmb.Density.empty(self._processed.transition.parameters.labels, head.density.next_id)
+            self._begin(replace(head, session=self._processed.transition.name(None, head.starts), density=empty))
         return outputs
 
     # To be written down and taken up again

@@ -1,0 +1,144 @@
+"""What a gateway stands: broken, huge and idle callers, while the others are served."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import grpc
+import pytest
+from gateway import GatewayProcess, detections, frame
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from service_process import ServiceProcess
+
+CONNECTIONS = 2_000
+"""Idle connections of the test; each end of one takes a file."""
+
+
+def resident(pid: int) -> int:
+    """Bytes of memory of a process."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
+
+
+def files(pid: int) -> int:
+    """Open files of a process."""
+    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
+
+
+def served(gateway: GatewayProcess, stream: str) -> None:
+    """Frames are tracked."""
+    responses = list(gateway.stub().Track((detections(frame(seq, stream)) for seq in range(5)), timeout=30))
+    assert [one.tracks.seq for one in responses] == list(range(5))
+
+
+def test_a_message_of_100_mb_is_refused(gateway: GatewayProcess, stream: str) -> None:
+    """It is RESOURCE_EXHAUSTED before memory is taken for it, and others are served."""
+    options = [("grpc.max_send_message_length", -1)]
+    stub = rpc.TrackingServiceStub(grpc.insecure_channel(gateway.address, options=options))
+    before = resident(gateway.process.pid)
+    huge = pb.TrackRequest(points=pb.Points(stream=stream, xyz=pb.Array(data=bytes(100 * 2**20))))
+    with pytest.raises(grpc.RpcError) as raised:
+        list(stub.Track(iter([huge])))
+    assert raised.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+    assert resident(gateway.process.pid) - before < 50 * 2**20
+    served(gateway, stream)
+
+
+def test_many_small_claims_take_little_memory(gateway: GatewayProcess, stream: str) -> None:
+    """Labels, shapes and numbers by the million are refused, and the memory comes back."""
+    stub = gateway.stub()
+    served(gateway, stream)
+    before = resident(gateway.process.pid)
+    message = pb.TrackRequest(detections=pb.Detections(stream=stream, labels=[""] * 2_000_000))
+    shape = pb.Array(dtype=pb.DATA_TYPE_F8, shape=[1] * 2_000_000)
+    for request in (message, pb.TrackRequest(detections=pb.Detections(stream=stream, center=shape))):
+        problems = list(stub.Track(iter([request])))
+        assert [one.WhichOneof("response") for one in problems] == ["problem"]
+    assert resident(gateway.process.pid) - before < 300 * 2**20
+
+
+def test_idle_connections(gateway: GatewayProcess, stream: str) -> None:
+    """Thousands of connections that say nothing keep nobody from being served, and their files come back."""
+    host, _, port = gateway.address.rpartition(":")
+    before = files(gateway.process.pid)
+    idle: list[socket.socket] = []
+    try:
+        idle.extend(socket.create_connection((host, int(port)), timeout=10) for _ in range(CONNECTIONS))
+        served(gateway, stream)
+    finally:
+        for one in idle:
+            one.close()
+    ends = time.monotonic() + 60
+    while files(gateway.process.pid) > before + 20:
+        assert time.monotonic() < ends, f"{files(gateway.process.pid) - before} files are left"
+        time.sleep(0.1)
+    served(gateway, stream)
+
+
+def test_slow_requests_hold_nobody(gateway: GatewayProcess, stream: str) -> None:
+    """Calls that begin and never send their message are no obstacle; they end with their callers."""
+    release = threading.Event()
+
+    def nothing() -> Iterator[Any]:
+        release.wait(60)
+        yield from ()
+
+    stub = gateway.stub()
+    slow = [stub.Track(nothing()) for _ in range(100)]
+    served(gateway, stream)
+    release.set()
+    assert [list(call) for call in slow] == [[]] * 100
+
+
+def test_garbage_is_no_http(gateway: GatewayProcess, stream: str) -> None:
+    """Bytes that are no HTTP/2, and a connection cut in the middle of a frame, leave nothing behind."""
+    host, _, port = gateway.address.rpartition(":")
+    for garbage in (b"\x00" * 1000, b"GET / HTTP/1.1\r\n\r\n", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\x00\xff\xff"):
+        with socket.create_connection((host, int(port)), timeout=10) as one:
+            one.sendall(garbage)
+    served(gateway, stream)
+
+
+def test_more_calls_than_allowed(service: ServiceProcess, stream: str) -> None:
+    """The call beyond the bound is RESOURCE_EXHAUSTED at once; when one ends there is room again."""
+    with GatewayProcess(service.endpoint, environment={"OPTIPMB_GRPC_CALLS": "2"}) as gateway:
+        gateway.wait_ready()
+        calls = [gateway.stub().Subscribe(pb.SubscribeRequest(pattern=stream)) for _ in range(2)]
+        for call in calls:
+            call.initial_metadata()
+        third = gateway.stub()
+        with pytest.raises(grpc.RpcError) as raised:
+            third.GetState(pb.GetStateRequest(stream=stream))
+        assert raised.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+def test_the_end_of_a_gateway_finishes_what_is_under_way(service: ServiceProcess, stream: str) -> None:
+    """On SIGTERM frames that were sent get their tracks, calls end as UNAVAILABLE, the process ends with status 0."""
+    with GatewayProcess(service.endpoint) as gateway:
+        gateway.wait_ready()
+        stub, release = gateway.stub(), threading.Event()
+
+        def requests() -> Iterator[pb.TrackRequest]:
+            yield from (detections(frame(seq, stream)) for seq in range(20))
+            release.wait(30)
+
+        call = stub.Track(requests())
+        received = [next(call).tracks.seq for _ in range(20)]
+        watching = stub.Subscribe(pb.SubscribeRequest(pattern=stream))
+        watching.initial_metadata()
+        status, seconds = gateway.end()
+        for one in (call, watching):
+            with pytest.raises(grpc.RpcError) as raised:
+                list(one)
+            assert raised.value.code() == grpc.StatusCode.UNAVAILABLE
+        release.set()
+        assert (received, status) == (list(range(20)), 0)
+        assert seconds < 5
