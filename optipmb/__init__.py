@@ -35,6 +35,7 @@ from optipmb.parameters import (
     Parameters,
     load_profile,
     parse_parameters,
+    profile_source,
     profiles,
 )
 from optipmb.points import points_in_boxes
@@ -77,6 +78,7 @@ __all__ = [
     "make_frame",
     "parse_parameters",
     "points_in_boxes",
+    "profile_source",
     "profiles",
     "sound",
     "warm_up",

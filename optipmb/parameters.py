@@ -11,13 +11,17 @@ filter with survival probability one needs to forget objects (`max_misses`, `min
 from __future__ import annotations
 
 import tomllib
+from difflib import get_close_matches
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from optipmb.errors import ParameterError
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 OpenProbability = Annotated[float, Field(gt=0.0, lt=1.0)]
@@ -259,11 +263,11 @@ def profiles() -> tuple[str, ...]:
     return tuple(sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml")))
 
 
-def load_profile(profile: str | Path) -> Parameters:
-    """Read a profile by the name of one that comes with the package, or by the path of a TOML file.
+def profile_source(profile: str | Path) -> str:
+    """Return the text of a profile by the name of one that comes with the package, or by the path of a TOML file.
 
     Raises:
-        ParameterError: no such profile, no TOML, or a value that is not allowed; `path` names the field.
+        ParameterError: no such profile.
     """
     if isinstance(profile, str) and profile in profiles():
         text = resources.files("optipmb").joinpath("profiles", f"{profile}.toml").read_text(encoding="utf-8")
@@ -271,8 +275,20 @@ def load_profile(profile: str | Path) -> Parameters:
         try:
             text = Path(profile).read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            expected = f"one of {', '.join(profiles())} or a readable TOML file"
+            near = get_close_matches(str(profile).lower(), profiles(), 1, 0.6)
+            meant = f" (is {near[0]} meant?)" if near else ""
+            expected = f"one of {', '.join(profiles())} or a readable TOML file{meant}"
             raise ParameterError("profile", expected, f"{str(profile)!r} ({type(error).__name__})") from error
+    return text
+
+
+def load_profile(profile: str | Path) -> Parameters:
+    """Read a profile by the name of one that comes with the package, or by the path of a TOML file.
+
+    Raises:
+        ParameterError: no such profile, no TOML, or a value that is not allowed; `path` names the field.
+    """
+    text = profile_source(profile)
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -291,4 +307,16 @@ def parse_parameters(document: dict[str, Any]) -> Parameters:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         path = ".".join(str(part) for part in first["loc"]) or "profile"
-        raise ParameterError(path, first["msg"], repr(first["input"])[:80]) from error
+        raise ParameterError(path, *_explained(first)) from error
+
+
+def _explained(problem: ErrorDetails) -> tuple[str, str]:
+    """Return what was expected and what was received, without the words of the library that checks."""
+    if problem["type"] == "missing":
+        return "a value", "none"
+    if problem["type"] == "extra_forbidden":
+        known = sorted({name for model in _Table.__subclasses__() for name in model.model_fields})
+        near = get_close_matches(str(problem["loc"][-1]), known, 3, 0.5)
+        return "a known field" + (f", such as {' or '.join(near)}" if near else ""), repr(problem["loc"][-1])
+    text = problem["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return text, repr(problem["input"])[:80]

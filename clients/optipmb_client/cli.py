@@ -19,6 +19,7 @@ from optipmb_client.commands.move import move
 from optipmb_client.commands.options import MANY
 from optipmb_client.commands.play import play
 from optipmb_client.commands.plot import plot
+from optipmb_client.commands.profiles import profiles
 from optipmb_client.commands.record import record
 from optipmb_client.commands.replay import replay
 from optipmb_client.commands.status import status
@@ -43,7 +44,23 @@ _OptionError: Any = typer.BadParameter.__base__
 app = typer.Typer(
     name="optipmb", help="Track objects in 3D: offline, or through a tracking service.", add_completion=False
 )
-for command in (demo, track, replay, record, play, watch, evaluate, tune, ablate, plot, status, load, move, warm_up):
+for command in (
+    demo,
+    track,
+    replay,
+    record,
+    play,
+    watch,
+    evaluate,
+    tune,
+    ablate,
+    plot,
+    status,
+    profiles,
+    load,
+    move,
+    warm_up,
+):
     app.command()(command)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Final
+from typing import Any, Final
 
 from optipmb import (
     Modules,
@@ -25,6 +25,8 @@ from optipmb import (
     like,
     load_profile,
     make_frame,
+    profile_source,
+    profiles,
     warm_up,
 )
 from optipmb_client.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame
@@ -183,6 +185,41 @@ def read_profile(profile: str) -> Parameters:
         return load_profile(profile)
     except OptipmbError as error:
         raise UsageError(f"--profile {profile}: {error}") from error
+
+
+def profile_names() -> tuple[str, ...]:
+    """Return the names of the profiles that come along."""
+    return profiles()
+
+
+def profile_text(profile: str) -> str:
+    """Return a profile as the text of its TOML file."""
+    return profile_source(profile)
+
+
+@dataclass(frozen=True)
+class FieldOfProfile:
+    """A field of a profile: its path below a class, what it means, and its value for each class that has it."""
+
+    path: str
+    description: str
+    values: dict[str, float]
+
+
+def fields_of(parameters: Parameters) -> Iterator[FieldOfProfile]:
+    """Yield every field with numbers of the classes of a profile."""
+    yield from _fields_of("", dict(parameters.classes))
+
+
+def _fields_of(path: str, tables: dict[str, Any]) -> Iterator[FieldOfProfile]:
+    for name, field in type(next(iter(tables.values()))).model_fields.items():
+        values = {label: getattr(table, name) for label, table in tables.items()}
+        numbers = {label: value for label, value in values.items() if isinstance(value, (int, float))}
+        inner = {label: value for label, value in values.items() if hasattr(value, "model_fields_set")}
+        if numbers:
+            yield FieldOfProfile(path + name, field.description or "", numbers)
+        if inner:
+            yield from _fields_of(f"{path}{name}.", inner)
 
 
 def profile_for(profile: str, sequences: Sequence[DataSequence]) -> Parameters:

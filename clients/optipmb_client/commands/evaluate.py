@@ -1,6 +1,8 @@
 """`optipmb evaluate`: result files against the truth."""
 
 from collections.abc import Sequence as Many
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,27 +15,34 @@ from optipmb_client.commands.options import (
     Root,
     Sequences,
     Source,
-    Tracks,
     Truth,
     asked_for,
     open_sequences,
     print_json,
     print_table,
 )
-from optipmb_client.datasets import DataSequence
+from optipmb_client.datasets import DataSequence, DatasetArguments
 from optipmb_client.errors import UsageError
+from optipmb_client.extras import needed
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from optipmb_client.evaluation import ClassResult, Rules
+    from optipmb_client.evaluation.figures import ClassFigures
 
 
 def evaluate(  # noqa: PLR0913  these are the command's options
     data: Source = None,
     *,
     dataset: DatasetName = None,
-    tracks: Tracks,
+    tracks: Annotated[
+        list[Path],
+        typer.Option(
+            "--tracks",
+            help="Folder with the result files of track or replay, or a table of tracks; several times: compared.",
+        ),
+    ],
     root: Root = None,
     detections: Detections = None,
     sequences: Sequences = None,
@@ -62,6 +71,48 @@ def evaluate(  # noqa: PLR0913  these are the command's options
 
     The best threshold is the one on the mean score of a track that gives the highest MOTA.
     """
+    needed("optipmb evaluate", "evaluation", "scipy")
+    from optipmb_client.commands.tables import comparison_tables  # noqa: PLC0415  loads the solvers of scipy
+
+    asked = asked_for(data, dataset, root, detections, option, truth)
+    _, chosen = open_sequences(asked, sequences)
+    names = tuple(classes or labels_of(chosen))
+    how = _How(iou, distance, cutoff, order)
+    reports = {str(one): _judge(asked, chosen, one, names, how) for one in tracks}
+    report = {"command": "evaluate", "dataset": asked.name, "sequences": [sequence.name for sequence in chosen]}
+    (first, *others) = reports.values()
+    if as_json and others:
+        print_json({**report, "trackers": {place: one.parts for place, one in reports.items()}})
+    elif as_json:
+        print_json({**report, "tracks": tracks[0], **first.parts})
+    else:
+        tables = comparison_tables({place: one.figures for place, one in reports.items()}) if others else first.tables
+        for table in tables:
+            print_table(table)
+
+
+@dataclass(frozen=True)
+class _How:
+    """What the options say about comparing."""
+
+    iou: float | None
+    distance: float | None
+    cutoff: float
+    order: float
+
+
+@dataclass(frozen=True)
+class _Judgement:
+    """What was found out about the tracks of one tracker: for programs, for tables beside each other, and as tables."""
+
+    parts: dict[str, Any]
+    figures: "Many[ClassFigures]"
+    tables: "Many[RenderableType]"
+
+
+def _judge(
+    asked: DatasetArguments, chosen: "Many[DataSequence]", tracks: Path, names: tuple[str, ...], how: _How
+) -> _Judgement:
     from optipmb_client.commands.tables import (  # noqa: PLC0415  loads the solvers of scipy
         clear_table,
         figure_tables,
@@ -75,41 +126,28 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     )
     from optipmb_client.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
 
-    asked = asked_for(data, dataset, root, detections, option, truth)
-    _, chosen = open_sequences(asked, sequences)
-    sequence_names = [sequence.name for sequence in chosen]
-    names = tuple(classes or labels_of(chosen))
-    report: dict[str, Any] = {
-        "command": "evaluate",
-        "dataset": asked.name,
-        "tracks": tracks,
-        "sequences": sequence_names,
-    }
     head: list[RenderableType] = []
-    settings = Settings(cutoff=cutoff, order=order) if iou is None else Settings((iou,), cutoff, order)
+    overall: dict[str, Any] = {}
+    settings = Settings((how.iou,), how.cutoff, how.order) if how.iou else Settings(cutoff=how.cutoff, order=how.order)
     if asked.name == "nuscenes" and asked.root is not None:
-        if iou is not None or distance is not None:
+        if how.iou is not None or how.distance is not None:
             raise UsageError("--iou and --distance: the benchmark of nuScenes has its own rules")
-        scores = evaluate_nuscenes(asked.root, tracks, sequence_names)
+        scores = evaluate_nuscenes(asked.root, tracks, [sequence.name for sequence in chosen])
         head = [nuscenes_table(scores, names)]
-        report["overall"] = scores.to_json()["overall"]
+        overall = {"overall": scores.to_json()["overall"]}
         parts = {name: {"nuscenes": one.to_json()} for name, one in scores.classes.items() if name in names}
         best = {name: scores.classes[name].best.threshold for name in parts}
     else:
-        results = evaluate_files(chosen, tracks, names, _rules(asked.name, iou, distance))
+        results = evaluate_files(chosen, tracks, names, _rules(asked.name, how.iou, how.distance))
         parts = {one.name: _figures(one) for one in results}
         best = {} if asked.name == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
-        if asked.name != "kitti" or distance is not None:  # AB3DMOT's protocol gives them at its own threshold
-            head = [clear_table(results, metres=iou is None)]
+        if asked.name != "kitti" or how.distance is not None:  # AB3DMOT's protocol gives them at its own threshold
+            head = [clear_table(results, metres=how.iou is None)]
     figures = evaluate_figures(asked.name, load_recordings(asked.name, chosen, tracks), names, settings, best)
     if not figures:
-        raise UsageError("neither the truth nor the tracks have objects of these classes")
-    if as_json:
-        report["classes"] = {one.name: {**parts.get(one.name, {}), **one.summary()} for one in figures}
-        print_json(report)
-        return
-    for table in (*head, *figure_tables(figures, cutoff)):
-        print_table(table)
+        raise UsageError(f"{tracks}: neither the truth nor the tracks have objects of these classes")
+    by_class = {one.name: {**parts.get(one.name, {}), **one.summary()} for one in figures}
+    return _Judgement({**overall, "classes": by_class}, figures, (*head, *figure_tables(figures, how.cutoff)))
 
 
 def labels_of(sequences: Many[DataSequence]) -> tuple[str, ...]:

@@ -31,6 +31,7 @@ from optipmb_client.commands.options import (
     print_json,
     say,
 )
+from optipmb_client.errors import UsageError
 from optipmb_client.links import linked
 from optipmb_client.progress import FrameProgress
 from optipmb_client.recording import latency
@@ -68,6 +69,10 @@ def replay(  # noqa: PLR0913  these are the command's options
     asked = asked_for(data, dataset, root, detections, option)
     opened, chosen = open_sequences(asked, sequences)
     name = profile or opened.profile
+    if name == "auto":
+        raise UsageError(
+            "--profile: one that the service knows; auto is made for offline tracking (see: optipmb profiles)"
+        )
     with (
         closing(linked(connect, config=config, timeout=wait)) as connection,
         FrameProgress("replaying", sum(map(len, chosen))) as progress,

@@ -86,6 +86,20 @@ def figure_tables(figures: "Sequence[ClassFigures]", cutoff: float) -> Iterator[
         )
 
 
+def comparison_tables(trackers: "Mapping[str, Sequence[ClassFigures]]") -> Iterator[RenderableType]:
+    """Yield a table for each class with the figures of several trackers, all their tracks counted."""
+    for name in dict.fromkeys(one.name for figures in trackers.values() for one in figures):
+        table = _empty(("tracks", *_HOTA, "LocA", *_GOSPA))
+        for place, figures in trackers.items():
+            for one in (one.everything for one in figures if one.name == name):
+                table.add_row(
+                    place,
+                    *(_shown(one.hota.summary()[column]) for column in (*_HOTA, "LocA")),
+                    *(_shown(one.gospa.summary()[column], plain=True) for column in _GOSPA),
+                )
+        yield _titled(f"{name}: HOTA of centres in percent; GOSPA and OSPA in metres", table)
+
+
 def _protocol(figures: "Sequence[ClassFigures]") -> Table:
     table = _empty(("class", "IoU", *_PROTOCOL, *_SHARES))
     for one in figures:
@@ -179,7 +193,7 @@ def _reliability(figures: "Sequence[ClassFigures]") -> Table:
 def _empty(columns: Sequence[str]) -> Table:
     table = Table(box=None, pad_edge=False)
     for name in columns:
-        table.add_column(name, justify="left" if name in {"class", ""} else "right", no_wrap=True)
+        table.add_column(name, justify="left" if name in {"class", "tracks", ""} else "right", no_wrap=True)
     return table
 
 

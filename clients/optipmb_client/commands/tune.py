@@ -73,7 +73,7 @@ def tune(  # noqa: PLR0913  these are the command's options
     A second call with the same --out goes on where the first one ended.
     """
     from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
-    from optipmb_client.offline import read_profile  # noqa: PLC0415  as above
+    from optipmb_client.offline import profile_for  # noqa: PLC0415  as above
 
     if not estimate_only:
         needed("optipmb tune", "tune", "optuna")
@@ -81,7 +81,7 @@ def tune(  # noqa: PLR0913  these are the command's options
         raise UsageError(f"--metric: one of {', '.join(METRICS)}, received {metric!r}")
     asked = asked_for(data, dataset, root, detections, option, truth)
     opened, chosen = open_sequences(asked, sequences)
-    parameters = read_profile(profile or opened.profile)
+    parameters = profile_for(profile or opened.profile, chosen)
     source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, classes)
     estimates = tuning.estimate_all(source, parameters, out)
     if not as_json:

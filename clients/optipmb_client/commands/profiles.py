@@ -1,0 +1,74 @@
+"""`optipmb profiles`: the parameter profiles that come along; list, show, copy, explain."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from optipmb_client.commands.options import AsJson, print_json, print_table, say
+from optipmb_client.errors import UsageError
+from optipmb_client.files import AtomicText
+
+if TYPE_CHECKING:
+    from optipmb_client.offline import FieldOfProfile
+
+
+def profiles(
+    name: Annotated[
+        str | None, typer.Argument(help="Profile to show: its name, or a TOML file.", show_default=False)
+    ] = None,
+    *,
+    copy: Annotated[
+        Path | None, typer.Option("--copy", help="Write the profile into this file, to change it.", show_default=False)
+    ] = None,
+    explain: Annotated[bool, typer.Option("--explain", help="Say what each field means, with its values.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List the profiles that come along, show one, copy it, or explain its fields.
+
+    A profile of your own is checked by showing it: `optipmb profiles mine.toml`.
+    """
+    from optipmb_client import offline  # noqa: PLC0415  loads the tracker and its compiler
+
+    if name is None:
+        if copy is not None or explain:
+            raise UsageError("which profile? " + ", ".join(offline.profile_names()))
+        _list(as_json=as_json)
+        return
+    parameters = offline.read_profile(name)
+    if copy is not None:
+        if copy.exists():
+            raise UsageError(f"--copy {copy}: it is there already")
+        file = AtomicText(copy)
+        file.write(offline.profile_text(name))
+        file.close()
+        say(f"{name} in {copy}; its name field is still {parameters.name!r}")
+    elif as_json:
+        print_json({"command": "profiles", "profile": parameters.model_dump()})
+    elif explain:
+        for field in offline.fields_of(parameters):
+            say(_line(field))
+    else:
+        say(offline.profile_text(name).rstrip())
+
+
+def _line(field: "FieldOfProfile") -> str:
+    values = ", ".join(f"{name} {value:g}" for name, value in field.values.items())
+    return f"{field.path}: {field.description}\n    {values}"
+
+
+def _list(*, as_json: bool) -> None:
+    from optipmb_client import offline  # noqa: PLC0415  as above
+
+    known = {one: offline.read_profile(one) for one in offline.profile_names()}
+    if as_json:
+        print_json({"command": "profiles", "profiles": {one: list(it.labels) for one, it in known.items()}})
+        return
+    table = Table(box=None, pad_edge=False)
+    for column in ("profile", "Hz", "classes"):
+        table.add_column(column, justify="right" if column == "Hz" else "left")
+    for one, it in known.items():
+        table.add_row(one, f"{1.0 / it.nominal_period:g}", ", ".join(it.labels))
+    table.add_row(offline.AUTO, "any", "any: made for the data by track and tune")
+    print_table(table)

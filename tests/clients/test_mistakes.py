@@ -1,0 +1,105 @@
+"""Twenty mistakes that new users make, and the sentence that each of them gets."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from optipmb_client.cli import run
+from optipmb_client.table_files import write_table
+from own_tables import FRAMES, boxes
+
+ROWS = 3 * FRAMES
+NOWHERE = "nowhere.csv"
+
+
+def camera_boxes() -> dict[str, np.ndarray]:
+    """Give boxes with the axes of a camera."""
+    plain = boxes()
+    return boxes(y=-plain["z"], z=np.linspace(2.0, 70.0, ROWS), x=plain["y"])
+
+
+def broken(column: str, row: int, value: float) -> dict[str, np.ndarray]:
+    """Give boxes with one wrong value."""
+    columns = boxes()
+    columns[column] = columns[column].astype(np.float64)
+    columns[column][row] = value
+    return columns
+
+
+def classes(*names: str) -> dict[str, np.ndarray]:
+    """Give boxes of other classes."""
+    return boxes(**{"class": np.array(names * FRAMES)})
+
+
+MISTAKES: list[tuple[str, Any, list[str], int, str]] = [
+    ("swapped axes", camera_boxes(), [], 2, "camera axes: x right, y down, z forward"),
+    ("degrees", boxes(yaw=np.tile([0.0, 179.0, 5.0], FRAMES)), [], 0, "yaw looks like degrees (up to 179)"),
+    ("milliseconds", boxes(t=np.repeat(np.arange(FRAMES) * 100, 3)), [], 0, "stamps look like milliseconds"),
+    ("frame numbers as time", boxes(t=np.repeat(np.arange(FRAMES), 3)), [], 2, "may count frames"),
+    ("frames without a rate", boxes(t=None, frame=np.repeat(np.arange(FRAMES), 3)), [], 2, "--option rate=HZ"),
+    ("sizes as h, w, l", boxes(l=boxes()["h"], h=boxes()["l"]), [], 0, "--option sizes=hwl reads them so"),
+    ("lower-case classes", classes("car", "car", "pedestrian"), ["--profile", "kitti"], 2, "class.car=Car"),
+    ("classes of nobody", classes("cone", "cone", "sign"), ["--profile", "kitti"], 2, "nothing would be tracked"),
+    ("some classes unknown", classes("Car", "Car", "Cone"), ["--profile", "kitti"], 0, "does not track Cone: left out"),
+    ("a rate of another profile", boxes(), ["--profile", "nuscenes", "--option", "class.Car=car"], 0, "for 2 Hz"),
+    ("not a number", broken("x", 7, np.nan), [], 2, "d.csv:9: expected finite x, y and z"),
+    ("a size of zero", broken("w", 3, 0.0), [], 2, "d.csv:5: expected positive length, width and height"),
+    ("logits as scores", boxes(score=np.tile([4.0, 3.0, -1.0], FRAMES)), [], 0, "scores look like logits (-1 to 4)"),
+    ("percent as scores", boxes(score=np.tile([90.0, 80.0, 70.0], FRAMES)), [], 0, "scores look like percent"),
+    ("rows backwards in time", {k: v[::-1] for k, v in boxes().items()}, [], 0, "results in"),
+    ("a column missing", boxes(yaw=None), [], 2, "expected a column yaw (--option column.yaw=NAME)"),
+    (
+        "text for a number",
+        boxes(x=np.array(["a", *["1.0"] * (ROWS - 1)])),
+        [],
+        2,
+        "d.csv:2: expected a number in column x",
+    ),
+    ("no header", "0.0,1,2,3,4,5,6,7,8\n", [], 2, "a first line with the names of the columns"),
+    ("an empty file", "", [], 2, "expected a table, received an empty file"),
+    ("a header alone", "t,x,y,z,l,w,h,yaw,score,class\n", [], 2, "expected rows, received none"),
+    ("no such file", None, [], 2, "expected a table (.csv), received No such file or directory"),
+    ("a wrong profile", boxes(), ["--profile", "kiti"], 2, "(is kitti meant?)"),
+    ("a wrong option", boxes(), ["--option", "jaw=degrees"], 2, "--option jaw: expected one of time, rate, yaw"),
+    ("no tracks", boxes(score=np.full(ROWS, 0.01)), ["--profile", "kitti"], 1, "no tracks came of 90 detections"),
+]
+
+
+@pytest.mark.parametrize(
+    ("content", "options", "status", "text"), [one[1:] for one in MISTAKES], ids=[m[0] for m in MISTAKES]
+)
+def test_every_mistake_gets_its_sentence(
+    content: Any, options: list[str], status: int, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command ends with the status and says the sentence; an error is one line, the last one."""
+    path = tmp_path / "d.csv"
+    if isinstance(content, str):
+        path.write_text(content)
+    elif content is not None:
+        write_table(path, content)
+    assert run(["track", str(path), "--out", str(tmp_path / "t.csv"), *options]) == status
+    printed = capsys.readouterr()
+    assert text in printed.err + printed.out
+    if status == 2:
+        assert text in printed.err.splitlines()[-1]
+        assert not (tmp_path / "t.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("package", "command", "line"),
+    [
+        ("pyarrow", ["track", "d.csv"], "pip install 'optipmb[table]'"),
+        ("optuna", ["tune", "d.csv"], "pip install 'optipmb[tune]'"),
+        ("scipy", ["evaluate", "d.csv", "--tracks", "t"], "pip install 'optipmb[evaluation]'"),
+    ],
+)
+def test_a_missing_extra_gets_the_command_that_installs_it(
+    package: str, command: list[str], line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without the packages of an extra, one line says how to install it, and the status is 1."""
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *_: None if name == package else object())
+    assert run(command) == 1
+    assert line in capsys.readouterr().err
