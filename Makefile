@@ -8,7 +8,7 @@ DATA ?= data
 KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
-FUZZ_TARGETS := fuzz-messages fuzz-checkpoints
+FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
 .PHONY: help docs release demo test bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check lowest pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
@@ -163,7 +163,7 @@ kills: install
 soak: install
 	OPTIPMB_TEST_SOAK_S=3600 OPTIPMB_TEST_SOAK_STREAMS=10 $(BIN)/pytest -q tests/e2e/test_soak.py --timeout 0
 
-# What is found is kept in tests/fuzz/found, where the tests take it up. `make -j2 fuzz` searches both decoders at once.
+# What is found is kept in tests/fuzz/found, where the tests take it up. `make -j2 fuzz` searches two decoders at once.
 FUZZ_S ?= 1800
 fuzz: $(FUZZ_TARGETS)
 $(FUZZ_TARGETS): fuzz-%: install

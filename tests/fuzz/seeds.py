@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import optipmb_schemas as schemas
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_service.session.checkpoint import HEAD, encode_checkpoint
 from optipmb_service.session.session import Session
 from router import Sensor
@@ -28,6 +30,15 @@ def main() -> None:
         name = type(message).__name__
         _write("messages", f"{name}.msgpack", kind + schemas.encode(message))
         _write("messages", f"{name}.json", kind + schemas.encode_json(message))
+    asked = pb.TrackFilter(classes=["car"], area=pb.Polygon(x=[0, 1, 1], y=[0, 0, 1]), fields=["center"])
+    requests = [
+        pb.TrackRequest(detections=convert.to_proto(messages[0])),
+        pb.PublishRequest(points=convert.to_proto(messages[1])),
+        pb.SubscribeRequest(pattern="*/*/*", filter=asked, max_rate_hz=2.0),
+        pb.SetParametersRequest(stream=sensor.stream, parameters=convert.to_proto(messages[3])),
+    ]
+    for number, request in enumerate(requests):
+        _write("protobuf", type(request).__name__, bytes([number]) + request.SerializeToString())
     parameters = optipmb.load_profile("kitti")
     small = parameters.model_copy(update={"classes": dict(list(parameters.classes.items())[:1]), "provenance": ""})
     one = Session(sensor.stream, small, tracker=chained)

@@ -8,6 +8,9 @@ from __future__ import annotations
 import contextlib
 
 import optipmb_schemas as schemas
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+from optipmb_service.grpc.selection import Pace, Selection
 from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
 from optipmb_service.session.convert import density_of
 from optipmb_service.session.session import Session
@@ -15,6 +18,7 @@ from optipmb_service.session.values import Policy
 from router import Sensor
 
 LIMITS = schemas.Limits(max_bytes=2**16, max_json_bytes=2**16, max_values=2**12)
+REQUESTS = (pb.TrackRequest, pb.PublishRequest, pb.SubscribeRequest, pb.SetParametersRequest)
 POLICY = Policy(checkpoint_bytes=2000)
 """So little that a restored session must go over its first frames again before it can be written down."""
 
@@ -52,12 +56,37 @@ def checkpoints(data: bytes) -> None:
     assert encode_checkpoint(decode_checkpoint(written)) == written
 
 
+def protobuf(data: bytes) -> None:
+    """A request over gRPC is read or refused; detections and clouds that are read survive both forms unchanged.
+
+    The first byte chooses the type of the request.
+    """
+    if not data:
+        return
+    kind = REQUESTS[data[0] % len(REQUESTS)]
+    try:
+        request = convert.parse(data[1:], kind)
+        if isinstance(request, pb.SubscribeRequest):
+            Selection(request.filter)
+            Pace(request.max_rate_hz).passes("a/b/c", 0)
+            schemas.Keys().matching(request.pattern, "tracks")
+        elif isinstance(request, pb.SetParametersRequest):
+            convert.from_proto(request.parameters, schemas.SessionParameters, LIMITS)
+        elif (name := request.WhichOneof("request")) in {"detections", "points"}:
+            model: type[schemas.Message] = schemas.Detections if name == "detections" else schemas.Points
+            message = convert.from_proto(getattr(request, name), model, LIMITS)
+            assert schemas.decode(schemas.encode(message), model) == message
+            assert convert.from_proto(convert.to_proto(message), model) == message
+    except schemas.MessageError:
+        return
+
+
 def _answer(session: Session) -> bytes:
     session.state()
     density_of(session.density, stream=session.stream, session=session.session, parameters=session.parameters)
     return encode_checkpoint(session.snapshot())
 
 
-TARGETS = {"messages": messages, "checkpoints": checkpoints}
-HEADS = {"messages": 1, "checkpoints": 0}
+TARGETS = {"messages": messages, "checkpoints": checkpoints, "protobuf": protobuf}
+HEADS = {"messages": 1, "checkpoints": 0, "protobuf": 1}
 """How many bytes stand before the map."""
