@@ -241,3 +241,19 @@ def test_paths_are_those_of_the_motion_model() -> None:
         assert headings[step, 0] == pytest.approx(0.3 + 0.2 * step)
     assert places[-1, 1, 0] == pytest.approx(2.25, abs=1e-2)
     assert places[:, 2].tolist() == [[5.0, 0.0]] * 7
+
+
+def test_damaged_bytes_raise_nothing_else() -> None:
+    """A message cut anywhere, or with any byte changed, is read or refused by the one error of the package."""
+    types = own_types()
+    whole = types.write(autoware())
+    kind = "autoware_perception_msgs/msg/DetectedObjects"
+    damaged = [whole[:end] for end in range(len(whole))]
+    damaged += [whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :] for at in range(len(whole))]
+    refused = 0
+    for data in damaged:
+        try:
+            boxes_of(types.read(kind, data))
+        except MessageError:
+            refused += 1
+    assert refused > len(whole) // 2
