@@ -126,6 +126,7 @@ def first_detected_states(
         table.noise_position,
         table.noise_velocity,
         table.noise_heading,
+        table.linearisations,
         mean_out,
         covariance_out,
     )
@@ -151,6 +152,7 @@ def first_states(
     noise_position: Array,
     noise_velocity: Array,
     noise_heading: Array,
+    linearisations: Index,
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
@@ -173,9 +175,10 @@ def first_states(
         heading_speed: (C,) this and the next two as in `birth_states`.
         known: (C, 6).
         unknown: (C, 6).
-        noise_position: (C,) this and the next two as in `ukf_updates`.
+        noise_position: (C,) this and the next three as in `ukf_updates`.
         noise_velocity: (C,).
         noise_heading: (C,).
+        linearisations: (C,).
         mean_out: (K, 6) receives the means.
         covariance_out: (K, 6, 6) receives the covariances.
 
@@ -230,6 +233,7 @@ def first_states(
         noise_position,
         noise_velocity,
         noise_heading,
+        linearisations,
         parts,
         spreads,
     )

@@ -31,6 +31,7 @@ class ClassTable:
         noise_heading: (C,) of z_phi.
         acceleration_time: (C,) time constant of the acceleration, s, infinite where it is constant.
         constant_velocity: (C,) whether the motion model is that of constant velocity.
+        linearisations: (C,) of measured velocities, zero for the UKF.
         reported_position: (C,) variance that R_x of `optipmb.reported` leaves for z_x and z_y; zero without it.
         reported_heading: (C,) for z_phi.
         birth_known: (C, 6) standard deviations of P^0 when the detection brings a velocity.
@@ -79,6 +80,7 @@ class ClassTable:
     noise_position: Array
     noise_velocity: Array
     noise_heading: Array
+    linearisations: NDArray[np.int64]
     reported_position: Array
     reported_heading: Array
     birth_known: Array
@@ -170,6 +172,7 @@ class ClassTable:
             noise_position=column(lambda p: p.measurement_noise.position),
             noise_velocity=column(lambda p: p.measurement_noise.velocity),
             noise_heading=column(lambda p: p.measurement_noise.heading),
+            linearisations=count(lambda p: p.linearisations),
             reported_position=column(lambda p: _left_over(p, "position")),
             reported_heading=column(lambda p: _left_over(p, "heading")),
             birth_known=spread(lambda p: p.birth.speed),

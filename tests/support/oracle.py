@@ -27,7 +27,7 @@ from oracle_formulas import (
     periods,
     predict,
     report,
-    ukf_update,
+    update,
 )
 from scipy.optimize import linear_sum_assignment
 
@@ -226,7 +226,7 @@ class Oracle:
             log_sum = log_e.max() + math.log(np.sum(np.exp(log_e - log_e.max())))
             log_total = np.logaddexp(log_sum, math.log(clutter))
             weights = [float(w) for w in np.exp(log_e - log_sum)]
-            parts = [ukf_update(u.mean, u.covariance, z, c) for u in members]
+            parts = [update(u.mean, u.covariance, z, c) for u in members]
         shadowed = c.birth_over_clutter and z.score >= c.birth_score
         if gate and not (shadowed and log_sum < math.log(clutter)):
             return NewObject(-log_total, math.exp(log_sum - log_total), *moment_match(weights, parts))
@@ -258,7 +258,7 @@ class Oracle:
             c = self.classes[b.label]
             if i in chosen:
                 z = zs[chosen[i]]
-                b.mean, b.covariance = ukf_update(b.mean, b.covariance, z, c)
+                b.mean, b.covariance = update(b.mean, b.covariance, z, c)
                 b.existence = 1.0
                 b.auxiliary = (1 - z.score) * b.auxiliary + z.score * z.auxiliary
                 length = 1 + (now - b.born_ns) * 1e-9 / self.nominal

@@ -108,6 +108,49 @@ def measure(x: Array, *, with_velocity: bool) -> Array:
     return np.array([px, py, v * np.cos(phi), v * np.sin(phi), phi] if with_velocity else [px, py, phi])
 
 
+def linear_velocity(m: Array, P: Array) -> tuple[Array, Array, Array]:
+    """Mean, Jacobian (2, 6) and error covariance of the best linear function for v (cos phi, sin phi) over N(m, P)."""
+    v, phi, s, c = m[2], m[3], P[3, 3], P[2, 3]
+    turned = np.exp(1j * phi - s / 2)
+    w = turned * (v + 1j * c)
+    square = np.exp(2j * phi - 2 * s) * ((v + 2j * c) ** 2 + P[2, 2])
+    length = v**2 + P[2, 2]
+    second = np.array([[length + square.real, square.imag], [square.imag, length - square.real]]) / 2
+    mean = np.array([w.real, w.imag])
+    A = np.zeros((2, 6))
+    A[:, 2], A[:, 3] = [turned.real, turned.imag], [-w.imag, w.real]
+    return mean, A, second - np.outer(mean, mean) - A @ P @ A.T
+
+
+def linearised_update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array, Array]:
+    """Iterated posterior linearisation: the prior updated by the function that is best over the posterior so far."""
+    noise = c.measurement_noise
+    R = np.diag(np.square([noise.position, noise.position, noise.velocity, noise.velocity, noise.heading]))
+    mean, covariance = m, P
+    for _ in range(c.linearisations):
+        w, A_w, omega = linear_velocity(mean, covariance)
+        A = np.zeros((5, 6))
+        A[0, 0] = A[1, 1] = A[4, 3] = 1.0
+        A[2:4] = A_w
+        S = A @ P @ A.T + R
+        S[2:4, 2:4] += omega
+        expected = np.array([m[0], m[1], *(w + A_w @ (m - mean)), m[3]])
+        heading = mean[3] + fold(z.yaw - mean[3])
+        K = P @ A.T @ np.linalg.inv(S)
+        mean = m + K @ (np.array([*z.xy, *np.asarray(z.velocity), heading]) - expected)
+        covariance = P - K @ S @ K.T
+    mean = mean.copy()
+    mean[3] = wrap(mean[3])
+    return mean, 0.5 * (covariance + covariance.T)
+
+
+def update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array, Array]:
+    """The update that the class asks for."""
+    if c.linearisations and z.velocity is not None:
+        return linearised_update(m, P, z, c)
+    return ukf_update(m, P, z, c)
+
+
 def ukf_update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array, Array]:
     """Eq. (UKF Update) with the parameters `c` of the class."""
     known = z.velocity is not None

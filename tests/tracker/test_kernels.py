@@ -336,7 +336,7 @@ def test_announced_objects_are_matched_mixtures(seed: int) -> None:
     root = rng.normal(0, 0.5, (count, 6, 6))
     mean, covariance = rng.normal(0, 3, (count, 6)), root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6)
     measured = rng.normal(0, 3, (5, 2)), rng.normal(0, 3, (5, 2)), rng.normal(0, 1, 5), np.array([0, 0, 0, 1, 0])
-    noise = rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2)
+    noise = rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2), np.array([0, 2])
     out, spread = np.full((3, 6), np.nan), np.full((3, 6, 6), np.nan)
     given = rows, kind, component, announced, log_e, mean, covariance
     births = rng.uniform(0, 2, 2), rng.uniform(0.1, 1, (2, 6)), rng.uniform(0.1, 1, (2, 6))
