@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     Index = NDArray[np.int64]
 
 
+LONGEST_STEP_S: Final = 6.0
+"""Longest time between two frames, s, over which an object is followed although its class forgets it sooner."""
+
+
 def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density, int]:
     """Carry the density from its stamp to `stamp_ns`.
 
@@ -26,8 +30,8 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     period of the stream: over dt it is ``p_s ** (dt / period)``, so that a stream at twice the rate does not forget
     twice as fast.
     Components that a silent stream has carried past their limits (`max_misses`, `poisson_steps`) are removed before
-    they could be associated, but for those that the last frame has seen: however slow a stream is, what it sees lives
-    until it has looked once more.
+    they could be associated, but for what the last frame has seen: in a slow stream it lives until the next look. That
+    holds for components whatever the time, for objects up to `LONGEST_STEP_S`.
 
     Args:
         density: posterior of the last frame.
@@ -44,8 +48,9 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     survival = table.survival ** (dt / table.period)
 
     before_ns = density.stamp_ns
+    seen_from_ns = before_ns if dt <= LONGEST_STEP_S else stamp_ns
     kept, mean, covariance, existence, repaired_mb = _carry(
-        bernoulli, bernoulli.existence, bernoulli.seen_ns, table.max_misses, survival, dt, before_ns, stamp_ns, table
+        bernoulli, bernoulli.existence, bernoulli.seen_ns, table.max_misses, survival, dt, seen_from_ns, stamp_ns, table
     )
     if kept.shape[0] < len(bernoulli):
         bernoulli = bernoulli.take(kept)
@@ -147,7 +152,7 @@ def predict_components(
         limit: (C,) periods after which a component goes.
         survival: (C,) p_s over dt.
         dt: time to predict over, s, positive.
-        before_ns: stamp of the last frame.
+        before_ns: rows seen from this stamp on stay, whatever the limit.
         stamp_ns: stamp of the new frame.
         period: nominal period, s.
         process_noise: (C, 6) standard deviations per square root of a second.

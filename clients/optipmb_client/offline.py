@@ -148,6 +148,8 @@ class TrackedSequence:
     left_out: int
     """Detections of classes that the profile lacks."""
     tracks: int
+    confirmed: int
+    """Tracks that were confirmed in some frame."""
     seconds: float
     step: Latency | None
 
@@ -378,6 +380,7 @@ def track(  # noqa: PLR0913  one argument per decision of the caller
     for sequence, tracked in zip(sequences, done, strict=True):
         file = results.write(sequence, tracked.tracks)
         identities = {int(number) for tracks in tracked.tracks.values() for number in tracks.id}
+        confirmed = {int(n) for one in tracked.tracks.values() for n in one.id[one.tracks.confirmed]}
         if jobs > 1:
             for _ in tracked.tracks:
                 on_frame()
@@ -389,6 +392,7 @@ def track(  # noqa: PLR0913  one argument per decision of the caller
             tracked.detections,
             tracked.left_out,
             len(identities),
+            len(confirmed),
             tracked.seconds,
             latency(tracked.steps_ns),
         )

@@ -104,7 +104,8 @@ class View:
             points, _ = _to_world(message, message.xyz.astype(np.float64))
             self._recording.log(f"{message.stream}/cloud", rr.Points3D(points, colors=_by_height(points), radii=0.03))
 
-    def _show_tracks(self, tracks: Tracks) -> None:
+    def _show_tracks(self, told: Tracks) -> None:
+        tracks = _confirmed(told)
         name, n = tracks.stream, len(tracks.id)
         if self._followed in {None, name}:
             middle = tracks.center[:, :2].mean(axis=0) if n else np.zeros(2)
@@ -145,6 +146,7 @@ class View:
         strips, ids = self._trail(tracks)
         log(f"{name}/tracks/trails", rr.LineStrips3D(strips, colors=[rgb_of(one) for one in ids], radii=0.7 * LINE))
         log(f"{name}/count/tracks", rr.Scalars(float(n)))
+        log(f"{name}/count/unconfirmed_tracks", rr.Scalars(float(len(told.id) - n)))
         log(f"{name}/count/surer_tracks", rr.Scalars(float(sure.sum())))
 
     def _show_detections(self, detections: Detections) -> None:
@@ -254,6 +256,15 @@ def _to_world(message: Detections | Points, points: Floats) -> tuple[Floats, flo
         return points, 0.0
     rotation = rotation_of(message.pose.quaternion)
     return points @ rotation.T + message.pose.translation, float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
+def _confirmed(tracks: Tracks) -> Tracks:
+    """Return the confirmed tracks of a frame: all, where the service does not tell."""
+    if tracks.confirmed is None or bool((tracks.confirmed > 0).all()):
+        return tracks
+    rows = tracks.confirmed > 0
+    columns = {name: column[rows] for name in tracks.arrays if (column := getattr(tracks, name)) is not None}
+    return tracks.model_copy(update=columns)
 
 
 def _turned(yaw: Floats) -> Floats:

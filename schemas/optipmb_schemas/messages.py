@@ -188,6 +188,11 @@ class Tracks(Header):
     detection: Annotated[NDArray[np.int64], Array("i8", ("N",), -1, INT64)] = Field(
         description="Row of the associated detection in the `Detections` message of this frame; -1: none."
     )
+    confirmed: Annotated[NDArray[np.int64], Array("i8", ("N",), 0, 1)] | None = Field(
+        default=None,
+        description="1: the track is confirmed, its existence reached a threshold of the profile and has not fallen "
+        "below a lower one since; 0: it may be of nothing. Absent: from a service that did not tell.",
+    )
     delivery: Delivery | None = Field(default=None, description="How this publication came about.")
 
     def check(self) -> None:

@@ -56,6 +56,7 @@ def _examples() -> list[Message]:
         size=np.array([[4.2, 1.8, 1.5], [0.6, 0.7, 1.75]]),
         yaw=np.array([0.1, -0.2]),
         heading_confidence=np.array([0.9, 0.5]),
+        confirmed=np.array([1, 0]),
         velocity=np.array([[1.0, 2.0], [0.0, 0.5]]),
         yaw_rate=np.array([0.01, 0.0]),
         acceleration=np.array([0.5, -0.5]),

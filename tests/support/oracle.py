@@ -139,7 +139,8 @@ class Oracle:
         self.bernoulli = [
             b
             for b in self.bernoulli
-            if periods(b.seen_ns, now, self.nominal) - 1 <= self.classes[b.label].max_misses or b.seen_ns == last
+            if periods(b.seen_ns, now, self.nominal) - 1 <= self.classes[b.label].max_misses
+            or (b.seen_ns == last and dt <= 6.0)
         ]
         self.poisson = [
             u

@@ -105,7 +105,9 @@ def track(  # noqa: PLR0913  these are the command's options
             if not as_json:
                 rate = result.frames / max(result.seconds, 1e-9)
                 step = f", step p50 {result.step.p50_ms:.2f} ms p99 {result.step.p99_ms:.2f} ms" if result.step else ""
-                say(f"{result.name}: {result.frames} frames, {result.tracks} tracks, {rate:.0f} frames/s{step}")
+                others = result.tracks - result.confirmed
+                told = f"{result.confirmed} tracks" + (f" and {others} never confirmed" if others else "")
+                say(f"{result.name}: {result.frames} frames, {told}, {rate:.0f} frames/s{step}")
     if as_json:
         print_json({"command": "track", "dataset": asked.name, "profile": name, "out": out, "sequences": results})
     else:

@@ -130,7 +130,7 @@ class Delivery(_message.Message):
     def __init__(self, instance: _Optional[str] = ..., received_ns: _Optional[int] = ..., published_ns: _Optional[int] = ..., queue_ms: _Optional[float] = ..., decode_ms: _Optional[float] = ..., step_ms: _Optional[float] = ..., run: _Optional[int] = ...) -> None: ...
 
 class Tracks(_message.Message):
-    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "session", "revision", "profile", "cloud_used", "gap", "ignored", "labels", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "delivery")
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "session", "revision", "profile", "cloud_used", "gap", "ignored", "labels", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "delivery")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -157,6 +157,7 @@ class Tracks(_message.Message):
     AGE_FIELD_NUMBER: _ClassVar[int]
     TIME_SINCE_DETECTION_FIELD_NUMBER: _ClassVar[int]
     DETECTION_FIELD_NUMBER: _ClassVar[int]
+    CONFIRMED_FIELD_NUMBER: _ClassVar[int]
     DELIVERY_FIELD_NUMBER: _ClassVar[int]
     stream: str
     epoch: bytes
@@ -184,8 +185,9 @@ class Tracks(_message.Message):
     age: Array
     time_since_detection: Array
     detection: Array
+    confirmed: Array
     delivery: Delivery
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
 
 class Problem(_message.Message):
     __slots__ = ("stream", "instance", "code", "path", "expected", "received", "message", "seq", "stamp_ns", "count", "reported_ns")

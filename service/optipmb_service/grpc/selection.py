@@ -63,7 +63,9 @@ class Selection:
             wanted = [number for number, name in enumerate(tracks.labels) if name in self._classes]
             rows &= np.isin(tracks.label, wanted)
         if self._confirmed:
-            rows &= (tracks.existence > CONFIRMED_EXISTENCE) & (tracks.age > 0.0)
+            told = tracks.confirmed
+            likely = (tracks.existence > CONFIRMED_EXISTENCE) & (tracks.age > 0.0)
+            rows &= likely if told is None else told > 0
         if self._area is not None:
             rows &= inside(tracks.center[:, :2], self._area)
         names = tracks.arrays if self._fields is None else self._fields

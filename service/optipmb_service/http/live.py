@@ -93,9 +93,10 @@ def live_frame(tracks: Sample | None, detections: Sample | None) -> str | None:
             message.time_since_detection,
             np.ones(len(message.id)) if message.heading_confidence is None else message.heading_confidence,
         ]
-    )[:_MOST]
-    numbers = np.round(rows, 3).tolist()
-    heads = zip(message.id.tolist(), message.label.tolist(), numbers, strict=False)
+    )
+    confirmed = np.ones(len(rows), np.bool_) if message.confirmed is None else message.confirmed > 0
+    numbers = np.round(rows[confirmed][:_MOST], 3).tolist()
+    heads = zip(message.id[confirmed].tolist(), message.label[confirmed].tolist(), numbers, strict=False)
     sensor, found = _seen(detections)
     frame: dict[str, Any] = {
         "time": message.stamp_ns / 1e9,
@@ -103,6 +104,7 @@ def live_frame(tracks: Sample | None, detections: Sample | None) -> str | None:
         "profile": message.profile,
         "labels": message.labels,
         "tracks": [[identity, label, *values] for identity, label, values in heads],
+        "unconfirmed": int((~confirmed).sum()),
         "sensor": sensor,
         "detections": found,
     }

@@ -142,5 +142,6 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
         age=tracks.age,
         time_since_detection=tracks.time_since_detection,
         detection=tracks.detection,
+        confirmed=tracks.confirmed.astype(np.int64),
         delivery=None,
     )

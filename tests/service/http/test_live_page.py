@@ -26,8 +26,8 @@ DEADLINE_S = 60.0
 
 
 def tracks(seq: int) -> bytes:
-    """One track, a long way from the origin, in msgpack."""
-    one = np.ones(1)
+    """One track, a long way from the origin, and one that is not confirmed, in msgpack."""
+    both = np.ones(2)
     return encode(
         Tracks(
             stream=STREAM,
@@ -38,21 +38,22 @@ def tracks(seq: int) -> bytes:
             profile="kitti",
             cloud_used=False,
             labels=["Car"],
-            id=[5],
-            label=[0],
-            center=[[100.12345, -7.0, 1.0]],
-            size=[[4.0, 2.0, 1.5]],
-            yaw=one / 3,
-            heading_confidence=one * 0.875,
-            velocity=[[1.0, 2.0]],
-            yaw_rate=one,
-            acceleration=one,
-            existence=one * 0.75,
-            score=one * 0.5,
-            covariance=np.eye(6)[None],
-            age=one * 2,
-            time_since_detection=one * 0.2,
-            detection=[-1],
+            id=[5, 6],
+            label=[0, 0],
+            center=np.array([[100.12345, -7.0, 1.0], [0.0, 0.0, 0.0]]),
+            size=[[4.0, 2.0, 1.5]] * 2,
+            yaw=both / 3,
+            heading_confidence=both * 0.875,
+            velocity=[[1.0, 2.0]] * 2,
+            yaw_rate=both,
+            acceleration=both,
+            existence=[0.75, 0.25],
+            score=both * 0.5,
+            covariance=np.stack([np.eye(6)] * 2),
+            age=both * 2,
+            time_since_detection=both * 0.2,
+            detection=[-1, -1],
+            confirmed=[1, 0],
         )
     )
 
@@ -268,6 +269,7 @@ def test_a_frame_holds_what_is_drawn() -> None:
     assert text is not None
     frame = json.loads(text)
     assert frame["tracks"] == [[5, 0, 100.123, -7.0, 4.0, 2.0, 0.333, 1.0, 2.0, 0.75, 0.5, 2.0, 0.2, 0.875]]
+    assert frame["unconfirmed"] == 1
     assert frame["sensor"] == [10.0, 20.0, 1.571]
     assert frame["detections"] == [[9.0, 25.0]]
     assert live_frame((b"\xc1", ""), None) is None

@@ -237,7 +237,7 @@ function sensor(x, y, yaw) {
 
 function tell() {
   at("caption").textContent = frame === null ? (chosen ? `${chosen}: waiting for tracks` : "")
-    : `${chosen} · ${frame.profile} · ${frame.tracks.length} tracks, ${frame.detections.length} detections`;
+    : `${chosen} · ${frame.profile} · ${frame.tracks.length} tracks${frame.unconfirmed ? ` and ${frame.unconfirmed} not confirmed` : ""}, ${frame.detections.length} detections`;
   const track = frame && frame.tracks.find((one) => one[ID] === selected);
   at("details").hidden = !track;
   if (!track) return;
