@@ -23,7 +23,6 @@ from optipmb.tracker import Tracker
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
     import pandas as pd
     import pyarrow as pa
@@ -136,7 +135,7 @@ class OnlineTracker:
     """
 
     def __init__(
-        self, profile: Parameters | str | Path, *, modules: Modules | None = None, unknown_classes: str = "refuse"
+        self, profile: Parameters | str, *, modules: Modules | None = None, unknown_classes: str = "refuse"
     ) -> None:
         if unknown_classes not in {"refuse", "leave out"}:
             raise FrameError("unknown_classes", "'refuse' or 'leave out'", repr(unknown_classes))

@@ -14,8 +14,8 @@ import optipmb
 FOLDER = Path(optipmb.__file__).parent
 MODULES = {path.stem: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(FOLDER.glob("*.py"))}
 ALLOWED = {
-    "__future__", "collections", "dataclasses", "difflib", "functools", "hashlib", "importlib", "math", "numba",
-    "numpy", "operator", "optipmb", "pathlib", "pydantic", "pydantic_core", "re", "sys", "tomllib", "typing",
+    "__future__", "collections", "contextlib", "dataclasses", "difflib", "functools", "hashlib", "importlib", "math",
+    "numba", "numpy", "operator", "optipmb", "pathlib", "pydantic", "pydantic_core", "re", "sys", "tomllib", "typing",
 }  # fmt: skip
 OPTIONAL = {"online": {"pandas", "pyarrow"}}  # to give tracks in the tables that users ask for
 TOUCHES_FILES = {"compiled", "parameters", "prepared"}
