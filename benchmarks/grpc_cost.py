@@ -2,8 +2,9 @@
 
 python benchmarks/grpc_cost.py [--frames N] [--objects N] [--subscribers N]
 
-A service, a gateway and this program, each a process. Frames go out at 10 Hz, in turns over Zenoh and over gRPC: both
-meet the same machine. Latency is from handing a frame to the client library until its tracks are there.
+A router, a gateway and this program, which also answers each frame with as many tracks at once: what is measured is the
+edge, not the tracker. Frames go out in turns over Zenoh and over gRPC: both meet the same machine. Latency is from
+handing a frame to the client library until its tracks are there.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from optipmb_client import Publisher, Subscriber
@@ -22,8 +23,13 @@ from optipmb_client import Publisher, Subscriber
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 
 from gateway import GatewayProcess
+from optipmb_schemas import Detections, Keys, Tracks, decode, encode, encoding_of
 from optipmb_schemas.protobuf import tracking_pb2 as pb
+from routers import open_client
 from service_process import ServiceProcess
+
+if TYPE_CHECKING:
+    import zenoh
 
 RATE_HZ = 10.0
 WARM = 20
@@ -58,11 +64,40 @@ def main() -> None:
     parser.add_argument("--objects", type=int, default=40)
     parser.add_argument("--subscribers", type=int, default=0, help="further subscribers, one of them asleep")
     options = parser.parse_args()
-    with ServiceProcess() as service, GatewayProcess(service.endpoint) as gateway:
-        service.wait_ready()
+    with ServiceProcess("router") as router, GatewayProcess(router.endpoint) as gateway:
+        router.wait_ready()
         gateway.wait_ready()
-        result = measure(service.endpoint, gateway, options)
+        with open_client(router.endpoint) as session:
+            kept = [answering(session, f"cost/{way}/lidar") for way in ("zenoh", "grpc")]
+            result = measure(router.endpoint, gateway, options)
+            del kept
     sys.stdout.write(json.dumps(result) + "\n")
+
+
+def answering(session: zenoh.Session, stream: str) -> Any:
+    """Answer every frame of a stream with a track for each of its objects."""
+    keys = Keys()
+    publisher = session.declare_publisher(keys.tracks(stream), encoding=encoding_of(Tracks), express=True)
+
+    def answer(sample: zenoh.Sample) -> None:
+        frame = decode(sample.payload.to_bytes(), Detections)
+        publisher.put(encode(tracks_of(frame)))
+
+    return publisher, session.declare_subscriber(keys.detections(stream), answer)
+
+
+def tracks_of(frame: Detections) -> Tracks:
+    """A track for each object of a frame."""
+    n = len(frame.label)
+    zeros, ones = np.zeros(n), np.ones(n)
+    header = {"stream": frame.stream, "epoch": frame.epoch, "seq": frame.seq, "stamp_ns": frame.stamp_ns}
+    boxes = {"label": frame.label, "center": frame.center, "size": frame.size, "yaw": frame.yaw}
+    rest = {"velocity": np.zeros((n, 2)), "yaw_rate": zeros, "acceleration": zeros, "existence": ones, "score": ones}
+    last = {"covariance": np.tile(np.eye(6), (n, 1, 1)), "age": ones, "time_since_detection": zeros}
+    return Tracks(
+        **header, **boxes, **rest, **last, session="0" * 32, profile="cost", cloud_used=False, labels=frame.labels,
+        id=np.arange(n), detection=np.arange(n),
+    )  # fmt: skip
 
 
 def measure(endpoint: str, gateway: GatewayProcess, options: argparse.Namespace) -> dict[str, Any]:
