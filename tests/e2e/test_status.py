@@ -15,11 +15,11 @@ def test_streams_at_work_are_shown(service: ServiceProcess, tmp_path: Path) -> N
             *("--speed", "2", "--connect", service.endpoint, "--out", tmp_path),
         )
         try:
-            received = tracks.receive(120.0)
+            received = tracks.receive(240.0)
             assert received is not None
             stream = received.tracks.stream
             for _ in range(30):
-                assert tracks.receive(30.0) is not None
+                assert tracks.receive(60.0) is not None
             result = result_of(optipmb("status", "--connect", service.endpoint, "--json"))
             table = optipmb("status", "--connect", service.endpoint)
         finally:

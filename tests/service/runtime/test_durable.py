@@ -186,19 +186,16 @@ def test_what_a_checkpoint_contains_has_had_time_to_leave() -> None:
 
 
 def test_overload_costs_the_stream_that_is_overloaded(start: Callable[..., Any]) -> None:
-    """Fault 14: four times what its tracker can do: that stream sheds, another is served in time, every frame counts.
+    """Fault 14: more than its tracker can do: that stream sheds, another is served in time, every frame counts.
 
     Received is the sum of frames, duplicates, late, refused, shed and queue, at every moment and for both streams.
     """
-    slow, sent, came = 7, 300, 0
-    more = threading.Condition()
+    slow, sent = 7, 300
 
     class Slow(optipmb.Tracker):
         def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
             if len(frame.score) == slow:
-                with more:
-                    due = min(came + 4, sent - 1) if came else 0  # the first frame is awaited
-                    assert more.wait_for(lambda: came >= due, 60)
+                threading.Event().wait(0.02)
             return super().step(density, frame)
 
     heavy = replace(SENSOR, stream="site/node/heavy", objects=slow)
@@ -207,17 +204,12 @@ def test_overload_costs_the_stream_that_is_overloaded(start: Callable[..., Any])
         state = KEYS.query(heavy.stream, "state")
         node.send(heavy.detections(0), SENSOR.detections(0))
         node.tracks(heavy.stream, 1)
-        pause = threading.Event()
-        for seq in range(1, sent):
+        for seq in range(1, sent):  # ten at a time, in which one or two are tracked
             node.send(heavy.detections(seq))
-            with more:
-                came = seq
-                more.notify_all()
             if seq % 10 == 0:
                 node.send(SENSOR.detections(seq // 10))
                 asked = node.ask(state, SessionState)
                 assert (balance(asked), asked.queue <= 9) == (0, True)
-            pause.wait(0.005)
         until(lambda: node.ask(state, SessionState).received == sent, "all frames are received")
         until(lambda: node.ask(state, SessionState).queue == 0, "the queue is empty")
         asked = node.ask(state, SessionState)

@@ -74,7 +74,7 @@ def told(found: optipmb.Tracks) -> schemas.Tracks:
     return convert.tracks_of(
         found,
         stream=SENSOR.stream,
-        mark=FrameId(SENSOR.epoch, 1, 2),
+        frame_id=FrameId(SENSOR.epoch, 1, 2),
         session="0" * 32,
         revision=0,
         parameters=NUSCENES,
@@ -99,7 +99,7 @@ def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.Data
             columns[name] = data.draw(
                 arrays(np.float64, shape, elements=st.just(0.5) | st.sampled_from(ends), fill=st.just(0.5))
             )
-    found = optipmb.Tracks(**columns)
+    found = optipmb.Tracks(**columns, confirmed=np.ones(count, np.bool_))
     try:
         message = told(found)
     except schemas.MessageError:
