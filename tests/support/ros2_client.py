@@ -6,6 +6,7 @@ types from them by its own rules.
 
 import os
 import threading
+import time
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Self
@@ -56,6 +57,10 @@ class Ros2Client:
         if topic not in self._publishers:
             about = {"msg_definition": own_types().definition(kind), "type_hash": hash_by_sdk(kind)}
             self._publishers[topic] = sdk.ROS2Publisher(topic, kind, **(self._where | about | options))
+            ends = time.monotonic() + DEADLINE_S
+            while not self._publishers[topic].pub.matching_status.matching:  # what is sent before that is lost
+                assert time.monotonic() < ends, f"nobody subscribes to {topic}"
+                time.sleep(0.01)
         publisher = self._publishers[topic]
         message = _built(publisher.session_mgr.store, kind, fields)
         publisher.publish(**{name: getattr(message, name) for name in message.__dataclass_fields__})
