@@ -91,7 +91,9 @@ def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.Data
     columns = {}
     for name, array in schemas.Tracks.arrays.items():
         shape = (count, *array.shape[1:])
-        if array.dtype == "i8":
+        if array.dtype == "b1":
+            columns[name] = data.draw(arrays(np.bool_, shape))
+        elif array.dtype == "i8":
             top = len(NUSCENES.classes) - 1 if name == "label" else 9
             columns[name] = data.draw(arrays(np.int64, shape, elements=st.integers(0, top), unique=name == "id"))
         else:
@@ -99,7 +101,7 @@ def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.Data
             columns[name] = data.draw(
                 arrays(np.float64, shape, elements=st.just(0.5) | st.sampled_from(ends), fill=st.just(0.5))
             )
-    found = optipmb.Tracks(**columns, confirmed=np.ones(count, np.bool_))
+    found = optipmb.Tracks(**columns)
     try:
         message = told(found)
     except schemas.MessageError:
