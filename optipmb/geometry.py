@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 MAX_CORNERS = 16
 """Two rectangles intersect in at most eight corners; clipping keeps a few more for a moment."""
 
-CERTAIN = 1.0 - 1e-9
-"""A bound below this share of a threshold is below the threshold, whatever rounding did to either."""
+ROUNDING = 1e-12
+"""Share of the squared sides of two boxes that rounding changes in their clipped intersection, at most."""
 
 
 @kernel
@@ -99,8 +99,9 @@ def iou_exceeds(first: Array, second: Array, threshold: float) -> bool:
     that is parallel to it. A bound that rounding could put on the wrong side of the threshold decides nothing.
     """
     area, other = first[2] * first[3], second[2] * second[3]
+    margin = ROUNDING * (first[2] * first[2] + first[3] * first[3] + second[2] * second[2] + second[3] * second[3])
     shared = min(area, other)
-    if shared < CERTAIN * threshold * (area + other - shared):
+    if shared + margin < threshold * (area + other - shared):
         return False
     cos_yaw, sin_yaw = math.cos(first[4]), math.sin(first[4])
     dx, dy = second[0] - first[0], second[1] - first[1]
@@ -113,7 +114,7 @@ def iou_exceeds(first: Array, second: Array, threshold: float) -> bool:
         other_half = 0.5 * (cos_turn * second[2 + axis] + sin_turn * second[3 - axis])
         inside *= max(min(half, offset + other_half) - max(-half, offset - other_half), 0.0)
     shared = min(shared, inside)
-    if shared < CERTAIN * threshold * (area + other - shared):
+    if shared + margin < threshold * (area + other - shared):
         return False
     return box_iou(first, second) > threshold
 

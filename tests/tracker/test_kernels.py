@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import oracle_formulas as textbook
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from optipmb.association import UNASSIGNED
-from optipmb.birth import birth_states, first_states
+from optipmb.birth import birth_states, first_states, moment_match
 from optipmb.calibration import SURE, calibrate_rows
 from optipmb.density import whole_periods
 from optipmb.extract import read_tracks, select_tracks
@@ -25,7 +25,7 @@ from optipmb.predict import predict_components
 from optipmb.preprocess import select, sort_canonically
 from optipmb.prune import NEW, select_objects
 from optipmb.undetected import fill_components, select_births, select_components, select_undetected
-from optipmb.update import moment_match, ukf_updates
+from optipmb.update import ukf_updates
 
 Array = NDArray[np.float64]
 COMPILING = settings(deadline=None)  # the first call compiles
@@ -116,6 +116,11 @@ def test_a_search_finds_every_neighbour_once(seed: int, count: int, extent: floa
         np.array
     ),
     threshold=st.sampled_from([0.0, 0.01, 0.1, 0.5, 0.9, 1.0]),
+)
+@example(  # they touch, and clipping leaves 1e-16 by rounding
+    a=np.array([0.0, 0.0, 5.7, 2.3, -1.8]),
+    b=np.array([-0.3375076506666007, -3.2071932566874595, 0.7, 3.8, -1.8]),
+    threshold=0.0,
 )
 def test_cheap_rejections_change_no_decision(a: Array, b: Array, threshold: float) -> None:
     """Whether an overlap exceeds a threshold is what the clipped overlap itself says."""

@@ -29,7 +29,8 @@ def run(frames: list[Any]) -> list[optipmb.OnlineTracks]:
 def test_it_gives_the_tracks_of_the_pure_steps() -> None:
     """The object is the pure function and nothing else: the same tracks, bit by bit."""
     parameters = optipmb.load_profile("kitti")
-    tracker, density = optipmb.Tracker(parameters), optipmb.Tracker.initial()
+    tracker = optipmb.Tracker(parameters)
+    density = tracker.initial()
     for k, found in enumerate(run([flat(k) for k in range(6)])):
         center = [[float(k), 0.0, 0.8]]
         frame, _ = optipmb.make_frame(

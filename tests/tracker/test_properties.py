@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compare import TRACKS, density_bytes, digest, tracks_bytes
+from oracle_formulas import Measurement, confidence, report
 from scenes import Options, SceneCloud, SceneFrame, SensorPose, frame_of, random_parameters, scene
 
 import optipmb
@@ -266,17 +267,38 @@ def test_two_processes_give_the_same_bytes() -> None:
     assert len(found.pop()) == 64
 
 
-def test_tracks_are_the_extracted_bernoullis() -> None:
-    """Every column of the tracks is what the density holds of the same id."""
-    parameters = parse_parameters(random_parameters(9))
-    for result in run(parameters, list(scene(9, Options(frames=40)))):
-        tracks, rows = result.tracks, result.density.bernoulli
-        index = np.searchsorted(rows.id, tracks.id)
-        np.testing.assert_array_equal(rows.id[index], tracks.id)
-        mean, now = rows.mean[index], result.density.stamp_ns
-        np.testing.assert_array_equal(tracks.center, np.c_[mean[:, :2], rows.auxiliary[index, 3]])
-        np.testing.assert_array_equal(tracks.covariance[:, :3, :3], rows.covariance[index, :3, :3])
-        np.testing.assert_allclose(np.hypot(*tracks.velocity.T), np.abs(mean[:, 2]), atol=1e-12)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_tracks_are_the_extracted_bernoullis(seed: int) -> None:
+    """Tracks say what the density holds of the same ids, but for two things.
+
+    With `reported_noise` the box of a detected object is updated once more; the doubt about the sign of a heading is
+    added to its variance.
+    """
+    parameters = parse_parameters(random_parameters(seed))
+    frames, classes, boxes_updated = list(scene(seed, Options(frames=40))), list(parameters.classes.values()), []
+    for given, result in zip(frames, run(parameters, frames), strict=True):
+        frame, tracks, rows = frame_of(parameters, given), result.tracks, result.density.bernoulli
+        now, index = result.density.stamp_ns, np.searchsorted(rows.id, tracks.id)
+        for name in ("id", "label", "existence", "score", "confirmed"):
+            np.testing.assert_array_equal(getattr(rows, name)[index], getattr(tracks, name))
+        np.testing.assert_array_equal(np.c_[tracks.size, tracks.center[:, 2]], rows.auxiliary[index])
         np.testing.assert_allclose(tracks.age, (now - rows.born_ns[index]) * 1e-9, atol=1e-12)
+        np.testing.assert_allclose(tracks.time_since_detection, (now - rows.seen_ns[index]) * 1e-9, atol=1e-12)
         assert rows.extracted[index].all()
         assert {len(getattr(tracks, name)) for name in TRACKS} == {len(tracks.id)}
+        v, phi = rows.mean[index, 2], tracks.yaw
+        np.testing.assert_allclose(tracks.velocity, np.c_[v * np.cos(phi), v * np.sin(phi)], atol=1e-12)
+        shown = np.c_[tracks.center[:, :2], v, tracks.yaw, tracks.yaw_rate, tracks.acceleration]
+        for k, n in enumerate(index):
+            c, mean, covariance = classes[tracks.label[k]], rows.mean[n], rows.covariance[n].copy()
+            detected = tracks.detection[k] >= 0 and c.reported_noise is not None
+            if detected:
+                m = int(np.flatnonzero(frame.source == tracks.detection[k])[0])
+                z = Measurement(frame.center[m, :2], None, float(frame.yaw[m]), frame.size[m], 0, 1.0, 0)
+                mean, covariance = report(c, z, mean, covariance)
+            covariance[3, 3] += confidence(c, float(rows.heading_odds[n]))[1]
+            tolerance = 1e-9 if detected else 0.0  # but for rounding, or to the bit
+            np.testing.assert_allclose(shown[k], mean, rtol=tolerance, atol=tolerance)
+            np.testing.assert_allclose(tracks.covariance[k], covariance, rtol=0, atol=max(tolerance, 1e-14))
+            boxes_updated.append(detected)
+    assert {*boxes_updated} == {True, False}

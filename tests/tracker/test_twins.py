@@ -81,7 +81,7 @@ TWINS = {
     "undetected.select_births": "test_kernels.test_low_scores_are_born_with_what_association_leaves",
     "undetected.select_components": "test_kernels.test_components_survive_unless_marked_or_old",
     "undetected.select_undetected": "test_kernels.test_what_is_undetected_stays_or_is_born",
-    "update.moment_match": "test_update.test_a_mixture_keeps_its_mean_and_covariance",
+    "birth.moment_match": "test_update.test_a_mixture_keeps_its_mean_and_covariance",
     "update.linearised_update": "test_update.test_the_linearised_update_is_the_textbook_one",
     "update.ukf_update": "test_update.test_the_update_is_the_textbook_ukf",
     "update.ukf_updates": "test_update.test_the_update_is_the_textbook_ukf",

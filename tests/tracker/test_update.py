@@ -12,9 +12,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from optipmb.birth import birth_states
+from optipmb.birth import birth_states, moment_match
 from optipmb.prune import NEW
-from optipmb.update import linearised_update, moment_match, ukf_update, ukf_updates, workspace
+from optipmb.update import linearised_update, ukf_update, ukf_updates, workspace
 
 Array = NDArray[np.float64]
 
