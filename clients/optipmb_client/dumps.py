@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Tracks, decode_dump
 
 import optipmb
@@ -107,6 +108,7 @@ def _step(
         cloud=None if given.points is None else optipmb.PointCloud(given.points.xyz, _pose(given.points)),
     )
     found = steps.step(density, frame)
+    columns = {column.name: getattr(found.tracks, column.name) for column in fields(found.tracks)}
     Tracks(
         stream=message.stream,
         epoch=message.epoch,
@@ -116,7 +118,7 @@ def _step(
         profile=parameters.name,
         cloud_used=given.points is not None,
         labels=tuple(parameters.classes),
-        **{column.name: getattr(found.tracks, column.name) for column in fields(found.tracks)},
+        **columns | {"confirmed": found.tracks.confirmed.astype(np.int64)},
     )
     return found.density
 

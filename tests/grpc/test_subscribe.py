@@ -90,13 +90,16 @@ def test_filters(stub: Any, stream: str) -> None:
     assert last(min_existence=1.0).id.shape[0] == int((full.existence >= 1.0).sum())
 
 
-def test_the_first_frame_of_an_object_is_not_confirmed(stub: Any, stream: str) -> None:
-    """Tracks detected once are left out of confirmed ones, the frame comes all the same."""
+def test_an_unlikely_object_is_not_confirmed(stub: Any, stream: str) -> None:
+    """A track that the tracker does not confirm is left out of confirmed ones, as long as it does not."""
     call = subscribed(stub, pattern=stream, filter=pb.TrackFilter(confirmed_only=True))
-    tracked(stub, stream, range(3))
-    counts = [one.tracks.id.shape[0] for one in taken(call, 3)]
-    assert counts[0] == 0
-    assert counts[2] == 2
+    unlikely = [frame(seq, stream, score=np.array([0.9, 0.25 + 0.1 * seq])) for seq in range(5)]
+    likely = [frame(seq, stream) for seq in range(5, 8)]
+    published = [one.tracks for one in stub.Track(detections(one) for one in (*unlikely, *likely))]
+    full = [convert.from_proto(tracks, Tracks) for tracks in published]
+    counts = [one.tracks.id.shape[0] for one in taken(call, 8)]
+    assert [len(tracks.id) for tracks in full[2:]] == [2] * 6
+    assert counts == [1] * 5 + [2] * 3
 
 
 def test_the_rate_is_bounded_in_sensor_time(stub: Any, stream: str) -> None:

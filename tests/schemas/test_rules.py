@@ -86,7 +86,7 @@ RULES: list[tuple[str, str, Any, str]] = [
     ("Detections", "yaw", [0, NAN, 0], "yaw[1]"),
     ("Detections", "yaw", [0, 0, INF], "yaw[2]"),
     ("Detections", "yaw", [0, 0, 1e5], "yaw[2]"),
-    ("Detections", "score", [0.5, 0.5, 0], "score[2]"),
+    ("Detections", "score", [0.5, 0.5, -1e-9], "score[2]"),
     ("Detections", "score", [0.5, 1.0000001, 0.5], "score[1]"),
     ("Detections", "score", [-0.5, 0.5, 0.5], "score[0]"),
     ("Detections", "score", [0.5, NAN, 0.5], "score[1]"),

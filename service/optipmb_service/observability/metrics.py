@@ -37,7 +37,7 @@ class MetricFamily:
     meaning: str
 
 
-METRICS: Final = {
+SERVICE_METRICS: Final = {
     "info": MetricFamily("gauge", ("instance", "version"), "Always 1; says who reports."),
     "state": MetricFamily("gauge", ("state",), "1 for the state the process is in."),
     "received_total": MetricFamily("counter", ("topic",), "Messages received, before any check."),
@@ -87,6 +87,11 @@ METRICS: Final = {
     "stream_latency_seconds": MetricFamily(
         "gauge", ("stream", "quantile"), "Median and 99th percentile of a stream's last 512 latencies."
     ),
+    "streams_unlisted": MetricFamily("gauge", (), "Streams without series of their own: more than `http_streams`."),
+}
+"""Those of a process that tracks, by their names without the prefix `optipmb_`."""
+
+GATEWAY_METRICS: Final = {
     "grpc_open_calls": MetricFamily("gauge", ("method",), "Calls over gRPC under way."),
     "grpc_calls_total": MetricFamily("counter", ("method", "code"), "Calls over gRPC that have ended, by status code."),
     "grpc_requests_total": MetricFamily("counter", ("method",), "Messages that callers sent over gRPC."),
@@ -96,9 +101,11 @@ METRICS: Final = {
     ),
     "grpc_refused_total": MetricFamily("counter", ("code",), "Messages of callers over gRPC that were not valid."),
     "grpc_invalid_total": MetricFamily("counter", (), "Messages of the network that were not valid and not sent on."),
-    "streams_unlisted": MetricFamily("gauge", (), "Streams without series of their own: more than `http_streams`."),
 }
-"""Every metric by its name without the prefix `optipmb_`. The figures of the process itself start with `process_`."""
+"""Those of a process that serves gRPC, by itself or beside tracking."""
+
+METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS
+"""Every metric. The figures of the process itself start with `process_`."""
 
 Value = tuple[str, tuple[str, ...], float]
 """One figure: name in `METRICS`, values of its labels, value."""

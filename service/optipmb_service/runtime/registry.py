@@ -370,6 +370,7 @@ class Registry:
     def _release(self, stream: str, lineage: Lineage) -> None:
         with self._lock:
             self._sessions -= 1
+            self._full.clear()  # who was refused may have room now
             self._lives[stream] = lineage
             if len(self._lives) > MAX_LIVES:
                 self._lives.popitem(last=False)

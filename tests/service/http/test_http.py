@@ -17,7 +17,7 @@ import pytest
 from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
 from optipmb_service.http import KnownHosts, Server, application
-from optipmb_service.observability.metrics import METRICS, NAMESPACE
+from optipmb_service.observability.metrics import NAMESPACE, SERVICE_METRICS
 from optipmb_service.runtime.ports import HttpError
 from prometheus_client.parser import text_string_to_metric_families
 from router import Node, Sensor, until
@@ -205,7 +205,7 @@ def test_a_service_tells_how_it_is_from_its_start_to_its_end() -> None:
 
 
 def test_metrics_count_what_happened(tmp_path: Path) -> None:
-    """Every metric of the list is there, in Prometheus' format, with the figures of what was sent; also over Zenoh."""
+    """Every metric of a service is there, in Prometheus' format, with the figures of what was sent; also over Zenoh."""
     options = ("--http", "127.0.0.1:0", "--log-format", "json", "--instance", "one")
     environment = {"OPTIPMB_STORE": str(tmp_path), "OPTIPMB_CHECKPOINT_S": "0.1"}
     with ServiceProcess(*options, environment=environment) as service:
@@ -222,7 +222,7 @@ def test_metrics_count_what_happened(tmp_path: Path) -> None:
             ((ok, key, asked),) = node.query(KEYS.metrics("one"))
             status = node.ask(KEYS.status("one"), ServiceStatus)
         assert {name.removesuffix("_bucket") for name, _ in figures if name.startswith(NAMESPACE)} >= {
-            NAMESPACE + name for name, metric in METRICS.items() if metric.kind != "histogram"
+            NAMESPACE + name for name, metric in SERVICE_METRICS.items() if metric.kind != "histogram"
         }
         expected = {
             ("frames_total", ()): 6,
