@@ -94,12 +94,13 @@ def test_an_unlikely_object_is_not_confirmed(stub: Any, stream: str) -> None:
     """A track that the tracker does not confirm is left out of confirmed ones, as long as it does not."""
     call = subscribed(stub, pattern=stream, filter=pb.TrackFilter(confirmed_only=True))
     unlikely = [frame(seq, stream, score=np.array([0.9, 0.25 + 0.1 * seq])) for seq in range(5)]
-    likely = [frame(seq, stream) for seq in range(5, 8)]
+    likely = [frame(seq, stream) for seq in range(5, 10)]
     published = [one.tracks for one in stub.Track(detections(one) for one in (*unlikely, *likely))]
     full = [convert.from_proto(tracks, Tracks) for tracks in published]
-    counts = [one.tracks.id.shape[0] for one in taken(call, 8)]
-    assert [len(tracks.id) for tracks in full[2:]] == [2] * 6
-    assert counts == [1] * 5 + [2] * 3
+    counts = [one.tracks.id.shape[0] for one in taken(call, 10)]
+    assert [len(tracks.id) for tracks in full[2:]] == [2] * 8
+    assert counts == [int((tracks.confirmed == 1).sum()) for tracks in full]
+    assert (counts[:5], counts[9]) == ([1] * 5, 2)
 
 
 def test_the_rate_is_bounded_in_sensor_time(stub: Any, stream: str) -> None:
