@@ -121,7 +121,7 @@ def test_a_refused_frame_is_a_problem_and_the_stream_goes_on(stub: Any, stream: 
     problems = [one.problem for one in responses if one.WhichOneof("response") == "problem"]
     assert {one.tracks.seq for one in responses if one.WhichOneof("response") == "tracks"} == {0, 2}
     assert [(problem.code, problem.path, problem.seq) for problem in problems] == [("invalid_value", "score[1]", 1)]
-    assert problems[0].expected == "a number in (0, 1]"
+    assert problems[0].expected == "a number in [0, 1]"
 
 
 def test_a_caller_that_comes_back_gets_what_was_tracked(stub: Any, stream: str) -> None:

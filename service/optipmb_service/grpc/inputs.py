@@ -12,10 +12,11 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc.feeds import EVERYTHING, Item, problem_item, tracks_item
 from optipmb_service.grpc.flight import Flight
+from optipmb_service.grpc.fresh import Fresh
 from optipmb_service.grpc.outbox import Outbox
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterable
 
     from optipmb_service.grpc.calls import Call
     from optipmb_service.grpc.selection import Selection
@@ -172,8 +173,7 @@ class _Answers:
 
     selection: Selection = EVERYTHING
 
-    def __init__(self, outbox: Outbox, flight: Flight | None = None) -> None:
-        self._flight = flight
+    def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
 
     def passes(self, _tracks: schemas.Tracks) -> bool:
@@ -182,9 +182,31 @@ class _Answers:
 
     def take(self, item: Item) -> None:
         """Take tracks or a problem."""
-        if self._flight is not None and item.tracks is not None:
-            self._flight.came(item.tracks.epoch, item.tracks.seq)
         self._outbox.put(item.stream, item.response)
+
+
+class _TracksAnswers(_Answers):
+    """The tracks of the frames on their way, and problems; what was published before the call is answered by it alone.
+
+    Args:
+        outbox: for the caller.
+        flight: of the call.
+    """
+
+    def __init__(self, outbox: Outbox, flight: Flight) -> None:
+        super().__init__(outbox)
+        self._flight = flight
+        self._fresh = Fresh(self._answer)
+        self.begin = self._fresh.begin
+
+    def take(self, item: Item) -> None:
+        """Take tracks or a problem, if they are new."""
+        self._fresh.put(item)
+
+    def _answer(self, item: Item) -> None:
+        if item.tracks is not None:
+            self._flight.came(item.tracks.epoch, item.tracks.seq)
+        super().take(item)
 
 
 async def track(call: Call) -> None:
@@ -193,7 +215,7 @@ async def track(call: Call) -> None:
     message = await incoming.first()
     if message is None:
         return
-    answers = _Answers(outbox, flight)
+    answers = _TracksAnswers(outbox, flight)
     keys, feeds = call.gateway.client.keys, call.gateway.feeds
     async with (
         feeds.joined(keys.tracks(incoming.stream), answers),
@@ -201,7 +223,9 @@ async def track(call: Call) -> None:
         incoming.opened(),
         call.writing(outbox),
     ):
-        known = await _already_tracked(call, message, outbox)
+        held = await feeds.recent(keys.tracks(incoming.stream))
+        known = _already_tracked(held, message, outbox)
+        answers.begin(held)
         while message is not None:
             if isinstance(message, schemas.Problem):
                 outbox.put(incoming.stream, problem_item(message).response)
@@ -215,12 +239,12 @@ async def track(call: Call) -> None:
     call.check_ending()
 
 
-async def _already_tracked(call: Call, first: Input, outbox: Outbox) -> set[tuple[bytes, int]]:
+def _already_tracked(held: Iterable[schemas.Tracks], first: Input, outbox: Outbox) -> set[tuple[bytes, int]]:
     """Answer what a caller that comes back sends again: it may have been tracked, and is not tracked twice."""
     known: set[tuple[bytes, int]] = set()
     if not isinstance(first, schemas.Detections | schemas.Points):
         return known
-    for tracks in await call.gateway.feeds.recent(call.gateway.client.keys.tracks(first.stream)):
+    for tracks in held:
         if tracks.epoch == first.epoch and tracks.stamp_ns >= first.stamp_ns:
             known.add((tracks.epoch, tracks.seq))
             outbox.put(tracks.stream, tracks_item(tracks).response)

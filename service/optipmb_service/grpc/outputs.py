@@ -10,6 +10,7 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc.feeds import tracks_item
+from optipmb_service.grpc.fresh import Fresh, order
 from optipmb_service.grpc.outbox import Outbox
 from optipmb_service.grpc.selection import Pace, Selection
 
@@ -17,13 +18,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from optipmb_service.grpc.calls import Call
-    from optipmb_service.grpc.feeds import Item
 
 QUEUE: Final = 16
 MAX_QUEUE: Final = 1024
-
-Frame = tuple[str, bytes, int, int, int]
-"""One publication of the tracks of a frame: stream, epoch, number, run, revision."""
 
 
 class _Subscriber:
@@ -42,24 +39,11 @@ class _Subscriber:
         if asked.queue > MAX_QUEUE:
             raise schemas.MessageError("too_large", "queue", f"at most {MAX_QUEUE}", str(asked.queue))
         self.outbox = Outbox(asked.queue or QUEUE)
-        self._known: set[Frame] = set()  # what the caches held at the beginning: recovery may bring it again
-        self._early: list[Item] | None = []  # what came before it was known what the caches hold
+        self._fresh = Fresh(lambda item: self.outbox.put(item.stream, item.response))
+        self.take, self.begin = self._fresh.put, self._fresh.begin
 
     def passes(self, tracks: schemas.Tracks) -> bool:
         return self._pace.passes(tracks.stream, tracks.stamp_ns)
-
-    def take(self, item: Item) -> None:
-        if self._early is not None and len(self._early) < MAX_QUEUE:
-            self._early.append(item)
-        elif item.tracks is None or _frame(item.tracks) not in self._known:
-            self.outbox.put(item.stream, item.response)
-
-    def begin(self, history: list[schemas.Tracks]) -> None:
-        """Take what came while the caches were asked, but for what they had."""
-        self._known = {_frame(tracks) for tracks in history}
-        early, self._early = self._early or [], None
-        for item in early:
-            self.take(item)
 
 
 async def subscribe(call: Call) -> None:
@@ -105,14 +89,6 @@ def newest(publications: Iterable[schemas.Tracks]) -> list[schemas.Tracks]:
     for tracks in publications:
         key = tracks.stream, tracks.epoch, tracks.seq
         known = holding.get(key)
-        if known is None or _order(tracks) >= _order(known):
+        if known is None or order(tracks) >= order(known):
             holding[key] = tracks
     return sorted(holding.values(), key=lambda tracks: (tracks.stream, tracks.stamp_ns, tracks.seq))
-
-
-def _order(tracks: schemas.Tracks) -> tuple[int, int]:
-    return tracks.delivery.run if tracks.delivery else 0, tracks.revision
-
-
-def _frame(tracks: schemas.Tracks) -> Frame:
-    return (tracks.stream, tracks.epoch, tracks.seq, *_order(tracks))
