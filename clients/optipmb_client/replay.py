@@ -106,8 +106,8 @@ def replay(  # noqa: PLR0913  one argument per decision of the caller
     task = _Task(connection, results, profile, pace, classes, prefix, on_frame)
     work = [_Replay(task, sequence, f"replay/{run}/{sequence.name}") for sequence in sequences]
     with concurrent.futures.ThreadPoolExecutor(max_workers=streams, thread_name_prefix="replay") as pool:
-        futures = [pool.submit(_replay_and_write, one) for one in work]
         try:
+            futures = [pool.submit(_replay_and_write, one) for one in work]
             pending = set(futures)
             while pending:
                 done, pending = concurrent.futures.wait(pending, TICK_S, concurrent.futures.FIRST_EXCEPTION)

@@ -146,6 +146,7 @@ class Sender:
     def __init__(self, publisher: _ZenohPublisher, matching: _ZenohMatching | None) -> None:
         self._publisher = publisher
         self._matching = matching
+        self._using = threading.Lock()  # Zenoh refuses to withdraw a publisher while another thread puts
 
     @property
     def wanted(self) -> bool:
@@ -163,13 +164,14 @@ class Sender:
             ConnectionFailed: After `close`.
         """
         try:
-            self._publisher.put(payload)
+            with self._using:
+                self._publisher.put(payload)
         except zenoh.ZError as error:
             raise ConnectionFailed("this publisher has been closed") from error
 
     def close(self) -> None:
         """Withdraw the publisher."""
-        with contextlib.suppress(zenoh.ZError):  # the session may be closed already
+        with self._using, contextlib.suppress(zenoh.ZError):  # the session may be closed already
             self._publisher.undeclare()
 
 

@@ -104,7 +104,7 @@ def test_four_streams_played_into_a_fresh_service(service: ServiceProcess, tmp_p
     assert summary is not None
     assert summary.statistics is not None
     topics = {channel.topic.rsplit("/", 1)[1] for channel in summary.channels.values()}
-    assert topics == {"detections", "points", "tracks", "scene", "parameters"}
+    assert topics == {"detections", "points", "tracks", "scene", "pose", "figures", "parameters"}
     play_into_another(path, tmp_path)
     offline = result_of(optipmb("track", "--dataset", "mcap", "--root", path, "--out", tmp_path / "offline", "--json"))
     for entry in offline["sequences"]:
