@@ -57,7 +57,8 @@ def test_a_sensor_that_stays_elsewhere_begins_anew() -> None:
     one = session()
     before = tracks(feed(one, dict.fromkeys(range(4), 0.0)))[-1]
     outputs = feed(one, dict.fromkeys(range(4, 10), 500.0))
-    assert len(problems(outputs)) == POLICY.astray_frames - 1
+    codes = [problem.code for problem in problems(outputs)]
+    assert codes == ["astray"] * (POLICY.astray_frames - 1) + ["restarted"]
     assert begun(outputs) == ["pose"]
     after = tracks(outputs)
     assert [message.seq for message in after] == [4 + POLICY.astray_frames - 1, 4 + POLICY.astray_frames]
