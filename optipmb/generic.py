@@ -92,7 +92,12 @@ def _of_class(kind: str, period: float, birth_score: float) -> dict[str, Any]:
         "extract_misses": max(2, round(SHOWN_S / period)),
         "max_misses": max(4, round(REMEMBERED_S / period)),
         "min_existence": 0.01,
-        "heading_sign": {"memory": 0.9, "detection": 1.0, "motion": 1.0, "speed": 1.0},
+        "heading_sign": {  # vehicles reverse at up to 4 m/s
+            "memory": 0.9,
+            "detection": 1.0,
+            "motion": 1.0,
+            "speed": 1.0 if agile or two_wheeled else 4.0,
+        },
         "birth_heading_speed": 1.0,
         "process_noise": {
             "position": 0.1,
