@@ -126,7 +126,7 @@ class Publisher:
             center: (M, 3), geometric centres of the boxes.
             size: (M, 3), length, width, height, all positive.
             yaw: (M,), counter-clockwise from x.
-            score: (M,), in (0, 1].
+            score: (M,), in [0, 1]; an object of score 0 is left out and counted.
             velocity: (M, 2), over ground; a row of NaN where it is unknown. None: unknown for all.
             labels: The class names that `label` points into.
             pose: Pose of the sensor in the world, (translation (3,), unit quaternion w x y z (4,)); needed with

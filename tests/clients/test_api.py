@@ -4,7 +4,7 @@ import re
 import threading
 import time
 from collections.abc import Iterator
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
@@ -13,8 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_client import Connection, ConnectionFailed, Publisher, Subscriber
 from optipmb_client.transport import Inbox
-from optipmb_schemas import Detections, MessageError, Points, Problem, Tracks, decode, encode, encoding_of
+from optipmb_schemas import Detections, Message, MessageError, Points, Problem, Tracks, decode, encode, encoding_of
 from routers import free_endpoint, open_client
+
+if TYPE_CHECKING:
+    from optipmb_client.links import Link
 
 DEADLINE_S = 60.0
 STREAM = "garage/robot-1/lidar"
@@ -147,11 +150,13 @@ class Recorder:
         self.wanted = wanted
         self.put = sent.append
 
-    def sender(self, *_: object, **__: object) -> "Recorder":
-        """Give the sender of any key."""
-        return self
+    def senders(self, *_: object, **__: object) -> tuple["Recorder", "Recorder"]:
+        """Give what sends the detections and the clouds of any stream."""
+        return self, self
 
-    cached_sender = plain_sender = sender
+    def pack(self, message: Message) -> bytes:
+        """Return a message as Zenoh sends it."""
+        return encode(message)
 
     def close(self) -> None:
         """Do nothing."""
@@ -159,7 +164,7 @@ class Recorder:
 
 def offline_publisher(sent: list[bytes], frame: str = "sensor", *, wanted: bool = True) -> Publisher:
     """Give a publisher whose messages end in a list."""
-    return Publisher(STREAM, connection=cast("Connection", Recorder(sent, wanted=wanted)), frame=cast("Any", frame))
+    return Publisher(STREAM, connection=cast("Link", Recorder(sent, wanted=wanted)), frame=cast("Any", frame))
 
 
 BAD = [

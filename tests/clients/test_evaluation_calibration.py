@@ -13,6 +13,8 @@ from optipmb_client.geometry import Floats
 from optipmb_client.offline import track
 from optipmb_client.results.full import FullTable, full_path, read_full, write_full
 
+import optipmb
+
 NEAR = Rules("distance", 2.0)
 COVARIANCE = np.array([[0.09, 0.03], [0.03, 0.04]])
 
@@ -136,8 +138,8 @@ def test_tracks_of_another_run_are_refused() -> None:
 def test_track_keeps_everything_on_demand(tmp_path: Path) -> None:
     """With `full` a file beside the results holds all columns of the same tracks, in the same bytes; without, none."""
     dataset = open_dataset("scene", frames=20, vehicles=6, pedestrians=3, cyclists=2)
-    sequences = list(dataset.sequences(["0000"]))
-    (result,) = track(dataset, sequences, tmp_path, profile="scene", full=True)
+    sequences, scene = list(dataset.sequences(["0000"])), optipmb.load_profile("scene")
+    (result,) = track(dataset, sequences, tmp_path, parameters=scene, full=True)
     beside = full_path(result.file)
     content = beside.read_bytes()
     full = read_full(beside)
@@ -151,9 +153,9 @@ def test_track_keeps_everything_on_demand(tmp_path: Path) -> None:
     (cars, *_) = evaluate_figures("scene", [recording], ("Car", "Pedestrian", "Cyclist"))
     assert cars.calibration is not None
     assert 0 < len(cars.calibration.nees) <= len(cars.calibration.existence)
-    list(track(dataset, sequences, tmp_path, profile="scene", full=True))
+    list(track(dataset, sequences, tmp_path, parameters=scene, full=True))
     assert beside.read_bytes() == content
-    list(track(dataset, sequences, tmp_path, profile="scene"))
+    list(track(dataset, sequences, tmp_path, parameters=scene))
     assert not beside.exists()
 
 

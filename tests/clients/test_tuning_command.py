@@ -60,7 +60,8 @@ def test_the_profile_loads_and_says_where_it_comes_from(tmp_path: Path, capsys: 
     changed = {one["path"] for one in car["evidence"]}
     table, other = (profile.model_dump()["classes"]["Car"] for profile in (before, after))
     flat = {key for key in table if table[key] != other[key] and not isinstance(table[key], dict)}
-    assert flat <= changed | {"calibration"}
+    assert flat <= changed | {"calibration", "heading_sign"}
+    assert before.classes["Car"].heading_sign is None, "tuning gives the usual one to a class that has none"
     assert other["calibration"] is not None
     assert car["calibration"]["held out"]
     assert car["ranking"][0]["score"] == "x_s"
@@ -80,7 +81,7 @@ def test_estimates_alone_need_no_search(tmp_path: Path, capsys: pytest.CaptureFi
     [
         ([*SCENE, "--classes", "Tram"], "no class 'Tram'"),
         ([*CARS, "--metric", "beauty"], "one of combination"),
-        ([*SCENE, "--profile", "nuscenes"], "nothing in these sequences"),
+        ([*SCENE, "--profile", "nuscenes"], "nothing would be tracked"),
     ],
 )
 def test_wrong_wishes_are_told_in_one_line(

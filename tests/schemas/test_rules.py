@@ -190,6 +190,13 @@ def test_integers_where_numbers_are_wanted(examples: dict[str, Message]) -> None
     assert decode(json.dumps(status).encode(), type(examples["ServiceStatus"])).uptime_s == 5.0
 
 
+def test_a_score_of_zero_is_valid(detections: Detections) -> None:
+    """A detector may give an object the score 0: the message is valid, from msgpack and from JSON, and keeps it."""
+    fields = {**plain(detections), "score": [0.5, 0, 0.5]}
+    for payload in (json.dumps(fields).encode(), msgpack.packb(fields)):
+        assert decode(payload, Detections).score.tolist() == [0.5, 0.0, 0.5]
+
+
 def test_no_detections_are_a_message(detections: Detections) -> None:
     """A frame without objects is valid, with empty lists or with empty blocks, and keeps its shapes."""
     empty = {"label": [], "center": [], "size": [], "yaw": [], "score": [], "velocity": []}
