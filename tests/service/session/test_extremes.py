@@ -127,7 +127,7 @@ def test_repairs_are_counted_and_shown() -> None:
 
 
 def test_tracks_die_of_silence() -> None:
-    """Ten seconds without a frame: tracks of before are gone by time, not by frames, and covariance has grown."""
+    """Four seconds without a frame: tracks of before are gone by time, not by frames, and covariance has grown."""
     one = Session(SENSOR.stream, NUSCENES)
     before = tracks(feed(one, range(5), SENSOR))[-1]
     assert len(before.id) == 3
@@ -135,7 +135,7 @@ def test_tracks_die_of_silence() -> None:
     spread = [np.trace(message.covariance[0]) for message in (before, shortly)]
     assert spread[1] > spread[0]
     assert (shortly.existence < before.existence[: len(shortly.id)]).all()
-    after = tracks(feed(one, [110], SENSOR, objects=0))[-1]
+    after = tracks(feed(one, [50], SENSOR, objects=0))[-1]
     assert len(after.id) == 0
 
 
