@@ -10,6 +10,7 @@ import grpc
 import numpy as np
 import pytest
 import zenoh
+import zenoh.ext
 from gateway import detections, frame, points
 from google.rpc import error_details_pb2
 from grpc_status import rpc_status
@@ -132,6 +133,26 @@ def test_a_caller_that_comes_back_gets_what_was_tracked(stub: Any, stream: str) 
     assert [one.tracks.seq for one in again] == list(range(10, 30))
     assert [one.SerializeToString() for one in again[:10]] == [one.SerializeToString() for one in first[10:]]
     assert stub.GetState(pb.GetStateRequest(stream=stream)).state.frames == 30
+
+
+def test_a_heartbeat_brings_nothing_again(service: ServiceProcess, stub: Any, stream: str) -> None:
+    """What recovery sends a call, as to every late subscriber, is left out: the call gets its own frames' tracks."""
+    list(stub.Track(detections(frame(seq, stream)) for seq in range(20)))
+
+    def requests() -> Iterator[pb.TrackRequest]:
+        yield detections(frame(20, stream))
+        with open_client(service.endpoint) as late:
+            recovered = zenoh.ext.declare_advanced_subscriber(
+                late,
+                KEYS.tracks(stream),
+                zenoh.handlers.FifoChannel(64),
+                recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+            )
+            for _ in range(20):  # a heartbeat has come
+                recovered.recv()
+        yield detections(frame(21, stream))
+
+    assert [one.tracks.seq for one in stub.Track(requests())] == [20, 21]
 
 
 @pytest.mark.parametrize(
