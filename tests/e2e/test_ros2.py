@@ -254,9 +254,11 @@ def test_a_clock_that_is_set_back_starts_anew(service: ServiceProcess, scene: Da
         for frame in back:
             for one in frame:
                 _shift(one[3], -100)
-        play(client, [[bags.Sent(*one) for one in frame] for frame in back])
-        stamps = [message.header.stamp.sec for message in client.received[TRACKS]]
-        assert stamps[-1] == START_NS // 10**9 - 100
+        for topic, kind, _, message in (one for frame in back for one in frame):
+            if topic != "/tf_static":
+                client.publish(topic, kind, message)
+        # The service believes a clock when three frames agree: the first two have no tracks.
+        client.wait(TRACKS, lambda got: got[-1].header.stamp.sec == START_NS // 10**9 - 100)
         assert "the clock went back by 100." in told(client, "clock went back")
 
 
