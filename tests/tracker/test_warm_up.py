@@ -49,7 +49,7 @@ for seed, modules in enumerate([optipmb.Modules(), optipmb.Modules(), *baselines
         frame, _ = optipmb.make_frame(parameters, pose=here if seed else None, cloud=cloud, **columns)
         density = tracker.step(density, frame).density
     stored = {name: read_only(column) for name, column in optipmb.columns_of(density).items()}
-    density = optipmb.density_of(density.stamp_ns, density.next_id, stored, len(parameters.classes))
+    density = optipmb.density_of(density.stamp_ns, density.next_id, stored, parameters.labels)
     tracker.step(density, frame)
 grown = [name for name, kernel in kernels().items() if len(kernel.signatures) != known.get(name)]
 print(json.dumps({"compiled": compiled, "later": compilations() - compiled, "grown": grown}))
