@@ -63,7 +63,9 @@ class Counts:
     tracks: int = 0
     problems: int = 0
     problem: str = ""
-    """The newest."""
+    """The newest of the bridge."""
+    service_problem: str = ""
+    """The newest of the service."""
     newest_s: float | None = None
     """When the newest detections came; clock of the bridge."""
     latency_ms: float = 0.0
@@ -204,7 +206,8 @@ class Bridge:
     def take_problem(self, problem: schemas.Problem) -> None:
         """Take in a problem that the service tells of a stream."""
         if problem.instance != self._instance and (stream := self._streams.get(problem.stream)) is not None:
-            self._note(stream.counts, f"{problem.instance}: {problem.message}")
+            stream.counts.problems += 1
+            stream.counts.service_problem = f"{problem.instance}: {problem.message}"
 
     def _sent(self, stream: _Stream, waiting: _Waiting, now: float) -> bool:
         """Send a message, or give it up; False while it has to wait."""
@@ -298,21 +301,18 @@ class Bridge:
     def _refuse(self, stream: _Stream, error: schemas.MessageError, stamp_ns: int | None = None) -> None:
         stream.counts.refused += 1
         problem = schemas.Problem.of(error, stream=stream.name, instance=self._instance)
-        self._note(stream.counts, problem.message)
+        stream.counts.problems += 1
+        stream.counts.problem = problem.message
         self._sink.tell(problem.model_copy(update={"stamp_ns": stamp_ns}))
 
     def _tell(self, stream: _Stream, code: str, text: str, stamp_ns: int) -> None:
         stream.counts.refused += 1
         text = text[:500]
-        self._note(stream.counts, text)
+        stream.counts.problems += 1
+        stream.counts.problem = text
         self._sink.tell(
             schemas.Problem(stream=stream.name, instance=self._instance, code=code, message=text, stamp_ns=stamp_ns)
         )
-
-    @staticmethod
-    def _note(counts: Counts, text: str) -> None:
-        counts.problems += 1
-        counts.problem = text
 
 
 def _stamp(header: Any) -> int:

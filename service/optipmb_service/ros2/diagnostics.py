@@ -46,7 +46,7 @@ def diagnostics(
         if one.newest_s is None or now_s - one.newest_s > stale_s:
             level, text = STALE, "no detections"
         elif new_problems.get(stream):
-            level, text = WARN, one.problem
+            level, text = WARN, "; ".join(filter(None, (one.problem, one.service_problem)))
         elif not one.tracks:
             level, text = WARN, "no tracks come back: is optipmb-service running, with the same prefix?"
         values = {
@@ -57,6 +57,7 @@ def diagnostics(
             "latency_ms": f"{one.latency_ms:.1f}",
             "problems": one.problems,
             "last_problem": one.problem,
+            "last_service_problem": one.service_problem,
         }
         statuses.append(_status(types, level, f"optipmb: {stream}", text, instance, values))
     wrong = tuple(mismatches)
