@@ -229,7 +229,7 @@ def test_many_streams_come_and_go(start: Callable[..., Any], tmp_path: Path) -> 
     service, endpoint = start(store=str(tmp_path), idle_s=0.5, max_sessions=STREAMS, checkpoint_s=0.2)
 
     def wave(name: str) -> None:
-        sensors = [replace(SENSOR, stream=f"{name}/node/{number}") for number in range(STREAMS)]
+        sensors = [replace(SENSOR, stream=f"{name}/node-{number}/lidar") for number in range(STREAMS)]
         with Node(endpoint) as node:
             for sensor in sensors:
                 node.send(sensor.detections(0))
