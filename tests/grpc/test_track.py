@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import threading
 import time
 from typing import TYPE_CHECKING, Any, Self
 
@@ -138,9 +139,11 @@ def test_a_caller_that_comes_back_gets_what_was_tracked(stub: Any, stream: str) 
 def test_a_heartbeat_brings_nothing_again(service: ServiceProcess, stub: Any, stream: str) -> None:
     """What recovery sends a call, as to every late subscriber, is left out: the call gets its own frames' tracks."""
     list(stub.Track(detections(frame(seq, stream)) for seq in range(20)))
+    answered = threading.Event()
 
     def requests() -> Iterator[pb.TrackRequest]:
         yield detections(frame(20, stream))
+        assert answered.wait(60)  # a subscriber that gets frame 20 itself is not sent those before it
         with open_client(service.endpoint) as late:
             recovered = zenoh.ext.declare_advanced_subscriber(
                 late,
@@ -152,7 +155,10 @@ def test_a_heartbeat_brings_nothing_again(service: ServiceProcess, stub: Any, st
                 recovered.recv()
         yield detections(frame(21, stream))
 
-    assert [one.tracks.seq for one in stub.Track(requests())] == [20, 21]
+    call = stub.Track(requests())
+    first = next(call).tracks.seq
+    answered.set()
+    assert [first, *(one.tracks.seq for one in call)] == [20, 21]
 
 
 @pytest.mark.parametrize(
