@@ -13,8 +13,11 @@ from optipmb_schemas import Problem, ServiceStatus
 from rich.console import Console
 
 
-def test_a_service_is_shown_with_its_streams_and_problems(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_service_is_shown_with_its_streams_and_problems(
+    endpoint: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The table holds instance, uptime, each stream with its figures, and the newest problem."""
+    monkeypatch.setenv("COLUMNS", "200")  # a narrow terminal folds the lines
     with FakeService(endpoint):
         assert run(["status", "--connect", endpoint, "--timeout", "10"]) == 0
     text = capsys.readouterr().out
