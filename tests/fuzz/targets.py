@@ -10,6 +10,7 @@ import contextlib
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
+from optipmb_schemas.protobuf.transcode import transcode
 from optipmb_service.grpc.selection import Pace, Selection
 from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
 from optipmb_service.session.convert import density_of
@@ -19,6 +20,7 @@ from router import Sensor
 
 LIMITS = schemas.Limits(max_bytes=2**16, max_json_bytes=2**16, max_values=2**12)
 REQUESTS = (pb.TrackRequest, pb.PublishRequest, pb.SubscribeRequest, pb.SetParametersRequest)
+CONFIRMED = Selection(pb.TrackFilter(confirmed_only=True, classes=["car"], area=pb.Polygon(x=[0, 9, 0], y=[0, 0, 9])))
 POLICY = Policy(checkpoint_bytes=2000)
 """So little that a restored session must go over its first frames again before it can be written down."""
 
@@ -59,10 +61,15 @@ def checkpoints(data: bytes) -> None:
 def protobuf(data: bytes) -> None:
     """A request over gRPC is read or refused; detections and clouds that are read survive both forms unchanged.
 
+    The same bytes as tracks of a service are refused, or carried on and filtered.
+
     The first byte chooses the type of the request.
     """
     if not data:
         return
+    with contextlib.suppress(schemas.MessageError):
+        tracks = transcode(data[1:], encoding=schemas.encoding_of(schemas.Tracks), limits=LIMITS)
+        CONFIRMED.of(tracks)
     kind = REQUESTS[data[0] % len(REQUESTS)]
     try:
         request = convert.parse(data[1:], kind)

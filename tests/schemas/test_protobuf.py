@@ -6,12 +6,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
-from optipmb_schemas import MessageError, SessionParameters, decode, encode
-from optipmb_schemas.messages import Detections, Message, Points
+from optipmb_schemas import MessageError, SessionParameters, decode, encode, encode_json, encoding_of
+from optipmb_schemas.messages import Detections, Message, Points, Tracks
 from optipmb_schemas.protobuf import convert, export
 from optipmb_schemas.protobuf import tracking_pb2 as pb
+from optipmb_schemas.protobuf.transcode import transcode
 
 SCHEMAS = Path(__file__).parents[2] / "schemas"
 BUF = Path(sys.executable).parent / "buf"
@@ -137,3 +139,41 @@ def test_unknown_fields_are_ignored(example_of: Any) -> None:
     payload = convert.to_proto(message).SerializeToString() + b"\xa2\x06\x03new"
     assert convert.from_proto(convert.parse(payload, pb.Detections), Detections) == message
     assert decode(encode(message), Detections) == message
+
+
+def test_tracks_are_transcoded_as_they_are(example_of: Any) -> None:
+    """Without a model between them they become what the model becomes, whatever the form."""
+    tracks = example_of(Tracks)
+    expected = convert.to_proto(tracks)
+    assert transcode(encode(tracks), encoding=encoding_of(Tracks)) == expected
+    assert transcode(encode(tracks)) == expected
+    assert transcode(encode_json(tracks), encoding=encoding_of(Tracks, form="json")) == expected
+    newer = msgpack.packb(msgpack.unpackb(encode(tracks)) | {"colour": "red"})
+    assert transcode(newer, encoding=encoding_of(Tracks)) == expected
+
+
+def without_rows(fields: dict[str, Any]) -> None:
+    """Take all rows of one column away."""
+    fields["yaw"] = {"dtype": "f8", "shape": [0], "data": b""}
+
+
+@pytest.mark.parametrize(
+    ("change", "path"),
+    [
+        (lambda fields: fields.pop("center"), "center"),
+        (lambda fields: fields["center"].update(data=b"12345678"), "center.data"),
+        (lambda fields: fields["center"].update(dtype="f16"), "center.dtype"),
+        (lambda fields: fields["size"].update(shape=[[]]), "size.shape"),
+        (lambda fields: fields.update(seq="first"), "seq"),
+        (lambda fields: fields.update(covariance=7), "covariance"),
+        (lambda fields: fields.update(labels=["a"] * 1000), "labels"),
+        (without_rows, "yaw"),
+    ],
+)
+def test_what_are_no_tracks_is_not_transcoded(example_of: Any, change: Any, path: str) -> None:
+    """Columns that do not fit, wrong types and missing fields are named, as when they are decoded."""
+    fields = msgpack.unpackb(encode(example_of(Tracks)))
+    change(fields)
+    with pytest.raises(MessageError) as raised:
+        transcode(msgpack.packb(fields), encoding=encoding_of(Tracks))
+    assert raised.value.path.startswith(path)

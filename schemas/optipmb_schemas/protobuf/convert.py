@@ -4,7 +4,7 @@
 limits and the same errors. It is total: it returns a model or raises `MessageError`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache
 from typing import Any, Final, TypeVar
 
@@ -29,7 +29,7 @@ P = TypeVar("P", bound=ProtoMessage)
 _DTYPE_NAMES: Final[dict[int, str]] = {
     code: name.rpartition("_")[2].lower() for name, code in pb.DataType.items() if code
 }
-_DTYPE_CODES: Final[dict[np.dtype[Any], Any]] = {DTYPES[name]: code for code, name in _DTYPE_NAMES.items()}
+DTYPE_CODES: Final[dict[np.dtype[Any], Any]] = {DTYPES[name]: code for code, name in _DTYPE_NAMES.items()}
 _FRAMES: Final[dict[int, str]] = {pb.FRAME_WORLD: "world", pb.FRAME_SENSOR: "sensor"}
 _FRAME_CODES: Final = {name: code for code, name in _FRAMES.items()}
 
@@ -47,19 +47,11 @@ def parse(payload: bytes, kind: type[P]) -> P:
         raise MessageError("malformed", "", f"a message {name}", f"{len(payload)} bytes that are none") from None
 
 
-def to_proto(message: Message, columns: Mapping[str, NDArray[Any]] | None = None) -> Any:
-    """Return the protobuf message of a model, which must have one: `export.MODELS`.
-
-    Args:
-        message: the model.
-        columns: arrays in the place of its own, for some rows or columns alone; default: its own.
-    """
+def to_proto(message: Message) -> Any:
+    """Return the protobuf message of a model, which must have one: `export.MODELS`."""
     kind = type(message)
     fields: dict[str, Any] = {}
-    for name, own in message.present():
-        value = own if columns is None or name not in kind.arrays else columns.get(name)
-        if value is None:
-            continue
+    for name, value in message.present():
         if isinstance(value, np.ndarray):
             fields[name] = value.tolist() if name in _repeated(kind) else _array(value)
         elif isinstance(value, Message):
@@ -80,9 +72,22 @@ def from_proto(proto: ProtoMessage, kind: type[T], limits: Limits = DEFAULT) -> 
     return build(_fields(proto), kind, limits)
 
 
+def column(array: pb.Array) -> NDArray[Any]:
+    """Return a column that was checked before as an array, a view of its bytes."""
+    dtype = DTYPES[_DTYPE_NAMES[array.dtype]]
+    return np.frombuffer(array.data, dtype).reshape(array.shape) if array.data else np.empty(array.shape, dtype)
+
+
+def select(array: pb.Array, rows: NDArray[np.bool_]) -> None:
+    """Leave only some rows in a column that was checked before."""
+    left = column(array)[rows]
+    array.shape[0] = len(left)
+    array.data = left.tobytes()
+
+
 def _array(array: NDArray[Any]) -> pb.Array:
     little = array.dtype.newbyteorder("<")
-    return pb.Array(dtype=_DTYPE_CODES[little], shape=array.shape, data=np.ascontiguousarray(array, little).tobytes())
+    return pb.Array(dtype=DTYPE_CODES[little], shape=array.shape, data=np.ascontiguousarray(array, little).tobytes())
 
 
 def _fields(proto: ProtoMessage) -> dict[str, Any]:

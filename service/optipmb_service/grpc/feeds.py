@@ -5,13 +5,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 import optipmb_schemas as schemas
 import structlog
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
+from optipmb_schemas.protobuf.transcode import transcode
 
+from optipmb_service.grpc.outbox import varint
 from optipmb_service.grpc.selection import Selection
 
 if TYPE_CHECKING:
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
 
 HISTORY_S: Final = 2.0
 """Longest wait for the caches of the services."""
+
+_TRACKS: Final = b"\x0a"
+"""Tag of field 1, `tracks`, of all responses with tracks."""
 
 EVERYTHING: Final = Selection(pb.TrackFilter())
 
@@ -33,7 +38,7 @@ class Item:
 
     stream: str
     response: bytes
-    tracks: schemas.Tracks | None = None
+    tracks: pb.Tracks | None = None
 
 
 class Listener(Protocol):
@@ -43,7 +48,7 @@ class Listener(Protocol):
     def selection(self) -> Selection:
         """What it wants of tracks."""
 
-    def passes(self, tracks: schemas.Tracks) -> bool:
+    def passes(self, tracks: pb.Tracks) -> bool:
         """Tell whether it wants the tracks of this frame; called on a thread of the feed."""
 
     def take(self, item: Item) -> None:
@@ -91,7 +96,7 @@ class Feeds:
                 if feed.subscription is not None:
                     await asyncio.shield(asyncio.to_thread(feed.subscription.close))
 
-    async def recent(self, key: str) -> list[schemas.Tracks]:
+    async def recent(self, key: str) -> list[pb.Tracks]:
         """Return the tracks that the services keep under a key expression, each stream's as they were published.
 
         Raises:
@@ -99,21 +104,21 @@ class Feeds:
         """
         return await asyncio.to_thread(self._recent, key)
 
-    def _recent(self, key: str) -> list[schemas.Tracks]:
+    def _recent(self, key: str) -> list[pb.Tracks]:
         messages = self._client.recent(key, HISTORY_S)
-        return [tracks for one in messages if (tracks := self._decoded(one, schemas.Tracks)) is not None]
+        return [tracks for one in messages if (tracks := self._tracks(one)) is not None]
 
     def _receive(self, feed: _Feed, message: Message) -> None:
         """Take a message on the thread of its subscription."""
         listeners = feed.listeners
         handed: list[tuple[Listener, Item]] = []
         if message.key.endswith("/problems"):
-            problem = self._decoded(message, schemas.Problem)
+            problem = self._problem(message)
             if problem is not None:
                 item = problem_item(problem)
                 handed = [(listener, item) for listener in listeners]
         else:
-            tracks = self._decoded(message, schemas.Tracks)
+            tracks = self._tracks(message)
             if tracks is not None:
                 wanting = [one for one in listeners if one.passes(tracks)]
                 items = {one.selection.key: one.selection for one in wanting}
@@ -123,18 +128,25 @@ class Feeds:
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(_hand_over, handed)
 
-    def _decoded(self, message: Message, kind: type[Any]) -> Any:
+    def _tracks(self, message: Message) -> pb.Tracks | None:
         try:
-            return schemas.decode(message.payload, kind, encoding=message.encoding)
+            return transcode(message.payload, encoding=message.encoding)
+        except schemas.MessageError as error:
+            self._invalid(str(error))
+            return None
+
+    def _problem(self, message: Message) -> schemas.Problem | None:
+        try:
+            return schemas.decode(message.payload, schemas.Problem, encoding=message.encoding)
         except schemas.MessageError as error:
             self._invalid(str(error))
             return None
 
 
-def tracks_item(tracks: schemas.Tracks, selection: Selection = EVERYTHING) -> Item:
+def tracks_item(tracks: pb.Tracks, selection: Selection = EVERYTHING) -> Item:
     """Return tracks as a response."""
-    response = pb.SubscribeResponse(tracks=selection.of(tracks))
-    return Item(tracks.stream, response.SerializeToString(), tracks)
+    payload = selection.of(tracks).SerializeToString()
+    return Item(tracks.stream, b"".join((_TRACKS, varint(len(payload)), payload)), tracks)
 
 
 def problem_item(problem: schemas.Problem) -> Item:

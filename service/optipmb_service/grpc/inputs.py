@@ -176,7 +176,7 @@ class _Answers:
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
 
-    def passes(self, _tracks: schemas.Tracks) -> bool:
+    def passes(self, _tracks: pb.Tracks) -> bool:
         """Tell whether they are wanted: all are."""
         return True
 
@@ -239,7 +239,7 @@ async def track(call: Call) -> None:
     call.check_ending()
 
 
-def _already_tracked(held: Iterable[schemas.Tracks], first: Input, outbox: Outbox) -> set[tuple[bytes, int]]:
+def _already_tracked(held: Iterable[pb.Tracks], first: Input, outbox: Outbox) -> set[tuple[bytes, int]]:
     """Answer what a caller that comes back sends again: it may have been tracked, and is not tracked twice."""
     known: set[tuple[bytes, int]] = set()
     if not isinstance(first, schemas.Detections | schemas.Points):

@@ -42,7 +42,7 @@ class _Subscriber:
         self._fresh = Fresh(lambda item: self.outbox.put(item.stream, item.response))
         self.take, self.begin = self._fresh.put, self._fresh.begin
 
-    def passes(self, tracks: schemas.Tracks) -> bool:
+    def passes(self, tracks: pb.Tracks) -> bool:
         return self._pace.passes(tracks.stream, tracks.stamp_ns)
 
 
@@ -83,9 +83,9 @@ async def query_tracks(call: Call) -> None:
             await call.write(tracks_item(tracks, selection).response)
 
 
-def newest(publications: Iterable[schemas.Tracks]) -> list[schemas.Tracks]:
+def newest(publications: Iterable[pb.Tracks]) -> list[pb.Tracks]:
     """Return what holds of each frame, by stream and stamp: that of the latest run, and in it the latest revision."""
-    holding: dict[tuple[str, bytes, int], schemas.Tracks] = {}
+    holding: dict[tuple[str, bytes, int], pb.Tracks] = {}
     for tracks in publications:
         key = tracks.stream, tracks.epoch, tracks.seq
         known = holding.get(key)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import collections
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import optipmb_schemas as schemas
-from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
+from optipmb_schemas.protobuf.convert import column, select
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -52,24 +52,34 @@ class Selection:
         self._area = _polygon(asked.area) if asked.HasField("area") else None
         self._fields = frozenset((*asked.fields, "id")) if asked.fields else None
 
-    def of(self, tracks: schemas.Tracks) -> pb.Tracks:
+    def of(self, tracks: pb.Tracks) -> pb.Tracks:
         """Return what is wanted of the tracks of a frame."""
-        proto: pb.Tracks = convert.to_proto(tracks, self._columns(tracks) if self.key else None)
-        return proto
+        if not self.key:
+            return tracks
+        rows = self._rows(tracks)
+        chosen = pb.Tracks()
+        chosen.CopyFrom(tracks)
+        for name in schemas.Tracks.arrays:
+            if self._fields is not None and name not in self._fields:
+                chosen.ClearField(name)
+            elif chosen.HasField(name):
+                select(getattr(chosen, name), rows)
+        return chosen
 
-    def _columns(self, tracks: schemas.Tracks) -> dict[str, NDArray[Any]]:
-        rows = tracks.existence >= self._min_existence
+    def _rows(self, tracks: pb.Tracks) -> NDArray[np.bool_]:
+        existence = column(tracks.existence)
+        rows: NDArray[np.bool_] = existence >= self._min_existence
         if self._classes:
             wanted = [number for number, name in enumerate(tracks.labels) if name in self._classes]
-            rows &= np.isin(tracks.label, wanted)
+            rows &= np.isin(column(tracks.label), wanted)
         if self._confirmed:
-            told = tracks.confirmed
-            likely = (tracks.existence > CONFIRMED_EXISTENCE) & (tracks.age > 0.0)
-            rows &= likely if told is None else told > 0
+            if tracks.HasField("confirmed"):
+                rows &= column(tracks.confirmed) > 0
+            else:
+                rows &= (existence > CONFIRMED_EXISTENCE) & (column(tracks.age) > 0.0)
         if self._area is not None:
-            rows &= inside(tracks.center[:, :2], self._area)
-        names = tracks.arrays if self._fields is None else self._fields
-        return {name: column[rows] for name in names if (column := getattr(tracks, name)) is not None}
+            rows &= inside(column(tracks.center)[:, :2], self._area)
+        return rows
 
 
 class Pace:
