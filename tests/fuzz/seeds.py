@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
@@ -39,6 +40,15 @@ def main() -> None:
     ]
     for number, request in enumerate(requests):
         _write("protobuf", type(request).__name__, bytes([number]) + request.SerializeToString())
+    scalars = ("yaw", "yaw_rate", "acceleration", "existence", "score", "age", "time_since_detection")
+    columns = {name: np.zeros(1) for name in scalars} | {
+        name: np.zeros(1, int) for name in ("id", "label", "detection")
+    }
+    columns |= {"center": np.zeros((1, 3)), "size": np.ones((1, 3)), "velocity": np.zeros((1, 2))}
+    header = {"stream": sensor.stream, "epoch": bytes(16), "seq": 0, "stamp_ns": 0, "session": "0" * 32}
+    rest = {"profile": "kitti", "cloud_used": False, "labels": ("car",), "covariance": np.zeros((1, 6, 6))}
+    tracks = schemas.Tracks(**header, **rest, **columns)
+    _write("protobuf", "Tracks", bytes([len(requests)]) + schemas.encode(tracks))
     parameters = optipmb.load_profile("kitti")
     small = parameters.model_copy(update={"classes": dict(list(parameters.classes.items())[:1]), "provenance": ""})
     one = Session(sensor.stream, small, tracker=chained)
