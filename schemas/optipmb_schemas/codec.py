@@ -6,12 +6,13 @@ are checked before memory is taken for them. `encode` is deterministic: equal me
 
 import json
 import re
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, cast
 
 import msgpack
 import numpy as np
 
 from optipmb_schemas.blocks import block_of, pack_field, read_array
+from optipmb_schemas.compact import read_detections
 from optipmb_schemas.control import MoveRequest, Problem, ResetRequest, ServiceStatus, SessionParameters, SessionState
 from optipmb_schemas.errors import MessageError, show
 from optipmb_schemas.limits import DEFAULT, Limits
@@ -98,6 +99,8 @@ def decode(payload: bytes, expected: type[T], *, encoding: str = "", limits: Lim
     most = limits.max_json_bytes if form == "json" else limits.max_bytes
     if len(payload) > most:
         raise MessageError("too_large", "", f"at most {most} bytes of {form}", f"{len(payload)} bytes")
+    if expected is Detections and form == "msgpack" and (message := read_detections(payload, limits)) is not None:
+        return cast("T", message)
     fields = _parse_json(payload, limits) if form == "json" else _parse_msgpack(payload, limits)
     if not isinstance(fields, dict):
         raise MessageError("malformed", "", f"one map with the fields of {expected.__name__}", show(fields))

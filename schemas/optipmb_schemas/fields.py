@@ -74,7 +74,8 @@ def _inside(path: str, key: str) -> str:
     return cut(f"{path}.{ascii(key)[1:-1]}".removeprefix("."))
 
 
-def _labels(labels: tuple[str, ...]) -> tuple[str, ...]:
+def check_labels(labels: tuple[str, ...]) -> tuple[str, ...]:
+    """Return `labels` when all are printable and differ from each other."""
     for i, label in enumerate(labels):
         if not label.isprintable():
             raise invalid(f"[{i}]", "a label of printable characters", label)
@@ -113,5 +114,5 @@ Plain = Annotated[dict[str, Any], AfterValidator(_plain)]
 Labels = Annotated[
     tuple[Annotated[str, Field(strict=True, min_length=1, max_length=64)], ...],
     Field(max_length=256, fail_fast=True),
-    AfterValidator(_labels),
+    AfterValidator(check_labels),
 ]

@@ -28,6 +28,8 @@ class Message(BaseModel):
     """Descriptions of the array fields, by name."""
     columns: ClassVar[tuple[tuple[str, str], ...]] = ()
     """Name and letter of the array fields whose number of rows is symbolic."""
+    optional: ClassVar[dict[str, Any]] = {}
+    """Values of the fields that need not be given, by name."""
     nested: ClassVar[dict[str, type["Message"]]] = {}
     """Message types of the fields that hold one message, by name."""
 
@@ -48,6 +50,7 @@ class Message(BaseModel):
                     cls.arrays[name] = part
                 elif isinstance(part, type) and issubclass(part, Message):
                     cls.nested[name] = part
+        cls.optional = {name: one.default for name, one in cls.model_fields.items() if not one.is_required()}
         cls.names = tuple(cls.model_fields)
         cls.columns = tuple((name, one.rows) for name, one in cls.arrays.items() if one.rows is not None)
 
@@ -60,10 +63,20 @@ class Message(BaseModel):
         """
         for name in cls.arrays:
             array = fields.get(name)
-            if array is not None:
+            if array is not None and array.flags.writeable:
                 fields[name] = array = array.view()
                 array.flags.writeable = False
-        return cls.model_construct(**fields)
+        # What pydantic's `model_construct` does, without looking at every field of the description.
+        message = cls.__new__(cls)
+        values = cls.optional | fields if cls.optional else fields
+        for name, value in (
+            ("__dict__", values),
+            ("__pydantic_fields_set__", set(fields)),
+            ("__pydantic_extra__", None),
+            ("__pydantic_private__", None),
+        ):
+            object.__setattr__(message, name, value)
+        return message
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -1,0 +1,293 @@
+"""What a frame costs the service, part by part, beside another version of the code, in one run.
+
+python benchmarks/frame_cost.py [--beside DIR] [--objects N] [--points N] [--rounds N] [--live SECONDS]
+
+A frame goes its way through one process, with everything real but the network and the store: a packet is handed over,
+decoded, tracked and published, and every tenth frame a checkpoint is encoded. What counts is the processor time of the
+thread. `--beside` names a checkout of another version: rounds of the two follow each other, each in a process of its
+own, and the medians of the rounds are compared. With `--live`, 40 streams at 10 Hz come from this process through a
+router in another one, and the system says what processor time the service takes, with Zenoh's threads and checkpoints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+import optipmb_schemas as schemas
+from optipmb_client import Connection
+from optipmb_client.load import Load, generated, run_load
+from optipmb_client.load.material import FIRST, head, message
+from optipmb_service.app.kernels import warm_up
+from optipmb_service.cluster.ownership import Role, RoleChange
+from optipmb_service.observability import logs
+from optipmb_service.observability.metrics import Metrics
+from optipmb_service.observability.problem_reporter import ProblemReporter
+from optipmb_service.runtime import stream_actor
+from optipmb_service.runtime.persistence import NoPersistence
+from optipmb_service.runtime.ports import Packet
+from optipmb_service.runtime.profiles import Profiles
+from optipmb_service.runtime.registry import Registry
+from optipmb_service.runtime.track_publisher import TrackPublisher
+from optipmb_service.session import convert
+from optipmb_service.session.checkpoint import encode_checkpoint
+from optipmb_service.session.session import Session
+from optipmb_service.settings import Settings
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
+
+from service_process import ServiceProcess
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+HERE = Path(__file__).resolve().parents[1]
+STREAM = "site-of-load/node/lidar1"
+WARM = 100
+FRAMES = 400
+RATE_HZ = 10.0
+STREAMS = 40
+CHECKPOINT_EVERY = 10
+
+
+class Parts:
+    """Processor time of the parts of a frame: of calls of functions, less that of timed calls inside them."""
+
+    def __init__(self) -> None:
+        self.spent_ns: dict[str, int] = {}
+        self._inside_ns = 0
+
+    def time(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the function as a part of the frame."""
+        self.spent_ns[part] = 0
+
+        def timed(*arguments: Any, **named: Any) -> Any:
+            outer_ns, self._inside_ns = self._inside_ns, 0
+            began_ns = time.thread_time_ns()
+            try:
+                return function(*arguments, **named)
+            finally:
+                took_ns = time.thread_time_ns() - began_ns
+                self.spent_ns[part] += took_ns - self._inside_ns
+                self._inside_ns = outer_ns + took_ns
+
+        return timed
+
+    def taken(self) -> dict[str, float]:
+        """Return the microseconds since the last time."""
+        taken = {part: spent_ns / 1e3 for part, spent_ns in self.spent_ns.items()}
+        self.spent_ns = dict.fromkeys(self.spent_ns, 0)
+        return taken
+
+
+class Network:
+    """Everything around the streams: it grants them all, takes what they publish, and runs their actors."""
+
+    def __init__(self) -> None:
+        self.waiting: list[Any] = []
+        self.roles: dict[str, Role] = {}
+        self.asked: list[str] = []
+        self.published = 0
+        self.problems: list[str] = []
+
+    def submit(self, actor: Any) -> None:
+        """Take an actor that has something to do."""
+        self.waiting.append(actor)
+
+    def run(self) -> None:
+        """Run the actors until none has anything to do."""
+        while self.waiting:
+            actor = self.waiting.pop(0)
+            if actor.work():
+                self.waiting.append(actor)
+
+    def role(self, stream: str) -> Role:
+        """Say what this instance is to a stream."""
+        return self.roles.get(stream, Role.NONE)
+
+    def may_write(self, stream: str) -> bool:
+        """Every stream that was granted may be written."""
+        return stream in self.roles
+
+    def elsewhere(self, stream: str) -> bool:
+        """No stream is tracked elsewhere."""
+        del stream
+        return False
+
+    def request(self, stream: str) -> None:
+        """Grant a stream soon."""
+        self.roles[stream] = Role.OWNER
+        self.asked.append(stream)
+
+    def release(self, stream: str) -> None:
+        """Forget a stream."""
+        self.roles.pop(stream, None)
+
+    def claim(self, stream: str) -> Network:
+        """Be the publisher of a stream."""
+        del stream
+        return self
+
+    def publish(self, payload: bytes) -> None:
+        """Take tracks."""
+        self.published += bool(payload)
+
+    def publish_problem(self, problem: schemas.Problem) -> None:
+        """Note what must not come."""
+        self.problems.append(str(problem))
+
+
+def packets(objects: int, points: int) -> Iterator[list[Packet]]:
+    """Yield the messages of each frame, its cloud first."""
+    frames, keys = generated(objects, points, RATE_HZ), schemas.Keys()
+    for k in range(WARM + FRAMES):
+        begins = head(STREAM, bytes(16), FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
+        made = []
+        detections, cloud = frames.detections[k % len(frames)], frames.clouds[k % len(frames)]
+        bodies = (
+            (cloud, keys.points(STREAM), schemas.Points),
+            (detections, keys.detections(STREAM), schemas.Detections),
+        )
+        for body, key, kind in bodies:
+            if body is not None:
+                payload = message(body, begins)
+                encoding = schemas.encoding_of(kind)
+                made.append(Packet(key, payload, len(payload), encoding, time.time_ns(), time.monotonic_ns()))
+        yield made
+
+
+def measured(objects: int, points: int) -> dict[str, float]:
+    """Return the median microseconds of each part of a frame."""
+    logs.configure("console", "error")
+    warm_up()
+    parts = Parts()
+    network: Any = Network()  # in the place of several parts
+    for part, owner, name in (
+        ("handing over", Registry, "frame"),
+        ("handing over", Registry, "cloud"),
+        ("decoding", stream_actor, "message_of"),
+        ("session", Session, "on_detections"),
+        ("session", Session, "on_points"),
+        ("conversion", convert, "frame_of"),
+        ("conversion", convert, "cloud_of"),
+        ("conversion", convert, "tracks_of"),
+        ("step", optipmb.Tracker, "step"),
+        ("publishing", TrackPublisher, "send"),
+        ("metrics", Metrics, "received"),
+        ("metrics", Metrics, "published"),
+        ("metrics", Metrics, "tracks"),
+        ("actor", stream_actor.StreamActor, "work"),
+    ):
+        if hasattr(owner, name):
+            setattr(owner, name, parts.time(part, getattr(owner, name)))
+    registry = Registry(
+        Settings(instance="cost", store="none"),
+        Profiles.read("nuscenes", {}),
+        sink=network,
+        reporter=ProblemReporter(network.publish_problem, lambda *_: None),
+        scheduler=network,
+        coordinator=network,
+        persistence=NoPersistence(),
+        arm=lambda *_: None,
+        metrics=Metrics(),
+    )
+    rows: list[dict[str, float]] = []
+    checkpoints: list[float] = []
+    for k, frame in enumerate(packets(objects, points)):
+        for packet in frame:
+            (registry.frame if packet.key.endswith("detections") else registry.cloud)(packet)
+        network.run()
+        while network.asked:
+            registry.changed(network.asked.pop(), RoleChange.GRANTED)
+            network.run()
+        row = parts.taken()
+        if k >= WARM:
+            rows.append(row)
+            if k % CHECKPOINT_EVERY == 0 and (actor := registry.actor(STREAM)) is not None and actor.session:
+                began_ns = time.thread_time_ns()
+                encode_checkpoint(actor.session.snapshot())
+                checkpoints.append((time.thread_time_ns() - began_ns) / 1e3 / CHECKPOINT_EVERY)
+    if network.published != WARM + FRAMES or network.problems:
+        raise RuntimeError(f"{network.published} frames were answered, {network.problems[:1]}")
+    medians = {part: median(row[part] for row in rows) for part in rows[0]}
+    return medians | {"checkpoint": median(checkpoints), "sum": sum(medians.values()) + median(checkpoints)}
+
+
+def live(tree: Path, objects: int, points: int, seconds: float) -> dict[str, float]:
+    """Return microseconds of processor time per frame of a service in a process of its own, and its latencies."""
+    with tempfile.TemporaryDirectory() as folder, ServiceProcess("--instance", "router") as router:
+        router.wait_ready()
+        environment = {"PYTHONPATH": roots(tree), "OPTIPMB_STORE": folder}
+        options = ("--connect", router.endpoint, "--instance", "cost", "--log-level", "warning")
+        with ServiceProcess(*options, environment=environment, listen=False) as service:
+            service.wait_ready()
+            frames = generated(objects, points, RATE_HZ)
+            with Connection(router.endpoint) as connection:
+                run_load(connection, Load(STREAMS, RATE_HZ, 2.0), frames)
+                before_s = processor_s(service.process.pid)
+                run = run_load(connection, Load(STREAMS, RATE_HZ, seconds), frames)
+                spent_s = processor_s(service.process.pid) - before_s
+    return {"service": spent_s / run.received * 1e6, "p50_ms": run.p50_ms, "p99_ms": run.p99_ms}
+
+
+def processor_s(pid: int) -> float:
+    """Processor time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def roots(tree: Path) -> str:
+    """Return the search path on which the packages of a checkout come first."""
+    return os.pathsep.join(str(tree / part) for part in ("", "schemas", "service", "clients"))
+
+
+def rounds(trees: Sequence[Path], options: argparse.Namespace) -> list[dict[str, float]]:
+    """Measure each checkout in turns; return the medians of the rounds."""
+    seen: list[list[dict[str, float]]] = [[] for _ in trees]
+    for _ in range(options.rounds):
+        for tree, rows in zip(trees, seen, strict=True):
+            command = [sys.executable, __file__, "--one", "--objects", str(options.objects)]
+            command += ["--points", str(options.points)]
+            environment = os.environ | {"PYTHONPATH": roots(tree)}
+            answer = subprocess.run(  # noqa: S603 - this file
+                command, env=environment, check=True, capture_output=True, text=True
+            )
+            row = json.loads(answer.stdout)
+            rows.append(row | (live(tree, options.objects, options.points, options.live) if options.live else {}))
+    return [{part: median(row[part] for row in rows) for part in rows[0]} for rows in seen]
+
+
+def main() -> None:
+    """Measure, and print a table of microseconds per frame."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--beside", type=Path, help="checkout of another version")
+    parser.add_argument("--objects", type=int, default=40)
+    parser.add_argument("--points", type=int, default=0)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--live", type=float, default=0.0, help="seconds of load on a running service; 0: none")
+    parser.add_argument("--one", action="store_true", help="one round of the packages on the search path, as JSON")
+    options = parser.parse_args()
+    if options.one:
+        print(json.dumps(measured(options.objects, options.points)))  # noqa: T201 - the parent reads it
+        return
+    trees = [*([options.beside.resolve()] if options.beside else []), HERE]
+    results = rounds(trees, options)
+    print("| part | " + " | ".join(["before", "after", "ratio"] if options.beside else ["us"]) + " |")  # noqa: T201
+    for part in results[0]:
+        values = [result[part] for result in results]
+        shown = [f"{value:.1f}" for value in values] + [f"{values[-1] / values[0]:.2f}"] * (len(values) - 1)
+        print(f"| {part} | " + " | ".join(shown) + " |")  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""Detections as our encoder writes them, read without the steps that other forms need; all else is left to the models.
+
+Nothing is refused here. A payload that is not plainly a valid message in this form (blocks of little-endian float64
+and int64, known fields only, each once) gives None: the walk and the models read it then, or say what is wrong with
+it. So there is one set of rules and one set of errors, and a test holds what is accepted here equal to the models.
+
+The bounds are those of `structure`. A payload is short enough here that whatever is built from it is small, every value
+in it is looked at, and so it holds no more values, no deeper nesting and no longer texts than the limits allow.
+"""
+
+import sys
+from functools import lru_cache
+from struct import unpack
+from typing import Any, Final
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from optipmb_schemas.arrays import unit_quaternion
+from optipmb_schemas.fields import check_labels, check_stream
+from optipmb_schemas.limits import Limits
+from optipmb_schemas.messages import INT64, Detections, Pose
+
+MOST: Final = 2**16
+"""Bytes of a payload that is read in this way; of a longer one the walk is a small part."""
+
+DEEPEST: Final = 4
+"""Levels of lists and maps: message, pose, block, shape."""
+
+_EPOCH: Final = 16
+_TEXT: Final = 64
+_LABELS: Final = 256
+_KNOWN: Final = frozenset(Detections.model_fields)
+_REQUIRED: Final = frozenset(name for name, field in Detections.model_fields.items() if field.is_required())
+_BLOCK: Final = frozenset({"dtype", "shape", "data"})
+_PADDED: Final = _BLOCK | {"pad"}
+_WHOLE: Final = frozenset({"i8", "<i8"})
+_REAL: Final = frozenset({"f8", "<f8"})
+_COLUMNS: Final = (("center", 3), ("size", 3), ("yaw", 1), ("score", 1), ("velocity", 2))
+_RANGES: Final = tuple(Detections.arrays[name] for name, _ in _COLUMNS)
+_LOWEST: Final = np.array([np.nextafter(one.low, np.inf) if one.above else one.low for one in _RANGES])
+_HIGHEST: Final = np.array([one.high for one in _RANGES], np.float64)
+_FRAMES: Final = frozenset({"world", "sensor"})
+_VELOCITY: Final = len(_COLUMNS) - 1
+_POSE: Final = tuple((name, int(one.shape[0]), one.low, one.high) for name, one in Pose.arrays.items())
+
+_msgpack: Any = msgpack  # its type information is partial
+
+
+def read_detections(payload: bytes, limits: Limits) -> Detections | None:
+    """Return the message of a payload in this form; None when it is in another, or not valid."""
+    if len(payload) > min(MOST, limits.max_values) or limits.max_depth < DEEPEST or sys.byteorder != "little":
+        return None
+    try:
+        pairs = _msgpack.unpackb(
+            payload,
+            object_pairs_hook=tuple,
+            ext_hook=_refuse,
+            max_str_len=limits.max_text,
+            max_array_len=_LABELS,
+            max_map_len=len(_KNOWN),
+        )
+        return _message(pairs, limits)
+    except (ValueError, TypeError, LookupError):
+        return None
+
+
+def _message(pairs: Any, limits: Limits) -> Detections:
+    """Return the message of the pairs of a map.
+
+    Raises:
+        ValueError, TypeError, LookupError: it is for the models.
+    """
+    fields = _once(pairs)
+    labels, label = fields["labels"], fields["label"]
+    count = dict(label)["shape"][0]
+    _need(_REQUIRED <= fields.keys() <= _KNOWN)
+    _need(type(labels) is list and type(count) is int and 0 < count <= limits.max_detections)
+    for name in ("seq", "stamp_ns"):
+        _need(type(fields[name]) is int and 0 <= fields[name] <= INT64)
+    _need(type(fields["epoch"]) is bytes and len(fields["epoch"]) == _EPOCH)
+    _need(type(fields["stream"]) is str and fields["frame"] in _FRAMES)
+    _need(fields.get("has_points") is None or type(fields["has_points"]) is bool)
+    _stream(fields["stream"])
+    _need(len(labels) <= limits.max_labels)
+    fields["labels"] = _labels(tuple(labels))
+    fields["label"] = index = np.frombuffer(_data(label, _WHOLE, [count], 8 * count), np.int64)
+    _need(int(index.view(np.uint64).max()) < len(labels))  # a negative one is larger than any
+    _read_columns(fields, count)
+    if fields.get("pose") is not None:
+        fields["pose"] = _pose(fields["pose"])
+    else:
+        _need(fields["frame"] == "world")
+    return Detections.trusted(**fields)
+
+
+def _read_columns(fields: dict[str, Any], count: int) -> None:
+    """Replace the blocks of numbers by arrays, all of which lie in one buffer, and check their ranges together."""
+    columns = _COLUMNS if fields.get("velocity") is not None else _COLUMNS[:-1]
+    parts: list[bytes] = []
+    for name, width in columns:
+        shape = [count, width] if width > 1 else [count]
+        parts.append(_data(fields[name], _REAL, shape, 8 * width * count))
+    numbers = np.frombuffer(b"".join(parts), np.float64)
+    starts, ends = _bounds(count)
+    lowest = np.minimum.reduceat(numbers, starts[: len(columns)])
+    highest = np.maximum.reduceat(numbers, starts[: len(columns)])
+    good = (lowest >= _LOWEST[: len(columns)]) & (highest <= _HIGHEST[: len(columns)])  # NaN is in no range
+    for (name, width), start, end in zip(columns, starts.tolist(), ends, strict=False):
+        column = numbers[start:end]
+        fields[name] = column.reshape(count, width) if width > 1 else column
+    if not good.all():
+        _need(bool(good[:_VELOCITY].all()) and _unknown_or_good(fields["velocity"]))
+
+
+def _unknown_or_good(velocity: NDArray[np.float64]) -> bool:
+    """Whether every row is within the range, or all NaN."""
+    good = (velocity >= _RANGES[_VELOCITY].low) & (velocity <= _RANGES[_VELOCITY].high)
+    return bool((good | np.isnan(velocity).all(axis=1, keepdims=True)).all())
+
+
+@lru_cache(64)
+def _bounds(count: int) -> tuple[NDArray[np.intp], list[int]]:
+    """Return where each column begins and ends in the buffer."""
+    ends = np.cumsum([count * width for _, width in _COLUMNS])
+    return np.concatenate([[0], ends[:-1]]).astype(np.intp), ends.tolist()
+
+
+def _pose(pairs: Any) -> Pose:
+    blocks = _once(pairs)
+    _need(len(blocks) == len(_POSE))
+    arrays = {}
+    for name, length, low, high in _POSE:
+        data = _data(blocks[name], _REAL, [length], 8 * length)
+        _need(all(low <= value <= high for value in unpack(f"<{length}d", data)))
+        arrays[name] = np.frombuffer(data, np.float64)
+    unit_quaternion(arrays["quaternion"])
+    return Pose.trusted(**arrays)
+
+
+def _data(pairs: Any, dtypes: frozenset[str], shape: list[int], size: int) -> bytes:
+    """Return the bytes of a block of a type and shape."""
+    block: dict[str, Any] = dict(pairs)
+    data: bytes = block["data"]
+    if (
+        type(pairs) is tuple
+        and len(block) == len(pairs)
+        and (block.keys() == _BLOCK or (block.keys() == _PADDED and type(block["pad"]) is bytes))
+        and block["dtype"] in dtypes
+        and block["shape"] == shape
+        and [*map(type, block["shape"])] == [*map(type, shape)]  # 1.0 and true equal 1
+        and type(data) is bytes
+        and len(data) == size
+    ):
+        return data
+    raise ValueError
+
+
+# Streams send the same names over and over.
+
+
+@lru_cache(4096)
+def _stream(name: str) -> str:
+    return check_stream(name)
+
+
+@lru_cache(64)
+def _labels(labels: tuple[str, ...]) -> tuple[str, ...]:
+    _need(all(type(label) is str and 0 < len(label) <= _TEXT for label in labels) and len(labels) <= _LABELS)
+    return check_labels(labels)
+
+
+def _once(pairs: Any) -> dict[str, Any]:
+    """Return the fields of a map, each there once."""
+    fields: dict[str, Any] = dict(pairs)
+    _need(type(pairs) is tuple and len(fields) == len(pairs))
+    return fields
+
+
+def _need(fact: bool) -> None:  # noqa: FBT001 - what it is asked is a fact
+    if not fact:
+        raise ValueError
+
+
+def _refuse(code: int, _data: bytes) -> None:
+    raise ValueError(code)
