@@ -3,13 +3,16 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
+# The tests start hundreds of processes; without it each of them would compile this package's Python files again.
+unexport PYTHONDONTWRITEBYTECODE
+
 # The folder with kitti/ and nuscenes/, for `make tune` and `make ablate`.
 DATA ?= data
 KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
-.PHONY: help docs release demo test bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check lowest pythons repeat schemas wheel clean tune ablate
+.PHONY: help docs release demo test bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests-together tests-alone check lowest pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    lint, types, schemas, tests, wheel"
@@ -53,7 +56,10 @@ containers: install
 	$(BIN)/python docker/containers.py $(OPTIONAL)
 
 # The demonstration is among the tests (tests/e2e/test_demo.py); CI also runs the command, which installs less.
-test: lint types schemas tests wheel
+# Tests that wait for conditions share the machine with all that waits for nobody; tests that measure come after it.
+test: install
+	$(MAKE) --jobs 5 --output-sync=line lint types schemas wheel tests-together
+	$(MAKE) tests-alone
 
 # For figures, nothing else should run on the machine. SERVICE holds options of the service, SECONDS how long a run takes.
 load: install
@@ -69,10 +75,13 @@ types: install
 # Kernels are compiled once, before processes that would each compile them. JOBS is more than two processors: many tests
 # wait for other processes. Those that measure memory and times run after the others, one by one.
 JOBS ?= 4
-tests: install
+tests-together: install
 	$(BIN)/optipmb warm-up
 	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not alone"
+
+tests-alone: install
 	$(BIN)/pytest -m alone
+
 
 # For a developer: style, types, and the tests nearest to what changed since SINCE (a commit; files not committed count).
 SINCE ?= main
