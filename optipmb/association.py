@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from optipmb.compiled import kernel
+from optipmb.records import INDEX
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,7 +46,7 @@ def associate(hypotheses: Hypotheses, n_objects: int) -> Index:
     Returns:
         (N,) the measurement of each object, `UNASSIGNED` for the missed ones.
     """
-    assigned = np.empty(n_objects, np.int64)
+    assigned = np.empty(n_objects, INDEX)
     assign(hypotheses.row, hypotheses.measurement, hypotheses.detection_cost, hypotheses.first_cost, assigned)
     return assigned
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, Self
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.records import record
+from optipmb.records import INDEX, record
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -145,9 +145,9 @@ class Poissons(_Rows):
             np.empty((count, STATE)),  # mean
             np.empty((count, STATE, STATE)),  # covariance
             weight,
-            np.empty(count, np.int64),  # label
+            np.empty(count, INDEX),  # label
             np.empty((count, 4)),  # auxiliary
-            np.empty(count, np.int64),  # born_ns
+            np.empty(count, INDEX),  # born_ns
         )
 
 

@@ -11,7 +11,7 @@ from optipmb.calibration import calibrate_rows
 from optipmb.compiled import kernel
 from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, copy_state, whole_periods
 from optipmb.heading import doubt, sign_probability
-from optipmb.records import record
+from optipmb.records import FLAG, INDEX, record
 from optipmb.reported import follow_box
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def extract(
         table: parameters as columns.
         two_thresholds: whether OTE is on.
     """
-    rows = np.empty(len(bernoulli), np.int64)
+    rows = np.empty(len(bernoulli), INDEX)
     count = select_tracks(
         bernoulli.existence,
         bernoulli.seen_ns,
@@ -109,8 +109,8 @@ def extract(
         rows,
     )
     tracks = Tracks(
-        np.empty(count, np.int64),  # id
-        np.empty(count, np.int64),  # label
+        np.empty(count, INDEX),  # id
+        np.empty(count, INDEX),  # label
         np.empty((count, 3)),  # center
         np.empty((count, 3)),  # size
         np.empty(count),  # yaw
@@ -123,8 +123,8 @@ def extract(
         np.empty((count, STATE, STATE)),  # covariance
         np.empty(count),  # age
         np.empty(count),  # time_since_detection
-        np.empty(count, np.int64),  # detection
-        np.empty(count, np.bool_),  # confirmed
+        np.empty(count, INDEX),  # detection
+        np.empty(count, FLAG),  # confirmed
     )
     read_tracks(
         rows,
@@ -153,6 +153,9 @@ def extract(
         table.knot_along,
         table.knot_across,
         table.score_of_evidence,
+        table.confirm_from,
+        table.confirm_until,
+        bernoulli.confirmed,
         tracks.id,
         tracks.label,
         tracks.center,
@@ -168,14 +171,6 @@ def extract(
         tracks.age,
         tracks.time_since_detection,
         tracks.detection,
-    )
-    confirm(
-        rows,
-        bernoulli.label,
-        tracks.existence,
-        table.confirm_from,
-        table.confirm_until,
-        bernoulli.confirmed,
         tracks.confirmed,
     )
     return tracks
@@ -266,6 +261,9 @@ def read_tracks(
     knot_along: Array,
     knot_across: Array,
     score_of_evidence: NDArray[np.bool_],
+    confirm_from: Array,
+    confirm_until: Array,
+    confirmed: NDArray[np.bool_],
     identity_out: Index,
     label_out: Index,
     center: Array,
@@ -281,8 +279,12 @@ def read_tracks(
     age: Array,
     time_since_detection: Array,
     detection: Index,
+    confirmed_out: NDArray[np.bool_],
 ) -> None:
-    """Write the columns of `Tracks` of the objects at the front of `rows`, calibrated where there are `knots`."""
+    """Write the columns of `Tracks` of the objects at the front of `rows`, calibrated where there are `knots`.
+
+    `confirmed` is written as by `confirm`.
+    """
     state = np.empty((identity_out.shape[0], STATE))
     for k in range(identity_out.shape[0]):
         n = rows[k]
@@ -291,7 +293,7 @@ def read_tracks(
         existence_out[k], score_out[k] = existence[n], score[n]
         copy_state(mean, covariance, n, state, covariance_out, k)
         m = measurement[n]
-        if m >= 0:
+        if m >= 0 and reported_position[c] + reported_heading[c] > 0.0:
             x, y, z_phi = position[m, 0], position[m, 1], measured_yaw[m]
             follow_box(x, y, z_phi, reported_position[c], reported_heading[c], state[k], covariance_out[k])
         v, phi = state[k, V], state[k, PHI]
@@ -320,3 +322,4 @@ def read_tracks(
         score_out,
         covariance_out,
     )
+    confirm(rows, label, existence_out, confirm_from, confirm_until, confirmed, confirmed_out)

@@ -14,7 +14,7 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.gating import gate, gate_radii
-from optipmb.records import record
+from optipmb.records import INDEX, record
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -87,7 +87,7 @@ def enumerate_hypotheses(
         table: parameters as columns.
     """
     count = len(measurements)
-    first_kind, first_cost = np.empty(count, np.int64), np.empty(count)
+    first_kind, first_cost = np.empty(count, INDEX), np.empty(count)
     first_existence, association = np.empty(count), np.empty(count)
     pairs = local_hypotheses(
         bernoulli.mean,
@@ -100,24 +100,11 @@ def enumerate_hypotheses(
         poisson.label,
         poisson.weight,
         p_d_poisson,
-        gate_radii(
-            bernoulli.covariance,
-            bernoulli.label,
-            dt,
-            table.period,
-            table.gate,
-            table.gate_growth,
-            table.gate_deviations,
-        ),
-        gate_radii(
-            poisson.covariance,
-            poisson.label,
-            dt,
-            table.period,
-            table.gate,
-            table.gate_growth,
-            table.gate_deviations,
-        ),
+        dt,
+        table.period,
+        table.gate,
+        table.gate_growth,
+        table.gate_deviations,
         measurements.position,
         measurements.label,
         measurements.score,
@@ -146,8 +133,11 @@ def local_hypotheses(
     label_poisson: Index,
     weight: Array,
     p_d_poisson: Array,
-    radius: Array,
-    radius_poisson: Array,
+    dt: float,
+    period: float,
+    distance: Array,
+    growth: Array,
+    deviations: Array,
     position: Array,
     measured_label: Index,
     score: Array,
@@ -162,6 +152,8 @@ def local_hypotheses(
     association: Array,
 ) -> tuple[Index, Index, Array, Index, Index, Array]:
     """Enumerate the local hypotheses: return the columns of `Hypotheses` over pairs, write those over measurements."""
+    radius = gate_radii(covariance, label, dt, period, distance, growth, deviations)
+    radius_poisson = gate_radii(covariance_poisson, label_poisson, dt, period, distance, growth, deviations)
     row, measurement, log_likelihood = gate(mean, covariance, label, radius, position, measured_label, noise_position)
     detection_cost = detection_costs(row, measurement, log_likelihood, existence, p_d, association)
     component, announced, log_e = gate(

@@ -12,6 +12,7 @@ from optipmb.compiled import kernel
 from optipmb.density import Bernoullis
 from optipmb.heading import follow_sign
 from optipmb.prune import NEW
+from optipmb.records import FLAG, INDEX
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -55,23 +56,21 @@ def light_weight_filter(
             detection by one nominal period.
         table: parameters as columns.
     """
-    count, known = len(survivors), survivors.known
-    confirmed = np.zeros(count, np.bool_)
-    confirmed[:known] = bernoulli.confirmed[survivors.row[:known]]
+    count = len(survivors)
     posterior = Bernoullis(
         mean,
         covariance,
         survivors.existence,
-        np.empty(count, np.int64),  # label
+        np.empty(count, INDEX),  # label
         np.empty((count, 4)),  # auxiliary
-        np.empty(count, np.int64),  # id
-        np.empty(count, np.int64),  # born_ns
-        np.empty(count, np.int64),  # seen_ns
+        np.empty(count, INDEX),  # id
+        np.empty(count, INDEX),  # born_ns
+        np.empty(count, INDEX),  # seen_ns
         np.empty(count),  # score
         np.empty(count),  # evidence
         np.empty(count),  # heading_odds
-        np.empty(count, np.bool_),  # extracted
-        confirmed,
+        np.empty(count, FLAG),  # extracted
+        np.empty(count, FLAG),  # confirmed
     )
     update_light_weight(
         survivors.row,
@@ -84,6 +83,7 @@ def light_weight_filter(
         bernoulli.evidence,
         bernoulli.heading_odds,
         bernoulli.extracted,
+        bernoulli.confirmed,
         next_id,
         measurements.label,
         measurements.auxiliary,
@@ -109,6 +109,7 @@ def light_weight_filter(
         posterior.evidence,
         posterior.heading_odds,
         posterior.extracted,
+        posterior.confirmed,
     )
     return posterior
 
@@ -125,6 +126,7 @@ def update_light_weight(
     evidence: Array,
     heading_odds: Array,
     extracted: NDArray[np.bool_],
+    confirmed: NDArray[np.bool_],
     next_id: int,
     measured_label: Index,
     measured_auxiliary: Array,
@@ -150,10 +152,11 @@ def update_light_weight(
     evidence_out: Array,
     heading_odds_out: Array,
     extracted_out: NDArray[np.bool_],
+    confirmed_out: NDArray[np.bool_],
 ) -> None:
     """Write the non-motion columns of the posterior (eq. Confidence Score), and turn states whose sign has changed.
 
-    `extracted` stays as it was.
+    `extracted` and `confirmed` stay as they were.
     """
     # What the evidence keeps: over the time since the frame before, and in a first detection over one nominal period.
     periods = (stamp_ns - before_ns) * 1e-9 / period
@@ -162,7 +165,7 @@ def update_light_weight(
         n, m = row[k], measurement[k]
         if n == NEW:
             label_out[k], identity_out[k] = measured_label[m], next_id
-            born_ns_out[k], extracted_out[k] = stamp_ns, False
+            born_ns_out[k], extracted_out[k], confirmed_out[k] = stamp_ns, False, False
             evidence_out[k] = heading_odds_out[k] = 0.0
             for s in range(4):
                 auxiliary_out[k, s] = measured_auxiliary[m, s]
@@ -170,7 +173,7 @@ def update_light_weight(
         else:
             label_out[k], identity_out[k] = label[n], identity[n]
             born_ns_out[k], seen_ns_out[k], extracted_out[k] = born_ns[n], seen_ns[n], extracted[n]
-            evidence_out[k], heading_odds_out[k] = evidence[n], heading_odds[n]
+            confirmed_out[k], evidence_out[k], heading_odds_out[k] = confirmed[n], evidence[n], heading_odds[n]
             for s in range(4):
                 auxiliary_out[k, s] = auxiliary[n, s]
         c = label_out[k]
@@ -185,17 +188,20 @@ def update_light_weight(
             score_out[k] = (1.0 - math.exp(-x_len)) * z_s
             seen_ns_out[k] = stamp_ns
             latest = log_odds(z_s)
-            heading_odds_out[k] = follow_sign(
-                heading_odds_out[k],
-                sign_memory[c] if first else sign_memory_of_frame[c],
-                sign_memory[c],
-                sign_detection[c],
-                sign_motion[c],
-                sign_speed[c],
-                z_s,
-                measured_yaw[m],
-                mean[k],
-                covariance[k],
-            )
+            if sign_memory[c] == 0.0:  # the sign is not followed
+                heading_odds_out[k] = 0.0
+            else:
+                heading_odds_out[k] = follow_sign(
+                    heading_odds_out[k],
+                    sign_memory[c] if first else sign_memory_of_frame[c],
+                    sign_memory[c],
+                    sign_detection[c],
+                    sign_motion[c],
+                    sign_speed[c],
+                    z_s,
+                    measured_yaw[m],
+                    mean[k],
+                    covariance[k],
+                )
         kept = memory[c] if first else memory_of_frame[c]
         evidence_out[k] = kept * evidence_out[k] + (1.0 - kept) * latest

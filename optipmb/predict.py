@@ -9,6 +9,7 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.density import NO_FRAME, STATE, Bernoullis, Density, Poissons, whole_periods
 from optipmb.motion import predict_state
+from optipmb.records import INDEX
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -93,7 +94,7 @@ def _carry(
 ) -> tuple[Index, Array, Array, Array, int]:
     """Predict the rows within their limit: which they are, their mean, covariance and weight, and the repairs."""
     count = weight.shape[0]
-    kept, mean, covariance = np.empty(count, np.int64), np.empty((count, STATE)), np.empty((count, STATE, STATE))
+    kept, mean, covariance = np.empty(count, INDEX), np.empty((count, STATE)), np.empty((count, STATE, STATE))
     carried = np.empty(count)
     left, repaired = predict_components(
         rows.mean,

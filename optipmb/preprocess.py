@@ -16,7 +16,7 @@ from optipmb.effort import UNLIMITED
 from optipmb.errors import EffortError
 from optipmb.geometry import iou_exceeds
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
-from optipmb.records import record
+from optipmb.records import INDEX, record
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -64,7 +64,7 @@ def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[
         EffortError: more than `most` pairs of detections may overlap.
     """
     count = frame.score.shape[0]
-    chosen = np.empty(count, np.int64)
+    chosen = np.empty(count, INDEX)
     above, kept = select(
         frame.center,
         frame.size,
@@ -85,8 +85,8 @@ def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[
         np.empty((kept, 2)),  # velocity
         np.empty((kept, 4)),  # auxiliary
         np.empty(kept),  # score
-        np.empty(kept, np.int64),  # label
-        np.empty(kept, np.int64),  # source
+        np.empty(kept, INDEX),  # label
+        np.empty(kept, INDEX),  # source
     )
     gather(
         chosen,

@@ -13,7 +13,7 @@ from optipmb.association import UNASSIGNED
 from optipmb.compiled import kernel
 from optipmb.density import whole_periods
 from optipmb.hypotheses import CLUTTER
-from optipmb.records import record
+from optipmb.records import INDEX, record
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -77,7 +77,7 @@ def surviving_objects(
         table: parameters as columns.
     """
     capacity = len(bernoulli) + len(measurements)
-    row, measurement, existence = np.empty(capacity, np.int64), np.empty(capacity, np.int64), np.empty(capacity)
+    row, measurement, existence = np.empty(capacity, INDEX), np.empty(capacity, INDEX), np.empty(capacity)
     count, known, detected = select_objects(
         bernoulli.existence,
         bernoulli.seen_ns,

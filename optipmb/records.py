@@ -8,9 +8,15 @@ For the same reason a step gives the fields of the long records by position.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar, dataclass_transform
+from typing import Final, TypeVar, dataclass_transform
+
+import numpy as np
 
 T = TypeVar("T")
+
+INDEX: Final = np.dtype(np.int64)
+FLAG: Final = np.dtype(np.bool_)
+"""Types of columns. Given to `np.empty` so, an array takes three quarters of the time that it takes by `np.int64`."""
 
 
 @dataclass_transform(frozen_default=True)

@@ -14,6 +14,7 @@ from optipmb.birth import birth_states
 from optipmb.compiled import kernel
 from optipmb.density import Poissons, copy_state, whole_periods
 from optipmb.hypotheses import CLUTTER
+from optipmb.records import INDEX
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -61,7 +62,7 @@ def update_undetected(
         adaptive: whether HABM is on; off: nothing is born here.
     """
     capacity = len(poisson) + len(measurements)
-    chosen, weight = np.empty(capacity, np.int64), np.empty(capacity)
+    chosen, weight = np.empty(capacity, INDEX), np.empty(capacity)
     old, count = select_undetected(
         poisson.weight,
         p_d,

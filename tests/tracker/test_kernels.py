@@ -225,11 +225,12 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     covariance = root @ root.transpose(0, 2, 1)
     states, spreads = mean.copy(), covariance.copy()
     out = [np.empty(6, np.int64), np.empty((6, 4)), *(np.empty(6, np.int64) for _ in range(3)), np.empty(6)]
-    weighed, facing, flags = np.empty(6), np.empty(6), np.empty(6, np.bool_)
-    known = label, auxiliary, identity, born, seen, evidence, odds, extracted
+    weighed, facing, flags, shown = np.empty(6), np.empty(6), np.empty(6, np.bool_), np.empty(6, np.bool_)
+    confirmed = rng.random(6) < 0.5
+    known = label, auxiliary, identity, born, seen, evidence, odds, extracted, confirmed
     times = NOW, NOW - 150_000_000, PERIOD, memory, missed
     given = (row, measurement, *known, 77, measured, boxes, score, yaw, *times, *sign.T.copy(), states, spreads)
-    update_light_weight(*given, *out, weighed, facing, flags)
+    update_light_weight(*given, *out, weighed, facing, flags, shown)
     old, new = row >= 0, row == NEW
     m, hit = measurement, measurement >= 0
     np.testing.assert_array_equal(out[0], [*label[row[old]], *measured[m[new]]])
@@ -243,6 +244,7 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     confidence = (1 - np.exp(-(1 + (NOW - birth) * 1e-9 / PERIOD))) * score[m]
     np.testing.assert_allclose(out[5], np.where(hit, confidence, 0.0), rtol=1e-15)
     np.testing.assert_array_equal(flags, [*extracted[row[old]], False, False])
+    np.testing.assert_array_equal(shown, [*confirmed[row[old]], False, False])
     with np.errstate(divide="ignore"):
         latest = np.where(hit, np.clip(np.log(score[m] / (1 - score[m])), -SURE, SURE), -missed[out[0]])
     kept = memory[out[0]] ** np.where(birth == NOW, 1.0, 1.5)
@@ -280,6 +282,7 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
     """Every column of the tracks, in the units that they promise, and calibrated where there is a calibration."""
     rng = np.random.default_rng(0)
     mean, auxiliary, born, seen = rng.normal(0, 3, (9, 6)), rng.uniform(1, 5, (9, 4)), stamps(rng, 9), stamps(rng, 9)
+    mean[:, 3] = [textbook.wrap(angle) for angle in mean[:, 3]]
     rows, measurement, source = np.array([1, 4, 8]), np.arange(9) % 3 - 1, np.array([50, 60])
     position, yaw = rng.normal(0, 3, (2, 2)), rng.uniform(-3, 3, 2)
     less = SimpleNamespace(position=0.1, heading=0.2)
@@ -298,7 +301,14 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
     curves = bends, rng.uniform(0, 1, (4, 3)), rng.uniform(0, 1, (4, 3)), rng.uniform(0, 1, (4, 3)), np.full(4, True)
     knots = np.full(4, 3 if calibrated else 0)
     given = *known, measurement, source, position, yaw, NOW, *left, followed, knots, *curves
-    read_tracks(rows, *given, ids, labels, *out[:7], *told, *out[7:], detection)
+    high, low = np.array([0.6, 0.7, 0.8, 0.9]), np.array([0.1, 0.2, 0.3, 0.4])
+    before, now = np.arange(9) % 2 == 0, np.empty(3, np.bool_)
+    after = before.copy()
+    read_tracks(rows, *given, high, low, after, ids, labels, *out[:7], *told, *out[7:], detection, now)
+    wanted_now = told[0] >= np.where(before[rows], low[label[rows]], high[label[rows]])
+    np.testing.assert_array_equal(now, wanted_now)
+    np.testing.assert_array_equal(after, np.where(np.isin(np.arange(9), rows), after, before))
+    np.testing.assert_array_equal(after[rows], wanted_now)
     x, spread = np.empty((3, 6)), np.empty((3, 6, 6))
     for k, n in enumerate(rows):
         m = measurement[n]

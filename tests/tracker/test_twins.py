@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from optipmb.calibration import SURE, calibrate_rows, log_odds
 from optipmb.errors import FrameError
 from optipmb.frame import MAX_COORDINATE, MAX_SPEED, _refuse, allowed
-from optipmb.gating import gate
+from optipmb.gating import gate, gate_radii
 from optipmb.hypotheses import detection_costs, first_detections, local_hypotheses
 from optipmb.preprocess import gather
 from optipmb.warm import kernels
@@ -213,8 +213,10 @@ def test_hypotheses_are_those_of_their_parts(seed: int) -> None:
     firsts = np.empty(15, np.int64), np.empty(15), np.empty(15)
     told = np.empty(15)
     table = noise, clutter, birth, threshold, np.array([True, False])
-    radius = distance[label]
-    found = local_hypotheses(*given, radius[old], radius[new], position, measured, score, *table, *firsts, told)
+    growth, deviations = np.array([0.5, 0.0]), np.array([0.0, 3.0])
+    gates = 0.15, 0.1, distance, growth, deviations
+    radius = gate_radii(covariance, label, *gates)
+    found = local_hypotheses(*given, *gates, position, measured, score, *table, *firsts, told)
     row, measurement, likelihood = gate(*objects, radius[old], position, measured, noise)
     association, kind, first_cost, existence = np.empty(15), np.empty(15, np.int64), np.empty(15), np.empty(15)
     cost = detection_costs(row, measurement, likelihood, weight[old], p_d[old], association)
