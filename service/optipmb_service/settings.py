@@ -350,6 +350,13 @@ class Settings(BaseSettings):
     grpc_calls: int = Field(
         default=1000, ge=1, le=100_000, description="calls over gRPC that may be open at once; further ones are refused"
     )
+    grpc_connections: int = Field(
+        default=10_000,
+        ge=1,
+        le=1_000_000,
+        description="connections over gRPC that may be open at once, fewer where the process may not open so many"
+        " files; further ones are closed",
+    )
     log_format: Literal["console", "json"] = Field(default="console", description="form of the log lines on stderr")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="least level that is logged"

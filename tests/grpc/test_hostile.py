@@ -22,6 +22,25 @@ if TYPE_CHECKING:
 CONNECTIONS = 2_000
 """Idle connections of the test; each end of one takes a file."""
 
+CONNECTION_BYTES = 64 * 2**10
+"""Memory that the gateway may take for each of them; it is about 17 KB."""
+
+PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])
+"""How a client of HTTP/2 begins: with this the handshake is over, and the connection is idle."""
+
+
+ALLOWED = 4
+"""Connections of the gateway that allows few."""
+
+
+@pytest.fixture(scope="module")
+def bounded(service: ServiceProcess) -> Iterator[GatewayProcess]:
+    """A gateway that allows few calls and connections."""
+    environment = {"OPTIPMB_GRPC_CALLS": "2", "OPTIPMB_GRPC_CONNECTIONS": str(ALLOWED)}
+    with GatewayProcess(service.endpoint, environment=environment) as process:
+        process.wait_ready()
+        yield process
+
 
 def resident(pid: int) -> int:
     """Bytes of memory of a process."""
@@ -37,6 +56,14 @@ def served(gateway: GatewayProcess, stream: str) -> None:
     """Frames are tracked."""
     responses = list(gateway.stub().Track((detections(frame(seq, stream)) for seq in range(5)), timeout=30))
     assert [one.tracks.seq for one in responses] == list(range(5))
+
+
+def connected(gateway: GatewayProcess) -> socket.socket:
+    """A connection without calls."""
+    host, _, port = gateway.address.rpartition(":")
+    one = socket.create_connection((host, int(port)), timeout=10)
+    one.sendall(PREFACE)
+    return one
 
 
 def test_a_message_of_100_mb_is_refused(gateway: GatewayProcess, stream: str) -> None:
@@ -66,19 +93,23 @@ def test_many_small_claims_take_little_memory(gateway: GatewayProcess, stream: s
 
 
 def test_idle_connections(gateway: GatewayProcess, stream: str) -> None:
-    """Thousands of connections that say nothing keep nobody from being served, and their files come back."""
-    host, _, port = gateway.address.rpartition(":")
-    before = files(gateway.process.pid)
+    """Thousands of connections without calls keep nobody from being served and take little; their files come back."""
+    pid = gateway.process.pid
+    served(gateway, stream)
+    before, memory = files(pid), resident(pid)
     idle: list[socket.socket] = []
     try:
-        idle.extend(socket.create_connection((host, int(port)), timeout=10) for _ in range(CONNECTIONS))
+        idle.extend(connected(gateway) for _ in range(CONNECTIONS))
+        for one in idle:
+            assert one.recv(1), "a connection was closed"
         served(gateway, stream)
+        assert resident(pid) - memory < CONNECTIONS * CONNECTION_BYTES
     finally:
         for one in idle:
             one.close()
     ends = time.monotonic() + 60
-    while files(gateway.process.pid) > before + 20:
-        assert time.monotonic() < ends, f"{files(gateway.process.pid) - before} files are left"
+    while files(pid) > before + 20:
+        assert time.monotonic() < ends, f"{files(pid) - before} files are left"
         time.sleep(0.1)
     served(gateway, stream)
 
@@ -107,17 +138,50 @@ def test_garbage_is_no_http(gateway: GatewayProcess, stream: str) -> None:
     served(gateway, stream)
 
 
-def test_more_calls_than_allowed(service: ServiceProcess, stream: str) -> None:
+def test_more_calls_than_allowed(bounded: GatewayProcess, stream: str) -> None:
     """The call beyond the bound is RESOURCE_EXHAUSTED at once; when one ends there is room again."""
-    with GatewayProcess(service.endpoint, environment={"OPTIPMB_GRPC_CALLS": "2"}) as gateway:
-        gateway.wait_ready()
-        calls = [gateway.stub().Subscribe(pb.SubscribeRequest(pattern=stream)) for _ in range(2)]
-        for call in calls:
-            call.initial_metadata()
-        third = gateway.stub()
+    stub = bounded.stub()
+    calls = [stub.Subscribe(pb.SubscribeRequest(pattern=stream)) for _ in range(2)]
+    for call in calls:
+        call.initial_metadata()
+    with pytest.raises(grpc.RpcError) as raised:
+        stub.GetState(pb.GetStateRequest(stream=stream))
+    assert raised.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+    for call in calls:
+        call.cancel()
+    wait_served(stub, stream)
+
+
+def test_more_connections_than_allowed(bounded: GatewayProcess, stream: str) -> None:
+    """The connection beyond the bound is closed and its call UNAVAILABLE; when one ends there is room again."""
+    idle: list[socket.socket] = []
+    try:
+        while len(idle) < 2 * ALLOWED:
+            idle.append(connected(bounded))
+            if not idle[-1].recv(1):
+                break
+        assert len(idle) <= ALLOWED + 1
+        stub = bounded.stub([("grpc.use_local_subchannel_pool", 1)])
         with pytest.raises(grpc.RpcError) as raised:
-            third.GetState(pb.GetStateRequest(stream=stream))
-        assert raised.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+            stub.GetState(pb.GetStateRequest(stream=stream), timeout=30)
+        assert raised.value.code() == grpc.StatusCode.UNAVAILABLE
+    finally:
+        for one in idle:
+            one.close()
+    wait_served(stub, stream)
+
+
+def wait_served(stub: Any, stream: str) -> None:
+    """Wait until a question is answered."""
+    ends = time.monotonic() + 60
+    while True:
+        try:
+            stub.GetState(pb.GetStateRequest(stream=stream), timeout=30)
+        except grpc.RpcError:
+            assert time.monotonic() < ends
+            time.sleep(0.1)
+        else:
+            return
 
 
 def test_the_end_of_a_gateway_finishes_what_is_under_way(service: ServiceProcess, stream: str) -> None:

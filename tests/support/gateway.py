@@ -14,7 +14,7 @@ from routers import free_endpoint
 from service_process import ServiceProcess
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
 EPOCH = bytes(range(16))
 STREAM = "garage/robot-1/lidar"
@@ -36,9 +36,9 @@ class GatewayProcess(ServiceProcess):
             "grpc", "--connect", router, "--grpc", self.address, *options, environment=environment, listen=False
         )  # fmt: skip
 
-    def stub(self) -> Any:
+    def stub(self, options: Sequence[tuple[str, int]] = ()) -> Any:
         """The generated stub on a channel of its own."""
-        return rpc.TrackingServiceStub(grpc.insecure_channel(self.address))
+        return rpc.TrackingServiceStub(grpc.insecure_channel(self.address, options=options))
 
 
 def frame(seq: int, stream: str = STREAM, epoch: bytes = EPOCH, **changes: Any) -> Detections:

@@ -73,7 +73,7 @@ class Call:
         self._ended = asyncio.Event()
         self.left_out = 0
         self._context = context
-        self._reading: asyncio.Future[Any] | None = None
+        self._reading: asyncio.Task[Any] | None = None
         self._outbox: Outbox | None = None
         self._name = name
         self._metrics = metrics
@@ -102,11 +102,11 @@ class Call:
         """Return the next request; None when the caller has sent all, or the gateway ends."""
         if self._ended.is_set():
             return None
-        self._reading = asyncio.ensure_future(self._context.read())
+        self._reading = task = asyncio.current_task()
         try:
-            request = await self._reading
+            request = await self._context.read()
         except asyncio.CancelledError:
-            if not self._ended.is_set():
+            if not self._ended.is_set() or task is None or task.uncancel():
                 raise
             return None
         finally:

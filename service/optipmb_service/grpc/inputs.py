@@ -37,6 +37,9 @@ WINDOW: Final = 64
 RESPONSES: Final = 256
 """Responses that may wait for a caller: more than the window, so that none are left out but for others' frames."""
 
+ACKNOWLEDGE_S: Final = 0.2
+"""Shortest time between two acknowledgements: one for every frame would cost about as much as its tracks."""
+
 WANTED_S: Final = 1.0
 """How long the first cloud waits for it to be known whether anybody takes clouds."""
 
@@ -280,7 +283,7 @@ async def publish(call: Call) -> None:
 async def _acknowledging(
     outbox: Outbox, outgoing: Outgoing, changed: asyncio.Event
 ) -> AsyncIterator[pb.Acknowledgement]:
-    """Acknowledge at once and whenever something has changed; the newest one stands for those before it."""
+    """Acknowledge at once, and soon when something has changed; the newest one stands for those before it."""
     progress = pb.Acknowledgement()
     _acknowledge(outbox, outgoing, progress)
 
@@ -289,6 +292,7 @@ async def _acknowledging(
             await changed.wait()
             changed.clear()
             _acknowledge(outbox, outgoing, progress)
+            await asyncio.sleep(ACKNOWLEDGE_S)
 
     task = asyncio.create_task(follow())
     try:

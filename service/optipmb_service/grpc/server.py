@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import resource
 import time
 from typing import TYPE_CHECKING, Any, Final
 
@@ -51,6 +52,9 @@ GRACE_S: Final = 1.0
 LINK_S: Final = 0.5
 """How often the gateway looks whether it has a router."""
 
+OTHER_FILES: Final = 256
+"""Files of a process beside the connections of gRPC: its own, and a service's with its links and its store."""
+
 HEADROOM: Final = 64 * 2**10
 """Bytes of a request beyond its payload."""
 
@@ -98,6 +102,7 @@ class Server:
             *OPTIONS,
             ("grpc.max_receive_message_length", most),
             ("grpc.max_send_message_length", -1),
+            ("grpc.max_allowed_incoming_connections", _connections(settings.grpc_connections)),
             ("grpc.max_concurrent_streams", settings.grpc_calls + 1),  # one more is refused, and does not wait
         )
         self._server = grpc.aio.server(options=options)
@@ -219,3 +224,16 @@ class Server:
     def _invalid(self, reason: str) -> None:
         self.metrics.invalid += 1
         log.warning("grpc_invalid", reason=reason)
+
+
+def _connections(wanted: int) -> int:
+    """Return how many connections there may be: each takes a file, and the process asks for as many as that takes."""
+    files, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = wanted + OTHER_FILES
+    if files == resource.RLIM_INFINITY or files >= needed:
+        return wanted
+    files = needed if most == resource.RLIM_INFINITY else min(needed, most)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (files, most))
+    if files < needed:
+        log.warning("grpc_connections", allowed=files - OTHER_FILES, wanted=wanted, files=files)
+    return max(1, files - OTHER_FILES)

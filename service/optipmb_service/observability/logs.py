@@ -23,6 +23,7 @@ EVENTS: Final = {
     "ready": "Streams and queries are served. stdout has the ready line.",
     "grpc": "gRPC is served at `address`.",
     "grpc_call": "A call over gRPC has ended (level debug).",
+    "grpc_connections": "Fewer connections over gRPC are allowed than the setting says, for want of files.",
     "grpc_invalid": "A message of the network was not valid and was not sent on to callers.",
     "grpc_certificates": "Renewed certificates of gRPC cannot be read; those before them go on.",
     "unknown_environment": "Variables that start with `OPTIPMB_` and are no setting: usually a typing error.",
