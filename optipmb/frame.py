@@ -225,8 +225,28 @@ def make_frame(
     if source.shape[0] < m:
         center, size, yaw, velocity = center[source], size[source], yaw[source], velocity[source]
         score, known = score[source], known[source]
-    frame = Frame(int(stamp_ns), center, size, yaw, velocity, score, known, source, parameters.labels, cloud)
-    return frame, m - source.shape[0]
+    columns = center, size, yaw, velocity, score, known, source
+    if pose is not None and not allowed(known, len(parameters.labels), center, size, yaw, score, velocity):
+        # What is too far only in the world: the constructor names it.
+        return Frame(int(stamp_ns), *columns, parameters.labels, cloud), m - source.shape[0]
+    return _checked(int(stamp_ns), columns, parameters.labels, cloud), m - source.shape[0]
+
+
+def _checked(
+    stamp_ns: int, columns: tuple[NDArray[Any], ...], labels: tuple[str, ...], cloud: PointCloud | None
+) -> Frame:
+    """Return the frame of arrays that nobody else has and that were checked, from `center` to `source`."""
+    frame = object.__new__(Frame)
+    values = frame.__dict__
+    values["stamp_ns"] = stamp_ns
+    for name, column in zip(_ARRAYS, columns, strict=True):
+        values[name] = _sealed(np.ascontiguousarray(column))
+    values["labels"] = labels
+    values["cloud"] = cloud
+    return frame
+
+
+_ARRAYS: Final = ("center", "size", "yaw", "velocity", "score", "label", "source")
 
 
 @kernel

@@ -66,16 +66,21 @@ class Message(BaseModel):
             if array is not None and array.flags.writeable:
                 fields[name] = array = array.view()
                 array.flags.writeable = False
-        # What pydantic's `model_construct` does, without looking at every field of the description.
+        return cls._of(cls.optional | fields, set(fields))
+
+    def with_trusted(self, /, **fields: Any) -> Self:
+        """Return the message with other values in some fields, which are known to be valid."""
+        return self._of(self.__dict__ | fields, self.model_fields_set | fields.keys())
+
+    @classmethod
+    def _of(cls, values: dict[str, Any], given: set[str]) -> Self:
+        """Do what pydantic's `model_construct` does, without looking at every field of the description."""
         message = cls.__new__(cls)
-        values = cls.optional | fields if cls.optional else fields
-        for name, value in (
-            ("__dict__", values),
-            ("__pydantic_fields_set__", set(fields)),
-            ("__pydantic_extra__", None),
-            ("__pydantic_private__", None),
-        ):
-            object.__setattr__(message, name, value)
+        set_attribute = object.__setattr__
+        set_attribute(message, "__dict__", values)
+        set_attribute(message, "__pydantic_fields_set__", given)
+        set_attribute(message, "__pydantic_extra__", None)
+        set_attribute(message, "__pydantic_private__", None)
         return message
 
     @model_validator(mode="after")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     import optipmb
     from optipmb_service.session.state import FilterState
-    from optipmb_service.session.timeline import Timeline
+    from optipmb_service.session.timeline import Decision, Timeline
     from optipmb_service.session.values import Policy
 
     Order = tuple[int, int, int]
@@ -45,6 +45,7 @@ class Held:
         ignored: objects left out of it.
         deadline_ns: until when it waits for its cloud (monotonic); None: it does not.
         ticket: what the caller gave with it.
+        judged: the timeline that it was judged by, and the decision and the timeline that came of it.
     """
 
     message: schemas.Detections
@@ -54,6 +55,7 @@ class Held:
     ignored: int
     deadline_ns: int | None
     ticket: Any
+    judged: tuple[Timeline, Decision, Timeline]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,14 +91,14 @@ class PendingFrames:
     def add(
         self,
         message: schemas.Detections,
-        order: Order,
+        frame_id: FrameId,
         frame: optipmb.Frame,
         ignored: int,
         arrived_ns: int,
         ticket: Any,
+        judged: tuple[Timeline, Decision, Timeline],
     ) -> None:
         """Put a frame where it belongs; the arguments are those of `Held`, and when it arrived (monotonic)."""
-        frame_id = FrameId(message.epoch, message.seq, message.stamp_ns)
         deadline_ns = hold_until(
             has_points=message.has_points,
             stamp_ns=frame_id.stamp_ns,
@@ -106,9 +108,9 @@ class PendingFrames:
             cloud_memory_ns=self.policy.cloud_memory_ns,
         )
         self.held_bytes += size_of(message, None)
-        insort(
-            self._held, Held(message, frame_id, order, frame, ignored, deadline_ns, ticket), key=lambda one: one.order
-        )
+        order = judged[1].place.order(frame_id)
+        held = Held(message, frame_id, order, frame, ignored, deadline_ns, ticket, judged)
+        insort(self._held, held, key=lambda one: one.order)
 
     def follow(self, past: Timeline, base: FilterState, gone: frozenset[FrameId]) -> None:
         """Take over where the past is now.

@@ -102,7 +102,8 @@ class Session:
                 self._reporting.deliveries.refused += 1
                 return [self._reporting.complain.quarantined(frame_id, self._quarantine)]
             outputs += self.reset("quarantine")
-        decision, arrived = self._pending.timeline.judge(frame_id)
+        judged_by = self._pending.timeline
+        decision, arrived = judged_by.judge(frame_id)
         if not decision.verdict.admitted:
             return [*outputs, *self._reporting.refused(frame_id, decision)]
         try:
@@ -114,7 +115,8 @@ class Session:
             return [*outputs, self._reporting.complain.invalid(frame_id, error)]
         self._pending.timeline = arrived
         since_ns = now_ns if arrived_ns is None else arrived_ns
-        self._pending.add(message, decision.place.order(frame_id), frame, ignored, since_ns, ticket)
+        judged = judged_by, decision, arrived
+        self._pending.add(message, frame_id, frame, ignored, since_ns, ticket, judged)
         return [*outputs, *self._advance(now_ns)]
 
     def on_points(self, message: schemas.Points, now_ns: int, *, ticket: Any = None) -> list[Output]:
@@ -349,7 +351,9 @@ class Session:
     def _process(self, ready: Ready) -> list[Output]:
         """Put a frame in its place."""
         began_ns, frame_id = self._clock(), ready.held.frame_id
-        decision, timeline = self._processed.timeline.judge(frame_id)
+        judged_by, decision, timeline = ready.held.judged
+        if judged_by is not self._processed.timeline:  # others were held when it came
+            decision, timeline = self._processed.timeline.judge(frame_id)
         if not decision.verdict.admitted:
             return self._reporting.refused(frame_id, decision)
         placed = self._processed.placed(ready, decision, timeline)
