@@ -106,6 +106,12 @@ def test_workers_share_the_streams(service: ServiceProcess) -> None:
         shares = workers_of(status)
         assert {stream: shares[stream] for stream in STREAMS} == {stream: worker_of(stream, 2) for stream in STREAMS}
         assert node.alive(KEYS.all_alive()) == [KEYS.alive("pair")]
+        lines = node.query(KEYS.metrics("pair"))[0][2].decode().splitlines()
+    for worker in "01":
+        mine = FRAMES * sum(str(share) == worker for stream, share in shares.items() if stream in STREAMS)
+        assert f'optipmb_received_total{{topic="detections",worker="{worker}"}} {mine:.1f}' in lines
+        assert f'optipmb_latency_seconds_bucket{{le="+Inf",worker="{worker}"}} {mine:.1f}' in lines
+    assert lines.count("# TYPE optipmb_latency_seconds histogram") == 1
 
 
 def test_a_killed_worker_comes_back(service: ServiceProcess) -> None:

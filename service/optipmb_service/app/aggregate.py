@@ -9,25 +9,22 @@ from __future__ import annotations
 import asyncio
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 import optipmb_schemas as schemas
 import structlog
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
-from prometheus_client.parser import text_string_to_metric_families
-from prometheus_client.samples import Sample
+from prometheus_client.metrics_core import Metric
 
 from optipmb_service import __version__
 from optipmb_service.observability import collectors
 from optipmb_service.observability.health import STUCK_S
-from optipmb_service.observability.metrics import ReadOnDemand
+from optipmb_service.observability.metrics import Collected, ReadOnDemand, families
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.problems import problem_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from prometheus_client.metrics_core import Metric
 
     from optipmb_service.observability.metrics import Value
     from optipmb_service.runtime.ports import Request
@@ -175,7 +172,7 @@ class AggregateView:
     def text(self) -> bytes:
         """Return the metrics of all processes in Prometheus' text format; those of a worker have its label."""
         registry = CollectorRegistry()
-        registry.register(_Merged(self._families))
+        registry.register(Collected(self._families))
         return generate_latest(registry)
 
     # Queries
@@ -231,18 +228,21 @@ class AggregateView:
     def _families(self) -> Iterator[Metric]:
         merged: dict[str, Metric] = {}
         own = ReadOnDemand(lambda: collectors.of_process(self._instance, self.state())).collect()
-        texts: list[tuple[str, Any]] = [("", [*own, *self._registry.collect()])]
-        for index, text in enumerate(self._ask(self._keys.metrics)):
-            if text is not None:
-                texts.append((str(index), text_string_to_metric_families(text.decode())))
-        for worker, families in texts:
-            for family in families:
-                into = merged.setdefault(family.name, family)
-                samples = [
-                    Sample(sample.name, {**sample.labels, "worker": worker} if worker else sample.labels, *sample[2:])
-                    for sample in family.samples
+        parts = [("", [*own, *self._registry.collect()])]
+        for index, samples in enumerate(self._ask(self._keys.samples)):
+            if samples is None:
+                continue
+            try:
+                parts.append((str(index), families(samples)))
+            except ValueError as error:
+                log.warning("metrics_unreadable", worker=index, error=str(error))
+        for worker, metrics in parts:
+            for metric in metrics:
+                into = merged.setdefault(metric.name, Metric(metric.name, metric.documentation, metric.type))
+                into.samples += [
+                    sample._replace(labels={**sample.labels, "worker": worker}) if worker else sample
+                    for sample in metric.samples
                 ]
-                into.samples = samples if into is family else [*into.samples, *samples]
         yield from merged.values()
 
     def _problem(self, error: schemas.MessageError) -> schemas.Problem:
@@ -255,14 +255,3 @@ class AggregateView:
             received=error.received,
             message=f"Query: {error.path or 'payload'}: expected {error.expected}, received {error.received}.",
         )
-
-
-class _Merged:
-    def __init__(self, families: Callable[[], Iterator[Metric]]) -> None:
-        self._families = families
-
-    def collect(self) -> Iterator[Metric]:
-        return self._families()
-
-    def describe(self) -> list[Metric]:
-        return []

@@ -109,7 +109,7 @@ class Service:
             share=share,
         )
         self._metrics.add(self._figures)
-        self._queries = Queries(self._registry, self.status, self._metrics.text)
+        self._queries = Queries(self._registry, self.status, self._metrics.text, self._metrics.samples)
 
     def start(self, *, announce: bool = True) -> None:
         """Receive, answer, and say so."""

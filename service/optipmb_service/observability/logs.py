@@ -64,6 +64,7 @@ EVENTS: Final = {
     " started again after `again_s`, and its streams come back; until then the state is `degraded`.",
     "worker_stuck": "A worker has given no sign of life for `silent_s`; it is killed and started again.",
     "worker_killed": "A worker process did not end, or answer, in time.",
+    "metrics_unreadable": "The metrics of a worker cannot be read; those of the others are shown.",
     "parent_gone": "A worker noticed that its parent has died, and ends.",
     "stream_moved": "An operator gave the stream to another worker.",
     "stop_asked": "SIGINT or SIGTERM came, or the parent ends its worker; it ends within two seconds.",

@@ -1,24 +1,27 @@
 """What a process of the service measures, in the form that Prometheus reads.
 
-`METRICS` is the whole list: name, kind, labels, meaning. Histograms and a few counters are fed as things happen; the
-rest is read from the streams when somebody asks (`figures`). Everything stands in a registry of its own, nothing is
-global. All histograms and counters are totals of the process; series with the name of a stream start with
-`optipmb_stream_`, and only so many streams have them.
+`METRICS` is the whole list: name, kind, labels, meaning. Durations and a few counts are noted as things happen, as
+plain numbers with one writer each; they become metrics, and the rest is read from the streams, when somebody asks.
+Everything stands in a registry of its own, nothing is global. All histograms and counters are totals of the process;
+series with the name of a stream start with `optipmb_stream_`, and only so many streams have them.
 """
 
 from __future__ import annotations
 
+import json
+from bisect import bisect_left
 from collections import defaultdict
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import TYPE_CHECKING, Final, Literal
 
-from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+from prometheus_client.metrics_core import METRIC_TYPES, Metric
+from prometheus_client.samples import Sample
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
-
-    from prometheus_client.metrics_core import Metric
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -111,43 +114,64 @@ Value = tuple[str, tuple[str, ...], float]
 """One figure: name in `METRICS`, values of its labels, value."""
 
 
+class Durations:
+    """A histogram with one writer: how many durations lie below each of `SECONDS`, and their sum."""
+
+    def __init__(self) -> None:
+        self._counts = [0] * (len(SECONDS) + 1)
+        self._sum_s = 0.0
+
+    def observe(self, seconds: float) -> None:
+        """Count a duration."""
+        self._counts[bisect_left(SECONDS, seconds)] += 1
+        self._sum_s += seconds
+
+    def family(self, name: str) -> Metric:
+        """Return the metric of the list with what was counted so far; may be called by any thread."""
+        counts = accumulate(self._counts)
+        buckets = list(zip((*map(str, SECONDS), "+Inf"), counts, strict=True))
+        return HistogramMetricFamily(NAMESPACE + name, METRICS[name].meaning, buckets, self._sum_s)
+
+
 class Metrics:
-    """The figures of one process; written and read by any thread."""
+    """The figures of one process, read by any thread.
+
+    Messages of a topic are counted by the reader of the topic, all else by the thread that tracks.
+    """
 
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
-        self._histograms = {
-            name: Histogram(NAMESPACE + name, metric.meaning, buckets=SECONDS, registry=self._registry)
-            for name, metric in METRICS.items()
-            if metric.kind == "histogram"
-        }
-        self._received = self._counter("received_total")
-        self._bytes = self._counter("received_bytes_total")
-        self._started = self._counter("tracks_started_total")
-        self._ended = self._counter("tracks_ended_total")
-        self._restored = self._counter("sessions_restored_total")
+        self._durations = {name: Durations() for name, metric in METRICS.items() if metric.kind == "histogram"}
+        self._latency, self._queue, self._decode, self._step = (
+            self._durations[f"{name}_seconds"] for name in ("latency", "queue", "decode", "step")
+        )
+        self._messages = {"detections": 0, "points": 0}
+        self._bytes = {"detections": 0, "points": 0}
+        self._started = self._ended = self._restored = 0
+        self._registry.register(Collected(lambda: [one.family(name) for name, one in self._durations.items()]))
+        self.add(self._counted)
         ProcessCollector(registry=self._registry)
 
-    def received(self, topic: str, size: int) -> None:
+    def received(self, topic: Literal["detections", "points"], size: int) -> None:
         """Count a message that arrived."""
-        self._received.labels(topic).inc()
-        self._bytes.labels(topic).inc(size)
+        self._messages[topic] += 1
+        self._bytes[topic] += size
 
     def published(self, *, latency_s: float, queue_s: float, decode_s: float, step_s: float) -> None:
         """Count a frame whose tracks went out."""
-        self._histograms["latency_seconds"].observe(latency_s)
-        self._histograms["queue_seconds"].observe(queue_s)
-        self._histograms["decode_seconds"].observe(decode_s)
-        self._histograms["step_seconds"].observe(step_s)
+        self._latency.observe(latency_s)
+        self._queue.observe(queue_s)
+        self._decode.observe(decode_s)
+        self._step.observe(step_s)
 
     def tracks(self, *, started: int, ended: int) -> None:
         """Count ids that came and went."""
-        self._started.inc(started)
-        self._ended.inc(ended)
+        self._started += started
+        self._ended += ended
 
     def restored(self) -> None:
         """Count a session that went on from its checkpoint."""
-        self._restored.inc()
+        self._restored += 1
 
     def add(self, figures: Callable[[], Iterable[Value]]) -> None:
         """Have figures read whenever somebody asks."""
@@ -157,30 +181,76 @@ class Metrics:
         """Return all figures in Prometheus' text format."""
         return generate_latest(self._registry)
 
-    def _counter(self, name: str) -> Counter:
-        metric = METRICS[name]
-        return Counter(NAMESPACE + name, metric.meaning, metric.labels, registry=self._registry)
+    def samples(self) -> bytes:
+        """Return all figures as `families` reads them."""
+        return json.dumps(
+            [
+                [
+                    one.name,
+                    one.documentation,
+                    one.type,
+                    [[sample.name, sample.labels, sample.value] for sample in one.samples],
+                ]
+                for one in self._registry.collect()
+            ]
+        ).encode()
+
+    def _counted(self) -> Iterator[Value]:
+        for topic, count in self._messages.items():
+            yield "received_total", (topic,), count
+            yield "received_bytes_total", (topic,), self._bytes[topic]
+        yield "tracks_started_total", (), self._started
+        yield "tracks_ended_total", (), self._ended
+        yield "sessions_restored_total", (), self._restored
 
 
-class ReadOnDemand:
-    """Asks for figures at every collection."""
+def families(data: bytes) -> list[Metric]:
+    """Return the metrics that `Metrics.samples` of another process gave.
 
-    def __init__(self, figures: Callable[[], Iterable[Value]]) -> None:
-        self._figures = figures
+    Raises:
+        ValueError: they are none.
+    """
+    made = []
+    try:
+        for name, meaning, kind, samples in json.loads(data):
+            if kind not in METRIC_TYPES:
+                raise ValueError(kind)
+            one = Metric(str(name), str(meaning), kind)
+            for sample, labels, value in samples:
+                one.samples.append(Sample(str(sample), {str(key): str(labels[key]) for key in labels}, float(value)))
+            made.append(one)
+    except (TypeError, LookupError, AttributeError, RecursionError) as error:
+        raise ValueError(str(error)) from error
+    return made
 
-    def collect(self) -> Iterator[Metric]:
-        """Read the figures now."""
-        grouped: defaultdict[str, list[tuple[tuple[str, ...], float]]] = defaultdict(list)
-        for name, labels, value in self._figures():
-            grouped[name].append((labels, value))
-        for name, values in grouped.items():
-            metric = METRICS[name]
-            kind = CounterMetricFamily if metric.kind == "counter" else GaugeMetricFamily
-            family = kind(NAMESPACE + name, metric.meaning, labels=metric.labels)
-            for labels, value in values:
-                family.add_metric(labels, value)
-            yield family
+
+class Collected:
+    """Metrics that a function makes at every collection."""
+
+    def __init__(self, collect: Callable[[], Iterable[Metric]]) -> None:
+        self.collect = collect
 
     def describe(self) -> list[Metric]:
         """Return nothing: the names are checked by a test, not at every start."""
         return []
+
+
+class ReadOnDemand(Collected):
+    """Asks for figures at every collection."""
+
+    def __init__(self, figures: Callable[[], Iterable[Value]]) -> None:
+        super().__init__(lambda: _families_of(figures()))
+
+
+def _families_of(figures: Iterable[Value]) -> Iterator[Metric]:
+    """Yield the metrics of figures."""
+    grouped: defaultdict[str, list[tuple[tuple[str, ...], float]]] = defaultdict(list)
+    for name, labels, value in figures:
+        grouped[name].append((labels, value))
+    for name, values in grouped.items():
+        metric = METRICS[name]
+        kind = CounterMetricFamily if metric.kind == "counter" else GaugeMetricFamily
+        family = kind(NAMESPACE + name, metric.meaning, labels=metric.labels)
+        for labels, value in values:
+            family.add_metric(labels, value)
+        yield family

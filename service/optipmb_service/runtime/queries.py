@@ -35,6 +35,9 @@ log = structlog.get_logger("optipmb_service")
 TEXT = "text/plain;version=0.0.4"
 """Zenoh encoding of the metrics."""
 
+JSON = "application/json"
+"""Zenoh encoding of the metrics as data."""
+
 NO_SESSION = "0" * 32
 """Session id in the state of a stream that has none."""
 
@@ -48,14 +51,20 @@ class Queries:
         registry: the streams.
         status: makes the status of the service.
         metrics: makes its metrics, in Prometheus' text format.
+        samples: makes its metrics as data for the parent of this process.
     """
 
     def __init__(
-        self, registry: Registry, status: Callable[[], schemas.ServiceStatus], metrics: Callable[[], bytes]
+        self,
+        registry: Registry,
+        status: Callable[[], schemas.ServiceStatus],
+        metrics: Callable[[], bytes],
+        samples: Callable[[], bytes],
     ) -> None:
         self._registry = registry
         self._status = status
         self._metrics = metrics
+        self._samples = samples
         self._keys = registry.keys
         self._digests = ThreadPoolExecutor(1, "digest")
 
@@ -65,6 +74,9 @@ class Queries:
         _guarded(request, lambda: self._report(request, self._keys.status(instance), self._keys.metrics(instance)))
 
     def _report(self, request: Request, status: str, metrics: str) -> None:
+        if request.key == self._keys.samples(self._registry.instance):
+            request.answer_text(request.key, self._samples(), JSON)
+            return
         if request.matches(status):
             request.answer(status, self._status())
         if request.matches(metrics):
