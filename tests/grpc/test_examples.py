@@ -49,8 +49,9 @@ def test_node_from_the_schema(gateway: GatewayProcess, tmp_path: Path) -> None:
     """The example in another language, with packages of its own and the .proto file, prints the same."""
     if shutil.which("npm") is None:
         pytest.skip("npm is not installed")
-    shutil.copy(EXAMPLES / "package.json", tmp_path)
-    install = ["npm", "install", "--silent", "--no-audit", "--no-fund"]
+    for name in ("package.json", "package-lock.json"):
+        shutil.copy(EXAMPLES / name, tmp_path)
+    install = ["npm", "ci", "--silent", "--no-audit", "--no-fund", "--ignore-scripts"]
     subprocess.run(install, cwd=tmp_path, check=True, timeout=120)
     schema = ROOT / "schemas" / "proto" / "optipmb" / "v1" / "tracking.proto"
     command = ["node", str(copied("track.mjs", gateway, tmp_path)), str(schema)]

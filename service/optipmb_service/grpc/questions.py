@@ -57,17 +57,22 @@ async def set_parameters(call: Call) -> None:
 
 
 async def list_streams(call: Call) -> None:
-    """Ask every service for its streams."""
+    """Ask every service for its streams; workers, who answer too, are no services: their parent speaks for them."""
     asked = convert.parse(await call.first() or b"", pb.ListStreamsRequest)
     client, pattern = call.gateway.client, asked.pattern or call.caller.pattern
     client.keys.matching(pattern, "tracks")
     call.caller.may_read(pattern)
-    answers = await asyncio.to_thread(client.ask, client.keys.all_status(), timeout=QUERY_S)
+    answers, alive = await asyncio.gather(
+        asyncio.to_thread(client.ask, client.keys.all_status(), timeout=QUERY_S),
+        asyncio.to_thread(client.alive, client.keys.all_alive(), QUERY_S),
+    )
+    services = {client.keys.instance_of(key) for key in alive}
     listed = []
     for answer in answers:
         if answer.good:
             status = schemas.decode(answer.payload, schemas.ServiceStatus, encoding=answer.encoding)
-            listed += [(status.instance, session) for session in status.sessions if _matches(session.stream, pattern)]
+            if status.instance in services:
+                listed += [(status.instance, one) for one in status.sessions if _matches(one.stream, pattern)]
     listed.sort(key=lambda entry: (entry[1].stream, entry[0]))
     streams = [pb.ListedStream(instance=instance, session=convert.to_proto(one)) for instance, one in listed]
     await _answer(call, pb.ListStreamsResponse(streams=streams))

@@ -1,0 +1,56 @@
+"""gRPC served by a service of several worker processes: its parent is the gateway of them all."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import grpc
+import pytest
+from gateway import detections, frame
+from optipmb_schemas.protobuf import tracking_pb2 as pb
+from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
+from routers import free_endpoint
+from service_process import ServiceProcess
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+STREAMS = tuple(f"garage/robot-{number}/lidar" for number in range(4))
+
+
+@pytest.fixture(scope="module")
+def workers() -> Iterator[tuple[ServiceProcess, str]]:
+    """A service of two workers and its address for gRPC."""
+    address = f"127.0.0.1:{free_endpoint().rpartition(':')[2]}"
+    with ServiceProcess("--workers", "2", "--grpc", address) as process:
+        process.wait_ready()
+        yield process, address
+
+
+def test_streams_of_all_workers(workers: tuple[ServiceProcess, str]) -> None:
+    """Streams of both workers are tracked, listed with their worker, asked about, reset and queried at one address."""
+    stub = rpc.TrackingServiceStub(grpc.insecure_channel(workers[1]))
+    for stream in STREAMS:
+        responses = list(stub.Track((detections(frame(seq, stream)) for seq in range(10)), timeout=60))
+        assert [one.tracks.seq for one in responses] == list(range(10))
+        assert stub.GetState(pb.GetStateRequest(stream=stream)).state.frames == 10
+        kept = [one.tracks.seq for one in stub.QueryTracks(pb.QueryTracksRequest(pattern=stream))]
+        assert kept == list(range(10))
+    listed = stub.ListStreams(pb.ListStreamsRequest()).streams
+    assert [one.session.stream for one in listed] == list(STREAMS)
+    assert {one.session.worker for one in listed} == {0, 1}
+    assert {one.instance for one in listed} == {listed[0].instance}
+    before = stub.GetState(pb.GetStateRequest(stream=STREAMS[0])).state.session
+    assert stub.Reset(pb.ResetRequest(stream=STREAMS[0])).state.session not in {"", before}
+
+
+def test_the_end_is_in_order(workers: tuple[ServiceProcess, str]) -> None:
+    """On SIGTERM a subscription ends as UNAVAILABLE, and the service with status 0."""
+    process, address = workers
+    call = rpc.TrackingServiceStub(grpc.insecure_channel(address)).Subscribe(pb.SubscribeRequest(pattern="*/*/*"))
+    call.initial_metadata()
+    status, _ = process.end()
+    with pytest.raises(grpc.RpcError) as raised:
+        list(call)
+    assert raised.value.code() == grpc.StatusCode.UNAVAILABLE
+    assert status == 0, process.errors
