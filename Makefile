@@ -12,11 +12,12 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
-.PHONY: help docs release demo test bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests-together tests-alone check lowest pythons repeat schemas wheel clean tune ablate
+.PHONY: help docs release demo test bounds bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests-together tests-alone check lowest pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    lint, types, schemas, tests, wheel"
 	@echo "make check   lint, types, and the tests nearest to what changed since SINCE=main, in less than a minute"
+	@echo "make bounds  call the tracker with every kernel compiled with bounds checks, which takes a minute"
 	@echo "make lowest  test the wheel with the oldest packages that it may be installed with"
 	@echo "make pythons test the wheel with every Python newer than 3.11 that this machine has"
 	@echo "make repeat  run make test N=10 times in fresh clones, with LOAD=0 processes that compute beside it"
@@ -77,10 +78,14 @@ types: install
 JOBS ?= 4
 tests-together: install
 	$(BIN)/optipmb warm-up
-	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not alone"
+	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not alone and not bounds"
 
 tests-alone: install
 	$(BIN)/pytest -m alone
+
+# Compiling all kernels a second time takes a minute; what is compiled is kept in .pytest_cache.
+bounds: install
+	$(BIN)/pytest tests/tracker -m bounds
 
 
 # For a developer: style, types, and the tests nearest to what changed since SINCE (a commit; files not committed count).

@@ -38,6 +38,7 @@ def material(dataset: str, detections: str) -> tuple[dict[str, Scorer], dict[str
     )
 
 
+@cache
 def figures(profile: str, detections: str, name: str) -> Figures:
     """The figures of one class by one profile."""
     scorers, clips = material(profile.removesuffix("-paper"), detections)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import optipmb, result_of
+from commands import result_of, run_here
 from optipmb_client.datasets import DataSequence, DatasetError, open_dataset
 from optipmb_client.datasets.table import TableDataset, TableSequence, match_stamps
 from optipmb_client.table_files import read_table, write_table
@@ -195,13 +195,13 @@ def test_stamps_match_the_nearest_frame() -> None:
     assert match_stamps(stamps, np.array([0, 49, 51, 120, 400, 449, 460, -60])).tolist() == [0, 0, 1, 1, 4, 4, -1, -1]
 
 
-def test_a_table_in_gives_a_table_out(tmp_path: Path) -> None:
+def test_a_table_in_gives_a_table_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`optipmb track d.csv --out t.csv`: rows keep the times and name the detections; evaluation finds three tracks."""
     plain = boxes()
     data = table(tmp_path / "d.csv", plain)
     truth = {name: plain[name] for name in ("t", "x", "y", "z", "l", "w", "h", "yaw", "class")}
     table(tmp_path / "truth.csv", {**truth, "id": np.tile([1, 2, 3], FRAMES)})
-    done = optipmb("track", data, "--out", tmp_path / "t.csv")
+    done = run_here(capsys, "track", data, "--out", tmp_path / "t.csv")
     assert done.returncode == 0, done.stderr
     assert "profile auto: " in done.stderr
     tracks = read_table(tmp_path / "t.csv")
@@ -212,33 +212,33 @@ def test_a_table_in_gives_a_table_out(tmp_path: Path) -> None:
     assert np.isnan(tracks["vx"][tracks["age"] == 0.0]).all()
     assert not np.isnan(tracks["vx"][tracks["age"] > 0.0]).any()
     asked = ("evaluate", data, "--truth", tmp_path / "truth.csv", "--tracks", tmp_path / "t.csv", "--json")
-    figures = result_of(optipmb(*asked))
+    figures = result_of(run_here(capsys, *asked))
     for name in CLASSES:
         assert figures["classes"][name]["all"]["MOTA"] == pytest.approx(1.0)
         assert figures["classes"][name]["all"]["IDS"] == 0
 
 
-def test_processes_give_the_bytes_of_one(tmp_path: Path) -> None:
+def test_processes_give_the_bytes_of_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`--jobs 2` over four recordings writes the same table as one process, and the same files into a folder."""
     plain = boxes()
     four = {name: np.concatenate([values] * 4) for name, values in plain.items()}
     data = table(tmp_path / "d.parquet", {**four, "log": np.repeat(["a", "b", "c", "d"], 3 * FRAMES)})
     for jobs in ("1", "2"):
-        assert optipmb("track", data, "--out", tmp_path / jobs / "t.jsonl", "--jobs", jobs).returncode == 0
-        assert optipmb("track", data, "--out", tmp_path / jobs / "files", "--jobs", jobs, "--full").returncode == 0
+        for out in ((tmp_path / jobs / "t.jsonl",), (tmp_path / jobs / "files", "--full")):
+            assert run_here(capsys, "track", data, "--jobs", jobs, "--out", *out).returncode == 0
     files = sorted(path.relative_to(tmp_path / "1") for path in (tmp_path / "1").rglob("*") if path.is_file())
     assert len(files) == 9
     for path in files:
         assert (tmp_path / "1" / path).read_bytes() == (tmp_path / "2" / path).read_bytes(), path
 
 
-def test_other_datasets_are_written_as_tables_too(tmp_path: Path) -> None:
+def test_other_datasets_are_written_as_tables_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A generated scene tracked into one table evaluates as its result files do, to their rounding."""
     data = ("--dataset", "scene", "--option", "frames=30", "--option", "clouds=0")
     for out in (tmp_path / "t.feather", tmp_path / "files"):
-        assert optipmb("track", *data, "--out", out).returncode == 0
+        assert run_here(capsys, "track", *data, "--out", out).returncode == 0
     figures = [
-        result_of(optipmb("evaluate", *data, "--tracks", out, "--json"))["classes"]
+        result_of(run_here(capsys, "evaluate", *data, "--tracks", out, "--json"))["classes"]
         for out in (tmp_path / "t.feather", tmp_path / "files")
     ]
     for name, one in figures[1].items():
@@ -246,13 +246,13 @@ def test_other_datasets_are_written_as_tables_too(tmp_path: Path) -> None:
         assert figures[0][name]["gospa"]["all"]["GOSPA"] == pytest.approx(one["gospa"]["all"]["GOSPA"], abs=1e-5)
 
 
-def test_a_dataset_is_guessed_from_its_file(tmp_path: Path) -> None:
+def test_a_dataset_is_guessed_from_its_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A folder of tables is a dataset of as many recordings; a file of no known kind is refused with the known ones."""
     for name in ("one", "two"):
         table(tmp_path / "many" / f"{name}.csv", boxes())
     dataset = open_dataset("table", tmp_path / "many")
     assert [one.name for one in dataset.sequences(["all"])] == ["one", "two"]
     (tmp_path / "a.xyz").write_text("nothing")
-    done = optipmb("track", tmp_path / "a.xyz")
+    done = run_here(capsys, "track", tmp_path / "a.xyz")
     assert done.returncode == 2
     assert "expected a table (.csv, .parquet, .jsonl, .feather)" in done.stderr

@@ -20,9 +20,9 @@ from tuning_cases import Habits, recorded
 import optipmb
 
 PAGE = Path(__file__).parents[2] / "docs" / "tuning.md"
-SCENE = ["--dataset", "scene", "--option", "frames=25", "--option", "clouds=0", "--sequences", "0000", "0001"]
+SCENE = ["--dataset", "scene", "--option", "frames=16", "--option", "clouds=0", "--sequences", "0000", "0001"]
 CARS = [*SCENE, "--profile", "kitti-paper", "--classes", "Car"]
-FEW = ["--trials", "5", "--fold-trials", "3", "--folds", "2"]
+FEW = ["--trials", "3", "--fold-trials", "2", "--folds", "2"]
 
 
 def tune(out: Path, *options: str) -> None:
@@ -31,13 +31,13 @@ def tune(out: Path, *options: str) -> None:
 
 
 def test_the_same_seed_gives_the_same_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two sessions of five trials, one of them in two parts and one in two processes, give the same bytes."""
+    """Two sessions of three trials, one of them in two parts and one in two processes, give the same bytes."""
     pytest.importorskip("optuna")
     tune(tmp_path / "a")
     shown = capsys.readouterr()
     assert "cross-validated" in shown.out
-    assert "trial 11 of 11" in shown.err
-    tune(tmp_path / "b", "--trials", "3")
+    assert "trial 7 of 7" in shown.err
+    tune(tmp_path / "b", "--trials", "2")
     tune(tmp_path / "b", "--jobs", "2")
     for name in ("tuned.toml", "report.json", "estimate.json", "estimated.toml"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()

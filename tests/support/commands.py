@@ -6,11 +6,23 @@ import subprocess
 import sys
 from typing import Any
 
+import pytest
+from optipmb_client.cli import run
+
 
 def optipmb(*arguments: object, timeout: float = 240.0) -> "subprocess.CompletedProcess[str]":
     """Run the client's command in a process of its own."""
     command = [sys.executable, "-m", "optipmb_client", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+
+
+def run_here(capsys: pytest.CaptureFixture[str], *arguments: object) -> "subprocess.CompletedProcess[str]":
+    """Run the client's command in this process, where the process is not the claim: imports take two seconds."""
+    words = [str(one) for one in arguments]
+    capsys.readouterr()
+    status = run(words)
+    shown = capsys.readouterr()
+    return subprocess.CompletedProcess(words, status, shown.out, shown.err)
 
 
 def start(*arguments: object) -> "subprocess.Popen[str]":

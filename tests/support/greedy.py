@@ -33,6 +33,7 @@ REACH = {
 }
 """Farthest that a track of a class is sought, metres."""
 PATIENCE = 3
+FAR = np.full(1, np.inf)
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ def greedy_tracks(clip: Clip, name: str) -> ResultTable:
         free, found = list(tracks), []
         for m in np.argsort(-frame.score, kind="stable").tolist():
             place = frame.center[m, :2]
-            distance = [float(np.hypot(*(place - velocity[m] * dt - track.place))) for track in free]
-            if distance and min(distance) <= REACH[name]:
+            distance = np.hypot(*(place - velocity[m] * dt - [track.place for track in free]).T) if free else FAR
+            if distance.min() <= REACH[name]:
                 identity = free.pop(int(np.argmin(distance))).id
             else:
                 count += 1

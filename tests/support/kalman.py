@@ -18,7 +18,6 @@ from boxes import Row, table_of
 from optipmb_client.evaluation.overlap import intersection_area
 from optipmb_client.geometry import box_corners, wrap_angle
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import ConvexHull
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -140,9 +139,25 @@ def generalised_overlap(boxes: Array, tracks: Array, apart: Array) -> Array:
     first, second = ((side[:, :3], side[:, SIZE], side[:, YAW]) for side in (boxes[m], tracks[n]))
     low = [center[:, 2] - 0.5 * size[:, 2] for center, size, _ in (first, second)]
     high = [center[:, 2] + 0.5 * size[:, 2] for center, size, _ in (first, second)]
-    common = intersection_area(first, second) * np.maximum(np.minimum(*high) - np.maximum(*low), 0.0)
+    common = np.zeros(len(m))
+    meet = apart[m, n] < reach[m, n]
+    common[meet] = intersection_area(*(tuple(column[meet] for column in side) for side in (first, second)))
+    common *= np.maximum(np.minimum(*high) - np.maximum(*low), 0.0)
     filled = np.prod(boxes[m][:, SIZE], axis=1) + np.prod(tracks[n][:, SIZE], axis=1) - common
     outlines = np.concatenate([box_corners(*side)[:, :4, :2] for side in (first, second)], axis=1)
-    hull = np.array([ConvexHull(outline).volume for outline in outlines]) * (np.maximum(*high) - np.minimum(*low))
+    hull = hull_area(outlines) * (np.maximum(*high) - np.minimum(*low))
     worth[m, n] = common / filled - (hull - filled) / np.maximum(hull, 1e-9)
     return worth
+
+
+def hull_area(points: Array) -> Array:
+    """Return the areas (N,) of the convex hulls of points (N, K, 2), of which no three lie on a line.
+
+    The way from one point to another is an edge of the hull if no point is to the right of it.
+    """
+    x, y = points[..., 0], points[..., 1]
+    dx, dy = x[:, None, :] - x[:, :, None], y[:, None, :] - y[:, :, None]
+    left = dx[:, :, :, None] * dy[:, :, None, :] - dy[:, :, :, None] * dx[:, :, None, :]
+    edge = (left >= 0.0).all(axis=3)
+    area: Array = 0.5 * (edge * (x[:, :, None] * dy - y[:, :, None] * dx)).sum(axis=(1, 2))
+    return area

@@ -68,8 +68,9 @@ def ctra(x: Array, dt: float, tau: float = math.inf) -> Array:
     def speed(t: Any) -> Any:
         return v + (a * t if tau == math.inf else a * tau * (1 - np.exp(-t / tau)))
 
-    px += 0.5 * dt * np.sum(weights * speed(t) * np.cos(phi + omega * t))
-    py += 0.5 * dt * np.sum(weights * speed(t) * np.sin(phi + omega * t))
+    passed = 0.5 * dt * weights * speed(t)
+    px += np.dot(passed, np.cos(phi + omega * t))
+    py += np.dot(passed, np.sin(phi + omega * t))
     return np.array([px, py, speed(dt), phi + omega * dt, omega, a * math.exp(-dt / tau)])
 
 
@@ -229,14 +230,13 @@ def iou(box_a: Array, box_b: Array) -> float:
 def count_inside(world: Array, xy: Array, yaw: float, auxiliary: Array) -> int:
     """Points in a box, faces included; `world` holds world points in rows."""
     length, width, height, z = auxiliary
-    count = 0
     offsets = world - np.array([xy[0], xy[1], z])
     close = np.all(np.abs(offsets) <= length + width + height, axis=1)  # only to be spared the far ones
-    for dx, dy, dz in offsets[close]:
-        along = math.cos(yaw) * dx + math.sin(yaw) * dy
-        across = -math.sin(yaw) * dx + math.cos(yaw) * dy
-        count += abs(along) <= length / 2 and abs(across) <= width / 2 and abs(dz) <= height / 2
-    return count
+    dx, dy, dz = offsets[close].T
+    along = math.cos(yaw) * dx + math.sin(yaw) * dy
+    across = -math.sin(yaw) * dx + math.cos(yaw) * dy
+    inside = (np.abs(along) <= length / 2) & (np.abs(across) <= width / 2) & (np.abs(dz) <= height / 2)
+    return int(inside.sum())
 
 
 def birth(z: Measurement, c: Any) -> tuple[Array, Array]:

@@ -155,6 +155,7 @@ def test_tracks_whose_columns_do_not_fit_are_not_sound() -> None:
         assert not optipmb.sound(short), field.name
 
 
+@pytest.mark.bounds
 def test_kernels_stay_within_their_arrays(request: pytest.FixtureRequest) -> None:
     """With numba's bounds checks on, the public calls never index beyond an array, and raise nothing but refusals."""
     cache = request.config.cache
