@@ -64,6 +64,11 @@ class Pose:
         object.__setattr__(self, "translation", translation)
         object.__setattr__(self, "quaternion", quaternion / norm)
 
+    @property
+    def is_identity(self) -> bool:
+        """Whether the sensor's coordinates are those of the world, exactly."""
+        return self.translation.tolist() == [0.0] * 3 and self.quaternion.tolist() in _UNTURNED
+
     @cached_property
     def rotation(self) -> NDArray[np.float64]:
         """Rotation matrix (3, 3) of the quaternion."""
@@ -75,6 +80,10 @@ class Pose:
                 [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
             ]
         )
+
+
+_UNTURNED: Final = ([1.0, 0.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0])
+"""The quaternions of no rotation."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +198,8 @@ def make_frame(
         yaw: (M,) rad, in the same frame.
         score: (M,) in [0, 1]; an object of score 0 is left out, for its detector says that there is none.
         velocity: (M, 2) over ground along the axes of the same frame, m/s; None, or rows of NaN, where unknown.
-        pose: world from sensor, or None when the arrays are in the world frame already.
+        pose: world from sensor, or None when the arrays are in the world frame already. The identity is the same as
+            None, to the last bit: a heading does not go through sine and cosine.
         cloud: the scan of the same stamp.
 
     Returns:
@@ -210,7 +220,7 @@ def make_frame(
     if not allowed(which, len(labels), center, size, yaw, scored, velocity):
         _refuse(which, len(labels), center, size, yaw, scored, velocity)
 
-    if pose is not None:
+    if pose is not None and not pose.is_identity:
         rotation = pose.rotation
         center = center @ rotation.T + pose.translation
         heading = np.empty((m, 2))

@@ -1,12 +1,23 @@
 """The promise of the replay: the service gives the same result files as the tracker in process, byte for byte."""
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from commands import optipmb, result_of
 from optipmb_client.child import ServiceProcess
+from optipmb_client.datasets import open_dataset
+from optipmb_client.mcap_files.writing import RecordingWriter
+from optipmb_client.offline import track_sequence
+from optipmb_schemas import Detections, Keys, encode, encoding_of
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Tracked
 from real_data import kitti_root
+from router import Sensor
+
+from optipmb import load_profile
 
 SCENE = ("--dataset", "scene", "--option", "frames=60")
 
@@ -61,3 +72,37 @@ def test_kitti(service: ServiceProcess, tmp_path: Path, streams: int) -> None:
     """Recorded detections, with the few clouds that there are, give the same files on both ways."""
     data = ("--dataset", "kitti", "--root", kitti_root(), "--detections", "pointrcnn")
     both(service, tmp_path, (*data, "--sequences", "0000", "0002", "0005"), "--streams", streams)
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_a_recording_of_a_publisher_of_the_world_frame(tmp_path: Path, *, posed: bool) -> None:
+    """Boxes in the world frame, recorded and tracked offline, give the bytes of a session: no heading is turned."""
+    sensor, path, chance = Sensor("site/world/lidar"), tmp_path / "world.mcap", np.random.default_rng(7)
+    parameters = load_profile("nuscenes")
+    session, expected = Session(sensor.stream, parameters), []
+    with RecordingWriter(path) as writer:
+        for seq in range(30):
+            angle = 0.1 * seq + np.arange(8.0)
+            message = sensor.detections(
+                seq,
+                objects=8,
+                center=np.c_[20 * np.arange(8) + 5 * np.cos(angle), 5 * np.sin(angle), np.ones(8)]
+                + chance.normal(0, 0.05, (8, 3)),
+                yaw=angle + np.pi / 2 + chance.normal(0, 0.02, 8),  # beyond pi too
+                has_points=False,
+            )
+            if posed:
+                pose = {"translation": [5.0, seq, 1.0], "quaternion": [0.6, 0.0, 0.0, 0.8]}
+                message = Detections(**(dict(message.present()) | {"pose": pose}))
+            assert message.frame == "world"
+            key = Keys().detections(sensor.stream)
+            writer.add(key, encode(message), encoding_of(message), seq)
+            expected += [one.tracks for one in session.on_detections(message, 0) if isinstance(one, Tracked)]
+    (sequence,) = open_dataset("mcap", path).sequences(["all"])
+    found = [tracks.tracks for _, tracks, _, _ in track_sequence(parameters, sequence)]
+    assert len(found) == len(expected) == 30
+    assert len(found[-1].id) >= 8
+    for offline, online in zip(found, expected, strict=True):
+        for field in fields(offline):
+            one, other = getattr(offline, field.name), getattr(online, field.name)
+            assert np.asarray(one).tobytes() == np.asarray(other, np.asarray(one).dtype).tobytes(), field.name

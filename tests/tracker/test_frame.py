@@ -182,3 +182,15 @@ def test_the_order_of_detections_does_not_matter_in_sensor_coordinates(seed: int
         one = tracker.step(one, optipmb.make_frame(KITTI, pose=pose, **given_frame.columns())[0]).density
         other = tracker.step(other, optipmb.make_frame(KITTI, pose=pose, **shuffled.columns())[0]).density
         assert density_bytes(one) == density_bytes(other)
+
+
+@settings(max_examples=50)
+@given(yaw=st.lists(st.floats(-1e4, 1e4), min_size=2, max_size=2), sign=st.sampled_from([1.0, -1.0]))
+def test_the_identity_moves_nothing(yaw: list[float], sign: float) -> None:
+    """A frame under the pose that is the identity is the frame without one, to the last bit."""
+    center = np.array([[-0.0, 1e-300, 0.1], [1e8, -1e8, 3.0]])
+    given_columns = columns(yaw=yaw, center=center, velocity=np.full((2, 2), -0.0))
+    identity = optipmb.Pose(np.zeros(3), np.array([sign, 0.0, 0.0, 0.0]))
+    (plain, _), (posed, _) = (optipmb.make_frame(KITTI, **given_columns, pose=pose) for pose in (None, identity))
+    for name in ("center", "size", "yaw", "velocity", "score", "label", "source"):
+        assert getattr(plain, name).tobytes() == getattr(posed, name).tobytes()
