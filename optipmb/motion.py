@@ -186,6 +186,10 @@ def predict_state(
             if column < STATE - 2:  # the columns of x and y leave the motion itself as it is at the centre
                 if straight:
                     along, across, speed, acceleration = (v + point[V]) * dt, 0.0, v + point[V], point[A]
+                elif tau == math.inf:  # as `travel` has it, without a call for each point
+                    speed, acceleration = v + point[V], a + point[A]
+                    along, across = ctra_displacement(speed, omega + point[OMEGA], acceleration, dt)
+                    speed += acceleration * dt
                 else:
                     along, across, speed, acceleration = travel(
                         v + point[V], omega + point[OMEGA], a + point[A], dt, tau
@@ -204,15 +208,20 @@ def predict_state(
     mean_out[OMEGA] = omega + centred(points, OMEGA)
     mean_out[A] = a0 + centred(points, A)
     for s in range(STATE):
-        for t in range(s + 1):
-            value = 0.0
-            for i in range(2 * STATE):
-                value += points[i, s] * points[i, t]
-            value *= WEIGHT
-            if s == t:
-                value += process_noise[s] ** 2 * dt if not (straight and s >= OMEGA) else 0.0
-            covariance_out[s, t] = value
-            covariance_out[t, s] = value
+        c0 = c1 = c2 = c3 = c4 = c5 = 0.0  # six sums side by side, which the processor adds at once
+        for i in range(2 * STATE):
+            deviation = points[i, s]
+            c0 += deviation * points[i, 0]
+            c1 += deviation * points[i, 1]
+            c2 += deviation * points[i, 2]
+            c3 += deviation * points[i, 3]
+            c4 += deviation * points[i, 4]
+            c5 += deviation * points[i, 5]
+        row = covariance_out[s]
+        row[0], row[1], row[2] = c0 * WEIGHT, c1 * WEIGHT, c2 * WEIGHT
+        row[3], row[4], row[5] = c3 * WEIGHT, c4 * WEIGHT, c5 * WEIGHT
+        if not (straight and s >= OMEGA):
+            row[s] += process_noise[s] ** 2 * dt
     return repaired
 
 
