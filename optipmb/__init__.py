@@ -38,6 +38,7 @@ from optipmb.parameters import (
     profile_source,
     profiles,
 )
+from optipmb.paths import PredictedPaths, predict_tracks
 from optipmb.points import points_in_boxes
 from optipmb.soundness import sound
 from optipmb.tracker import Diagnostics, Modules, StepResult, Tracker
@@ -65,6 +66,7 @@ __all__ = [
     "PointCloud",
     "Poissons",
     "Pose",
+    "PredictedPaths",
     "StepResult",
     "Tracker",
     "Tracks",
@@ -78,6 +80,7 @@ __all__ = [
     "make_frame",
     "parse_parameters",
     "points_in_boxes",
+    "predict_tracks",
     "profile_source",
     "profiles",
     "sound",

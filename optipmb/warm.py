@@ -13,6 +13,7 @@ from optipmb.errors import EffortError
 from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
 from optipmb.parameters import load_profile, parse_parameters
+from optipmb.paths import predict_tracks
 from optipmb.soundness import sound
 from optipmb.tracker import Tracker
 
@@ -79,5 +80,6 @@ def _run() -> None:
         result = tracker.step(posterior, given)
         posterior = result.density
         sound(result.tracks)
+    predict_tracks(result.tracks, [0.5], parameters)
     with suppress(EffortError):
         Tracker(parameters, max_pairs=8).step(posterior, given)

@@ -1,0 +1,210 @@
+"""Where tracks are going: their states at times ahead, by the motion model of their class (eq. Motion Predict).
+
+A path is what the filter itself would hold of an object that it does not see again in a stream at the nominal rate of
+the profile: between two horizons the state is predicted in equal steps of at most one nominal period, each as in
+`optipmb.motion`. One long step would be another motion: its noise of speed and heading would reach no position.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from optipmb.columns import fitting
+from optipmb.compiled import kernel
+from optipmb.density import PHI, STATE, Density, copy_state
+from optipmb.errors import DensityError, FrameError
+from optipmb.heading import doubt
+from optipmb.motion import predict_state
+from optipmb.records import record
+from optipmb.soundness import sound
+from optipmb.table import ClassTable
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from optipmb.extract import Tracks
+    from optipmb.parameters import Parameters
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+MAX_HORIZON_S: Final = 30.0
+"""Farthest horizon, s."""
+
+MAX_HORIZONS: Final = 100
+"""Most horizons of a call."""
+
+MAX_STEPS: Final = 1000
+"""Most steps of a path, whatever the nominal period."""
+
+ROUNDING: Final = 1e-6
+"""Share of a period by which a step may be longer, so that rounding of a horizon costs no step more."""
+
+
+@record
+class PredictedPaths:
+    """The states of tracks at times ahead, in the world frame, rows as in the tracks.
+
+    Attributes:
+        id: (N,) int64 track ids.
+        label: (N,) int64, index into the classes of the parameters.
+        horizons: (H,) s after the stamp of the tracks.
+        mean: (N, H, 6) [x, y, v, phi, omega, a]: m, m/s along the heading, rad in (-pi, pi], rad/s, m/s^2.
+        covariance: (N, H, 6, 6) of those; that of the heading with the doubt which way the object faces, as tracks
+            have it.
+    """
+
+    id: Index
+    label: Index
+    horizons: Array
+    mean: Array
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @property
+    def position(self) -> Array:
+        """(N, H, 2) x and y, m."""
+        return self.mean[:, :, :2]
+
+    @property
+    def yaw(self) -> Array:
+        """(N, H) headings, rad, in (-pi, pi]."""
+        return self.mean[:, :, PHI]
+
+
+def predict_tracks(
+    tracks: Tracks | Density, horizons: Sequence[float] | Array, parameters: Parameters
+) -> PredictedPaths:
+    """Predict where objects will be, by the motion model of their class.
+
+    The doubt which way an object faces (`optipmb.heading`) takes no part: both headings describe the same motion.
+
+    Args:
+        tracks: tracks of a step, or a density, of which all detected objects are predicted.
+        horizons: times after the stamp of the tracks, s: positive, ascending, at most `MAX_HORIZONS` of them, up to
+            `MAX_HORIZON_S`.
+        parameters: the profile that the tracks were made with.
+
+    Raises:
+        FrameError: the horizons are not so; or the tracks are not `sound`, or of classes that the profile lacks.
+        DensityError: the columns of the density do not fit together, or to the classes of the profile.
+    """
+    times = _horizons(horizons)
+    table = ClassTable.of(parameters)
+    if isinstance(tracks, Density):
+        if tracks.labels != parameters.labels or not fitting(tracks, len(parameters.labels)):
+            raise DensityError("density", f"columns of equal length, of the classes {parameters.labels}", "others")
+        objects = tracks.bernoulli
+        return _predict(objects.id, objects.label, objects.mean, objects.covariance, times, table)
+    if not sound(tracks):
+        raise FrameError("tracks", "sound tracks", "others")
+    label = tracks.label
+    if label.size and not 0 <= label.min() <= label.max() < len(parameters.labels):
+        classes = f"indices below {len(parameters.labels)}"
+        raise FrameError("tracks.label", classes, f"{label.min()} to {label.max()}")
+    speed = tracks.velocity[:, 0] * np.cos(tracks.yaw) + tracks.velocity[:, 1] * np.sin(tracks.yaw)
+    mean = np.column_stack((tracks.center[:, :2], speed, tracks.yaw, tracks.yaw_rate, tracks.acceleration))
+    unsure = np.array([doubt(p) for p in tracks.heading_confidence])
+    covariance = tracks.covariance.copy()
+    covariance[:, PHI, PHI] -= unsure
+    paths = _predict(tracks.id, label, mean, covariance, times, table)
+    paths.covariance[:, :, PHI, PHI] += unsure[:, None]
+    return paths
+
+
+def _horizons(values: Sequence[float] | Array) -> Array:
+    expected = f"at most {MAX_HORIZONS} ascending times above 0 s up to {MAX_HORIZON_S:g} s"
+    try:
+        times = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise FrameError("horizons", expected, repr(values)[:200]) from None
+    if times.ndim != 1 or times.size > MAX_HORIZONS:
+        raise FrameError("horizons", expected, f"an array of shape {times.shape}")
+    before = np.concatenate((np.zeros(1), times[:-1]))[: times.size]
+    wrong = np.flatnonzero(~((times > before) & (times <= MAX_HORIZON_S)))
+    if wrong.size:
+        raise FrameError(f"horizons[{wrong[0]}]", expected, f"{times[wrong[0]]:g}")
+    return times
+
+
+def _predict(
+    identity: Index, label: Index, mean: Array, covariance: Array, times: Array, table: ClassTable
+) -> PredictedPaths:
+    shape = label.shape[0], times.shape[0]
+    paths = PredictedPaths(
+        identity.copy(), label.copy(), times, np.empty((*shape, STATE)), np.empty((*shape, STATE, STATE))
+    )
+    predict_paths(
+        mean,
+        covariance,
+        paths.label,
+        times,
+        table.period,
+        table.process_noise,
+        table.acceleration_time,
+        table.constant_velocity,
+        paths.mean,
+        paths.covariance,
+    )
+    return paths
+
+
+@kernel
+def predict_paths(
+    mean: Array,
+    covariance: Array,
+    label: Index,
+    horizons: Array,
+    period: float,
+    process_noise: Array,
+    acceleration_time: Array,
+    constant_velocity: NDArray[np.bool_],
+    mean_out: Array,
+    covariance_out: Array,
+) -> None:
+    """Predict states to each of the horizons, in equal steps of at most a nominal period between them.
+
+    Args:
+        mean: (N, 6) states now.
+        covariance: (N, 6, 6) their covariances.
+        label: (N,) classes.
+        horizons: (H,) ascending times ahead, s.
+        period: nominal period, s.
+        process_noise: (C, 6) standard deviations per square root of a second.
+        acceleration_time: (C,) time constant of the acceleration, s.
+        constant_velocity: (C,) whether a class moves at constant velocity.
+        mean_out: (N, H, 6) receives the states at the horizons.
+        covariance_out: (N, H, 6, 6) receives their covariances.
+    """
+    root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
+    state, spread = np.empty((2, STATE)), np.empty((2, STATE, STATE))
+    for n in range(mean.shape[0]):
+        c = label[n]
+        copy_state(mean, covariance, n, state, spread, 0)
+        before = 0.0
+        for h in range(horizons.shape[0]):
+            ahead = horizons[h] - before
+            steps = max(1, math.ceil(min(ahead / period - ROUNDING, MAX_STEPS * ahead / horizons[-1])))
+            for _ in range(steps):
+                predict_state(
+                    state[0],
+                    spread[0],
+                    ahead / steps,
+                    process_noise[c],
+                    acceleration_time[c],
+                    constant_velocity[c],
+                    root,
+                    points,
+                    state[1],
+                    spread[1],
+                )
+                copy_state(state, spread, 1, state, spread, 0)
+            copy_state(state, spread, 0, mean_out[n], covariance_out[n], h)
+            before = horizons[h]

@@ -1,0 +1,150 @@
+"""Predicted paths against the filter's own prediction, and against the textbook's step by step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import oracle_formulas as textbook
+import pytest
+
+import optipmb
+from optipmb.paths import MAX_HORIZONS, predict_paths
+
+KITTI = optipmb.load_profile("kitti")
+LABELS = ("Car", "Pedestrian", "Cyclist")
+
+
+def frame(stamp_ns: int, k: int | None) -> optipmb.Frame:
+    """A turning car, a pedestrian and a cyclist in frame k, or nothing."""
+    there = slice(0 if k is None else 3)
+    t = 0.1 * (k or 0)
+    center = [[8 * t, 2 * t * t, 0.8], [20.0, t, 0.9], [-5 * t, 30.0, 0.9]]
+    found, _ = optipmb.make_frame(
+        KITTI,
+        stamp_ns=stamp_ns,
+        labels=LABELS,
+        label=np.arange(3)[there],
+        center=np.array(center)[there],
+        size=np.array([[4.0, 1.7, 1.5], [0.6, 0.6, 1.7], [1.8, 0.6, 1.7]])[there],
+        yaw=np.array([0.5 * t, 1.5, 3.1])[there],
+        score=np.array([0.95, 0.9, 0.9])[there],
+    )
+    return found
+
+
+def followed() -> tuple[optipmb.Tracker, optipmb.StepResult]:
+    """The tracker and its result after a second."""
+    tracker = optipmb.Tracker(KITTI)
+    density = tracker.initial()
+    for k in range(10):
+        result = tracker.step(density, frame(k * 100_000_000, k))
+        density = result.density
+    assert len(result.tracks) == 3
+    return tracker, result
+
+
+def test_a_path_is_what_the_filter_predicts_of_an_object_that_it_does_not_see() -> None:
+    """Frames without detections lead to the states at the horizons."""
+    tracker, result = followed()
+    paths = optipmb.predict_tracks(result.density, [0.1, 0.3, 0.5], KITTI)
+    density = result.density
+    for k in range(1, 6):
+        density = tracker.step(density, frame(900_000_000 + k * 100_000_000, None)).density
+        if k % 2:
+            rows = np.searchsorted(paths.id, density.bernoulli.id)
+            assert len(rows) == 3
+            np.testing.assert_allclose(paths.mean[rows, k // 2], density.bernoulli.mean, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(paths.covariance[rows, k // 2], density.bernoulli.covariance, rtol=1e-9)
+
+
+@pytest.mark.parametrize("tau", [math.inf, 1.5])
+def test_states_are_predicted_as_numpy_does_step_by_step(tau: float) -> None:
+    """Equal steps of at most a period between horizons, each the textbook's, for both motion models."""
+    rng = np.random.default_rng(0)
+    mean, root = rng.normal(0, [50, 50, 8, 1, 0.3, 1], (6, 6)), rng.normal(0, 0.2, (6, 6, 6))
+    covariance = root @ root.transpose(0, 2, 1) + 0.01 * np.eye(6)
+    label, noise = np.arange(6) % 2, rng.uniform(0.1, 1.0, (2, 6))
+    horizons, straight = np.array([0.1, 0.25, 1.0, 1.001]), np.array([False, True])
+    means, covariances = np.empty((6, 4, 6)), np.empty((6, 4, 6, 6))
+    given = mean, covariance, label, horizons, 0.1, noise, np.full(2, tau), straight
+    predict_paths(*given, means, covariances)
+    for n in range(6):
+        c, m, spread = label[n], mean[n], covariance[n]
+        for h, (ahead, steps) in enumerate(((0.1, 1), (0.15, 2), (0.75, 8), (0.001, 1))):
+            for _ in range(steps):
+                m, spread = textbook.predict(
+                    m, spread, np.diag(noise[c] ** 2), ahead / steps, tau, straight=bool(straight[c])
+                )
+            np.testing.assert_allclose(means[n, h], m, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(covariances[n, h], spread, rtol=1e-8, atol=1e-9)
+
+
+def test_tracks_are_predicted_from_what_they_report() -> None:
+    """A track's path is that of its box, speed and covariance."""
+    _, result = followed()
+    tracks = result.tracks
+    paths = optipmb.predict_tracks(tracks, [0.001], KITTI)
+    np.testing.assert_array_equal(paths.id, tracks.id)
+    np.testing.assert_array_equal(paths.label, tracks.label)
+    ahead = tracks.center[:, :2] + 0.001 * tracks.velocity
+    np.testing.assert_allclose(paths.position[:, 0], ahead, atol=1e-4)
+    np.testing.assert_allclose(paths.yaw[:, 0], tracks.yaw, atol=1e-2)
+    np.testing.assert_allclose(paths.covariance[:, 0], tracks.covariance, rtol=0.05, atol=0.02)
+
+
+def test_a_doubtful_heading_changes_no_motion() -> None:
+    """Only the variance of the heading has the doubt in it, at each horizon as in the track."""
+    _, result = followed()
+    sure = replace(result.tracks, heading_confidence=np.ones(3))
+    unsure = replace(sure, heading_confidence=np.full(3, 0.6), covariance=sure.covariance.copy())
+    doubt = (0.6 * 0.4 - 0.025 * 0.975) * np.pi**2
+    unsure.covariance[:, 3, 3] += doubt
+    a, b = (optipmb.predict_tracks(one, [0.5, 2.0], KITTI) for one in (sure, unsure))
+    np.testing.assert_allclose(b.mean, a.mean, rtol=1e-9, atol=1e-9)
+    b.covariance[:, :, 3, 3] -= doubt
+    np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-9, atol=1e-9)
+
+
+def test_no_objects_and_no_horizons_have_empty_paths() -> None:
+    """Shapes hold for none of either."""
+    tracker, result = followed()
+    assert optipmb.predict_tracks(tracker.initial(), [1.0], KITTI).mean.shape == (0, 1, 6)
+    assert optipmb.predict_tracks(result.tracks, [], KITTI).covariance.shape == (3, 0, 6, 6)
+
+
+@pytest.mark.parametrize(
+    ("horizons", "path"),
+    [
+        ([0.0], "horizons[0]"),
+        ([1.0, 1.0], "horizons[1]"),
+        ([1.0, np.nan], "horizons[1]"),
+        ([np.inf], "horizons[0]"),
+        ([31.0], "horizons[0]"),
+        ([[1.0]], "horizons"),
+        (1.0, "horizons"),
+        (["soon"], "horizons"),
+        (np.linspace(0.1, 1, MAX_HORIZONS + 1), "horizons"),
+    ],
+)
+def test_other_horizons_are_refused_by_name(horizons: Any, path: str) -> None:
+    """Not above zero, not ascending, not finite, too far, too many, or no list of numbers."""
+    _, result = followed()
+    with pytest.raises(optipmb.FrameError) as caught:
+        optipmb.predict_tracks(result.tracks, horizons, KITTI)
+    assert caught.value.path == path
+
+
+def test_tracks_of_another_profile_are_refused() -> None:
+    """Classes that the profile lacks, tracks that are not sound, a density of other classes or with other columns."""
+    _, result = followed()
+    tracks, density = result.tracks, result.density
+    for wrong in (replace(tracks, label=tracks.label + 1), replace(tracks, yaw=tracks.yaw * np.nan)):
+        with pytest.raises(optipmb.FrameError, match="tracks"):
+            optipmb.predict_tracks(wrong, [1.0], KITTI)
+    short = replace(density.bernoulli, mean=density.bernoulli.mean[:1])
+    for other in (replace(density, labels=("car",)), replace(density, bernoulli=short)):
+        with pytest.raises(optipmb.DensityError, match="density"):
+            optipmb.predict_tracks(other, [1.0], KITTI)
