@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import grpc
 import pytest
-from gateway import GatewayProcess, detections, frame
+from gateway import GatewayProcess, detections, frame, resident
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 
@@ -40,11 +40,6 @@ def bounded(service: ServiceProcess) -> Iterator[GatewayProcess]:
     with GatewayProcess(service.endpoint, environment=environment) as process:
         process.wait_ready()
         yield process
-
-
-def resident(pid: int) -> int:
-    """Bytes of memory of a process."""
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
 
 
 def files(pid: int) -> int:

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from typing import TYPE_CHECKING, Any
 
 import grpc
 import numpy as np
 import pytest
-from gateway import detections, frame
+from gateway import detections, frame, resident
 from grpc_status import rpc_status
 from optipmb_schemas import Tracks, encode
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
+from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from gateway import GatewayProcess
+
+
+SUBSCRIBERS = 200
+FRAMES = 40
+
+SUBSCRIBER_BYTES = 512 * 2**10
+"""Memory that the gateway may take for each of many subscribers."""
 
 
 def tracked(stub: Any, stream: str, frames: Iterable[int] = range(30)) -> list[Any]:
@@ -180,3 +189,50 @@ def test_what_is_left_of_a_frame_is_a_message(stub: Any, stream: str) -> None:
     asked = pb.QueryTracksRequest(pattern=stream, filter=pb.TrackFilter(classes=["car"]))
     for one in stub.QueryTracks(asked):
         assert encode(convert.from_proto(one.tracks, Tracks))
+
+
+def test_200_subscribers_and_one_asleep(gateway: GatewayProcess, stream: str) -> None:
+    """All that read get every frame, the one that sleeps is told what it missed, and little memory is taken for all."""
+    # A connection of its own for each, whose window does not grow: what nobody reads waits in the gateway.
+    options = [("grpc.use_local_subchannel_pool", 1), ("grpc.http2.bdp_probe", 0)]
+    many = {"label": np.zeros(100, dtype=int), "center": np.random.default_rng(1).uniform(-90, 90, (100, 3))}
+    many |= {"size": np.tile([4.5, 1.9, 1.6], (100, 1)), "yaw": np.zeros(100), "score": np.full(100, 0.9)}
+    frames = [frame(seq, stream, **many) for seq in range(FRAMES)]
+    before = resident(gateway.process.pid)
+
+    async def subscribe(asleep: asyncio.Event | None) -> tuple[list[int], int]:
+        async with grpc.aio.insecure_channel(gateway.address, options=options) as channel:
+            asked = pb.SubscribeRequest(pattern=stream, queue=1024 if asleep is None else 8)
+            call = rpc.TrackingServiceStub(channel).Subscribe(asked)
+            await call.initial_metadata()
+            in_force.release()
+            if asleep is not None:
+                await asleep.wait()
+            received, skipped = [], 0
+            while not received or received[-1] < FRAMES - 1:
+                response = await call.read()
+                received.append(response.tracks.seq)
+                skipped += response.skipped
+            return received, skipped
+
+    in_force = asyncio.Semaphore(0)
+
+    async def together() -> None:
+        asleep = asyncio.Event()
+        readers = [asyncio.create_task(subscribe(None)) for _ in range(SUBSCRIBERS - 1)]
+        sleeper = asyncio.create_task(subscribe(asleep))
+        for _ in range(SUBSCRIBERS):
+            await in_force.acquire()
+        stub = gateway.stub()
+        for one in frames:
+            await asyncio.to_thread(lambda one=one: list(stub.Track(iter([detections(one)]))))
+        for received, skipped in await asyncio.gather(*readers):
+            assert (received, skipped) == (list(range(FRAMES)), 0)
+        taken = resident(gateway.process.pid) - before
+        asleep.set()
+        late, skipped = await sleeper
+        assert skipped > 0
+        assert len(late) + skipped == FRAMES
+        assert taken < SUBSCRIBERS * SUBSCRIBER_BYTES
+
+    asyncio.run(together())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import grpc
@@ -39,6 +40,11 @@ class GatewayProcess(ServiceProcess):
     def stub(self, options: Sequence[tuple[str, int]] = ()) -> Any:
         """The generated stub on a channel of its own."""
         return rpc.TrackingServiceStub(grpc.insecure_channel(self.address, options=options))
+
+
+def resident(pid: int) -> int:
+    """Bytes of memory of a process."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
 
 
 def frame(seq: int, stream: str = STREAM, epoch: bytes = EPOCH, **changes: Any) -> Detections:
