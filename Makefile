@@ -87,7 +87,6 @@ tests-alone: install
 bounds: install
 	$(BIN)/pytest tests/tracker -m bounds
 
-
 # For a developer: style, types, and the tests nearest to what changed since SINCE (a commit; files not committed count).
 SINCE ?= main
 check: install

@@ -46,7 +46,7 @@ def test_the_same_seed_gives_the_same_profile(tmp_path: Path, capsys: pytest.Cap
 def test_the_profile_loads_and_says_where_it_comes_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The profile has all classes, other values than before only for the class tuned, and tracks."""
     pytest.importorskip("optuna")
-    tune(tmp_path, "--json", "--metric", "mota", "--degrade", "0", "--all")
+    tune(tmp_path, "--json", "--metric", "mota", "--degrade", "0", "--all", "--fold-trials", "1")
     report = json.loads(capsys.readouterr().out)
     before, after = optipmb.load_profile("kitti-paper"), optipmb.load_profile(report["profile"])
     assert after.labels == before.labels
