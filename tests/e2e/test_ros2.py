@@ -22,22 +22,16 @@ from routers import open_client
 from service_process import ServiceProcess
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 
-pytestmark = pytest.mark.alone
-
 DOMAIN = 7
 STREAM = "garage/robot/lidar"
 TF = "tf2_msgs/msg/TFMessage"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 TRACKS = "/detector/boxes/tracks"
 START_NS = 10**18
-SETTINGS = f"""
-[ros2]
-domain = {DOMAIN}
-tf_wait_s = 1.0
-[ros2.streams."{STREAM}"]
-detections = "/detector/boxes"
-points = "/points"
-"""
+pytestmark = pytest.mark.alone
+
+PATIENCE_S = 20.0
+"""How long clouds and transforms are waited for that do come, on a busy machine."""
 
 
 @pytest.fixture(scope="module")
@@ -50,15 +44,17 @@ def scene() -> DataSequence:
 @pytest.fixture
 def service() -> Iterator[ServiceProcess]:
     """A service that is a router, and waits long enough for clouds on a busy machine."""
-    with ServiceProcess("--profile", "scene", environment={"OPTIPMB_CLOUD_WAIT_S": "20"}) as process:
+    with ServiceProcess("--profile", "scene", environment={"OPTIPMB_CLOUD_WAIT_S": str(PATIENCE_S)}) as process:
         process.wait_ready()
         yield process
 
 
-def bridge(service: ServiceProcess, folder: Path) -> ServiceProcess:
-    """Start the bridge; use it as a context manager."""
+def bridge(service: ServiceProcess, folder: Path, *, points: str = "", tf_wait_s: float = PATIENCE_S) -> ServiceProcess:
+    """Start the bridge, for a topic of points where one is named; use it as a context manager."""
     file = folder / "ros2.toml"
-    file.write_text(SETTINGS)
+    stream = f'[ros2.streams."{STREAM}"]\ndetections = "/detector/boxes"\n'
+    clouds = f'points = "{points}"\n' if points else ""
+    file.write_text(f"[ros2]\ndomain = {DOMAIN}\ntf_wait_s = {tf_wait_s}\n{stream}{clouds}")
     process = ServiceProcess("ros2", "--settings", str(file), "--connect", service.endpoint, listen=False)
     assert process.wait_ready().startswith(f"ready ros2={STREAM} ")
     return process
@@ -153,7 +149,7 @@ def test_topics_become_tracks_of_another_node(service: ServiceProcess, scene: Da
     """Detections, clouds and tf of a node that is not ours come back to it as the tracks of the same data."""
     frames = frames_of(scene)
     static = next(one.message for one in frames[0] if one.topic == "/tf_static")
-    with open_client(service.endpoint) as session, bridge(service, tmp_path) as process:
+    with open_client(service.endpoint) as session, bridge(service, tmp_path, points="/points") as process:
         publisher = publish_static(session, static)
         with ready_client(service) as client:
             play(client, frames)
@@ -195,7 +191,7 @@ def test_either_side_may_restart(service: ServiceProcess, scene: DataSequence, t
     static = next(one.message for one in frames[0] if one.topic == "/tf_static")
     with open_client(service.endpoint) as session:
         publisher = publish_static(session, static)
-        with bridge(service, tmp_path) as process:
+        with bridge(service, tmp_path, points="/points") as process:
             with ready_client(service) as client:
                 play(client, frames[:6])
                 before = ids(client.received[TRACKS][-1])
@@ -203,7 +199,7 @@ def test_either_side_may_restart(service: ServiceProcess, scene: DataSequence, t
                 play(client, frames[6:10])
                 between = ids(client.received[TRACKS][-1])
             process.process.kill()
-        with bridge(service, tmp_path), ready_client(service) as client:
+        with bridge(service, tmp_path, points="/points"), ready_client(service) as client:
             play(client, frames[10:])
             after = ids(client.received[TRACKS][-1])
             counted = told(client, "tracking")
@@ -217,7 +213,7 @@ def test_what_is_wrong_on_the_other_side_is_told(service: ServiceProcess, scene:
     """A clock that starts late, frames that tf lacks, quality of service or definitions that do not fit are told."""
     frames = frames_of(scene)
     boxes = json.loads(json.dumps(next(one for one in frames[0] if one.topic == "/detector/boxes").message))
-    with bridge(service, tmp_path) as process, ready_client(service) as client:
+    with bridge(service, tmp_path, points="/points", tf_wait_s=1.0) as process, ready_client(service) as client:
         boxes["header"]["stamp"] = {"sec": 0, "nanosec": 0}
         client.publish("/detector/boxes", bags.VISION, boxes)
         assert "simulated clock that has not started" in told(client, "header.stamp")

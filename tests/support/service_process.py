@@ -63,6 +63,8 @@ class ServiceProcess:
         for stream in (self.process.stdout, self.process.stderr):
             if stream is not None:
                 stream.close()
+        if error is not None:
+            error.add_note(f"the end of its log:\n{self.errors[-3000:]}")
 
     def wait_ready(self) -> str:
         """Return the ready line."""
