@@ -252,18 +252,20 @@ def roots(tree: Path) -> str:
 
 
 def rounds(trees: Sequence[Path], options: argparse.Namespace) -> list[dict[str, float]]:
-    """Measure each checkout in turns; return the medians of the rounds."""
+    """Measure the checkouts side by side, then each as a service; return the medians of the rounds."""
     seen: list[list[dict[str, float]]] = [[] for _ in trees]
+    command = [sys.executable, __file__, "--one", "--objects", str(options.objects), "--points", str(options.points)]
     for _ in range(options.rounds):
-        for tree, rows in zip(trees, seen, strict=True):
-            command = [sys.executable, __file__, "--one", "--objects", str(options.objects)]
-            command += ["--points", str(options.points)]
-            environment = os.environ | {"PYTHONPATH": roots(tree)}
-            answer = subprocess.run(  # noqa: S603 - this file
-                command, env=environment, check=True, capture_output=True, text=True
+        started = [
+            subprocess.Popen(  # noqa: S603 - this file
+                command, env=os.environ | {"PYTHONPATH": roots(tree)}, stdout=subprocess.PIPE, text=True
             )
-            row = json.loads(answer.stdout)
-            rows.append(row | (live(tree, options.objects, options.points, options.live) if options.live else {}))
+            for tree in trees
+        ]
+        answers = [process.communicate()[0] for process in started]
+        for tree, rows, answer in zip(trees, seen, answers, strict=True):
+            service = live(tree, options.objects, options.points, options.live) if options.live else {}
+            rows.append(json.loads(answer) | service)
     return [{part: median(row[part] for row in rows) for part in rows[0]} for rows in seen]
 
 
