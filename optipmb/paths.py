@@ -111,7 +111,7 @@ def predict_tracks(
         raise FrameError("tracks.label", classes, f"{label.min()} to {label.max()}")
     speed = tracks.velocity[:, 0] * np.cos(tracks.yaw) + tracks.velocity[:, 1] * np.sin(tracks.yaw)
     mean = np.column_stack((tracks.center[:, :2], speed, tracks.yaw, tracks.yaw_rate, tracks.acceleration))
-    unsure = np.array([doubt(p) for p in tracks.heading_confidence])
+    unsure = _doubts(tracks.heading_confidence)
     covariance = tracks.covariance.copy()
     covariance[:, PHI, PHI] -= unsure
     paths = _predict(tracks.id, label, mean, covariance, times, table)
@@ -154,6 +154,14 @@ def _predict(
         paths.covariance,
     )
     return paths
+
+
+@kernel
+def _doubts(heading_confidence: Array) -> Array:
+    unsure = np.empty(heading_confidence.shape[0])
+    for n in range(unsure.shape[0]):
+        unsure[n] = doubt(heading_confidence[n])
+    return unsure
 
 
 @kernel

@@ -65,6 +65,7 @@ TWINS = {
     "neighbours.empty_torus": "test_kernels.test_a_search_finds_every_neighbour_once",
     "neighbours.insert": "test_kernels.test_a_search_finds_every_neighbour_once",
     "reported.follow_box": "test_kernels.test_tracks_are_read_off_the_states",
+    "paths._doubts": "test_paths.test_a_doubtful_heading_changes_no_motion",
     "paths.predict_paths": "test_paths.test_states_are_predicted_as_numpy_does_step_by_step",
     "points.boxes_in_sensor": "test_geometry.test_points_in_boxes_counts_every_point",
     "points.boxes_of_cells": "test_geometry.test_points_in_boxes_counts_every_point",
