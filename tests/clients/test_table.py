@@ -219,9 +219,11 @@ def test_a_table_in_gives_a_table_out(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_processes_give_the_bytes_of_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`--jobs 2` over four recordings writes the same table as one process, and the same files into a folder."""
+    """`--jobs 2` over four recordings writes the same table as one process, and the same files in a folder."""
     plain = boxes()
     four = {name: np.concatenate([values] * 4) for name, values in plain.items()}
+    # Recordings differ, so that none may stand for another.
+    four["x"] = four["x"] + np.repeat([0.0, 1.0, 2.0, 3.0], 3 * FRAMES)
     data = table(tmp_path / "d.parquet", {**four, "log": np.repeat(["a", "b", "c", "d"], 3 * FRAMES)})
     for jobs in ("1", "2"):
         for out in ((tmp_path / jobs / "t.jsonl",), (tmp_path / jobs / "files", "--full")):
