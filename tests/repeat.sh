@@ -2,7 +2,7 @@
 # Runs `make test` again and again in fresh clones of this repository, and says how often it passed and how long it took.
 # Called as: sh tests/repeat.sh TIMES LOAD
 #   LOAD  processes that compute all the time beside it
-# The environment is made once, because installing is not what is tested. The data beside this repository are used.
+# The data beside this repository are used.
 set -eu
 times=$1
 load=$2
@@ -19,12 +19,17 @@ for _ in $(seq "$load"); do
   sh -c 'while :; do :; done' &
   busy="$busy $!"
 done
+# The environment is not what is tested: one serves all clones, which lie in the same place one after the other.
+clone=$work/clone
+VENV=$work/venv
 passed=0
 for number in $(seq "$times"); do
-  git clone --quiet "$root" "$work/$number"
-  make -s -C "$work/$number" install
+  rm -rf "$clone"
+  git clone --quiet "$root" "$clone"
+  [ ! -e "$VENV/.installed" ] || touch "$VENV/.installed"
+  make -s -C "$clone" install VENV="$VENV"
   began=$(date +%s)
-  if make -C "$work/$number" test >"$work/$number.log" 2>&1; then
+  if make -C "$clone" test VENV="$VENV" >"$work/$number.log" 2>&1; then
     passed=$((passed + 1))
     result=passed
   else
@@ -32,7 +37,6 @@ for number in $(seq "$times"); do
   fi
   echo "$number: $result $(($(date +%s) - began)) s $(grep -E '^(FAILED|ERROR)' "$work/$number.log" | head -5 | tr '\n' ' ')"
   [ "$result" = passed ] || cp "$work/$number.log" "$root/out/repeat-$number.log" 2>/dev/null || tail -50 "$work/$number.log"
-  rm -rf "$work/$number"
 done
 echo "$passed of $times passed, $load processes beside it"
 [ "$passed" = "$times" ]

@@ -77,8 +77,12 @@ class Search:
         self._seed = seed
         self._distributions = {one.path: self._distribution(one) for one in space}
         storage.parent.mkdir(parents=True, exist_ok=True)
+        from sqlalchemy.pool import NullPool  # noqa: PLC0415  comes with Optuna
+
+        # A connection for each access, closed after it: those of a pool would stay open for as long as the process.
+        kept = self._optuna.storages.RDBStorage(f"sqlite:///{storage}", engine_kwargs={"poolclass": NullPool})
         self._study = self._optuna.create_study(
-            storage=f"sqlite:///{storage}", study_name=name, direction="maximize", load_if_exists=True
+            storage=kept, study_name=name, direction="maximize", load_if_exists=True
         )
         text = json.dumps(settings, sort_keys=True)
         known = self._study.user_attrs.get("settings")
