@@ -59,7 +59,7 @@ containers: install
 # The demonstration is among the tests (tests/e2e/test_demo.py); CI also runs the command, which installs less.
 # Tests that wait for conditions share the machine with all that waits for nobody; tests that measure come after it.
 test: install
-	$(MAKE) --jobs 5 --output-sync=line lint types schemas wheel tests-together
+	$(MAKE) --jobs 5 lint types schemas wheel tests-together
 	$(MAKE) tests-alone
 
 # For figures, nothing else should run on the machine. SERVICE holds options of the service, SECONDS how long a run takes.

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from optipmb_client.commands.options import AsJson, Out, print_json, say
-from optipmb_client.commands.replay import complain
+from optipmb_client.commands.options import AsJson, Out, Speed, print_json, say
+from optipmb_client.commands.replay import complain, speed_of
 from optipmb_client.extras import needed
 from optipmb_client.progress import FrameProgress
 
@@ -15,7 +15,7 @@ def demo(
     *,
     out: Out = Path("out/demo"),
     frames: Annotated[int, typer.Option(min=10, max=2000, help="Frames of the scene, ten per second.")] = 200,
-    speed: Annotated[float, typer.Option(min=0.1, help="Multiple of real time.")] = 2.0,
+    speed: Speed = "max",
     as_json: AsJson = False,
 ) -> None:
     """Start a service, send generated traffic through it, and show what the tracks are worth.
@@ -26,7 +26,9 @@ def demo(
     from optipmb_client.demo import demonstrate  # noqa: PLC0415  loads what only this command needs
 
     with FrameProgress("replaying", frames) as progress:
-        result = demonstrate(out, frames=frames, speed=speed, on_stage=progress.note, on_frame=progress.advance)
+        result = demonstrate(
+            out, frames=frames, speed=speed_of(speed), on_stage=progress.note, on_frame=progress.advance
+        )
     replayed, figures = result.replayed, result.figures
     if as_json:
         print_json(
