@@ -210,6 +210,21 @@ def test_an_object_of_autoware_is_read_whole() -> None:
     assert boxes_of(autoware(), {"truck": "Lorry"}).labels == ("Lorry",)
 
 
+def test_a_score_of_zero_refuses_no_message() -> None:
+    """An object of score 0 is read, to be left out and counted as in every other message; one below 0 is refused."""
+    types = own_types()
+    message = autoware(existence_probability=0.0)
+    for score in (0.0, -0.5):
+        message.objects[0].classification = [
+            types.new("autoware_perception_msgs/msg/ObjectClassification", label=2, probability=score)
+        ]
+        if score < 0:
+            with pytest.raises(MessageError, match=r"objects\[0\].existence_probability: expected a score in \[0, 1\]"):
+                boxes_of(message)
+        else:
+            assert boxes_of(message).score.tolist() == [0.0]
+
+
 def test_other_shapes_become_boxes() -> None:
     """A cylinder is as long as wide; the box around a polygon is where the polygon is."""
     types = own_types()

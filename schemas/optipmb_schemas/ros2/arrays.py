@@ -44,7 +44,7 @@ class Boxes:
     yaw: NDArray[np.float64]
     """(M,) rad."""
     score: NDArray[np.float64]
-    """(M,) in (0, 1]."""
+    """(M,) in [0, 1]; an object of score 0 is left out and counted by the service."""
     velocity: NDArray[np.float64] | None
     """(M, 2) over ground along x and y of the frame, m/s; rows of NaN, or None for all, where unknown."""
 
@@ -222,8 +222,8 @@ def _size(path: str, value: Any) -> list[float]:
 
 
 def _score(path: str, value: float) -> float:
-    if not 0 < value <= 1:
-        raise invalid(path, "a score in (0, 1]", value)
+    if not 0 <= value <= 1:
+        raise invalid(path, "a score in [0, 1]", value)
     return value
 
 
