@@ -38,7 +38,7 @@ RESPONSES: Final = 256
 """Responses that may wait for a caller: more than the window, so that none are left out but for others' frames."""
 
 ACKNOWLEDGE_S: Final = 0.2
-"""Shortest time between two acknowledgements: one for every frame would cost about as much as its tracks."""
+"""Shortest time between two acknowledgements: one covers all frames since the last, to save messages."""
 
 WANTED_S: Final = 1.0
 """How long the first cloud waits for it to be known whether anybody takes clouds."""
