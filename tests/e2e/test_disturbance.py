@@ -8,14 +8,15 @@ from typing import Any, Self
 
 import numpy as np
 import pytest
-from commands import kill, optipmb, result_of, start
+from commands import kill, result_of, run_here, start
 from optipmb_client import Connection, Publisher, Subscriber
 from optipmb_client.child import ServiceProcess
+from optipmb_client.cli import run
 from optipmb_client.sessions import find_services
 from optipmb_schemas import Detections, Keys, Points, Problem, SessionParameters, Tracks, encoding_of
 from routers import open_client
 
-SCENE = ("--dataset", "scene", "--option", "frames=60", "--option", "clouds=0")
+SCENE = ("--dataset", "scene", "--option", "frames=40", "--option", "clouds=0")
 POSE = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
@@ -23,15 +24,19 @@ POSE = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 def expected(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The result file of the scene, tracked offline."""
     out = tmp_path_factory.mktemp("expected")
-    result_of(optipmb("track", *SCENE, "--out", out, "--json"))
+    assert run([str(one) for one in ("track", *SCENE, "--out", out, "--json")]) == 0
     return (out / "0000.txt").read_bytes()
 
 
-def replay(service: ServiceProcess, out: Path) -> Any:
-    """Replay the scene at twice the recorded rate, that is for three seconds."""
-    return result_of(
-        optipmb("replay", *SCENE, "--speed", 2, "--connect", service.endpoint, "--out", out, "--json", timeout=240)
-    )
+@pytest.fixture
+def replay(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[], Any]:
+    """A function that replays the scene at twice the recorded rate, that is for two seconds."""
+
+    def replay() -> Any:
+        way = ("--speed", 2, "--connect", service.endpoint, "--out", tmp_path, "--json")
+        return result_of(run_here(capsys, "replay", *SCENE, *way))
+
+    return replay
 
 
 class Disturbance:
@@ -66,18 +71,38 @@ def link(service: ServiceProcess) -> Iterator[Connection]:
 
 
 def test_a_client_killed_in_the_middle(
-    service: ServiceProcess, link: Connection, expected: bytes, tmp_path: Path
+    service: ServiceProcess, link: Connection, expected: bytes, replay: Callable[[], Any], tmp_path: Path
 ) -> None:
     """SIGKILL of one client while another replays: the other's file is that of an undisturbed run."""
-    with Subscriber("replay/*/0007", connection=link) as tracks:
+    with (
+        Subscriber("replay/*/0007", connection=link) as tracks,
+        Subscriber("replay/*/0000", connection=link) as others,
+    ):
         victim = start(
-            *("replay", *SCENE, "--option", "frames=600", "--sequences", "0007", "--speed", "1"),
+            *(
+                "replay",
+                *SCENE,
+                "--option",
+                "frames=200",
+                "--option",
+                "vehicles=5",
+                "--sequences",
+                "0007",
+                "--speed",
+                "1",
+            ),
             *("--connect", service.endpoint, "--out", tmp_path / "victim"),
         )
         assert tracks.receive(60.0) is not None, "the victim did not start"
-        killer = threading.Timer(1.0, kill, (victim,))  # in the middle of the other's three seconds
+
+        def kill_in_the_middle() -> None:
+            for _ in range(10):
+                others.receive(60.0)
+            kill(victim)
+
+        killer = threading.Thread(target=kill_in_the_middle)
         killer.start()
-        result = replay(service, tmp_path)
+        result = replay()
         killer.join(60.0)
     assert victim.returncode == -9
     assert result["missing"] == 0
@@ -85,7 +110,9 @@ def test_a_client_killed_in_the_middle(
     assert not (tmp_path / "victim" / "0007.txt").exists()
 
 
-def test_garbage_on_every_key(service: ServiceProcess, link: Connection, expected: bytes, tmp_path: Path) -> None:
+def test_garbage_on_every_key(
+    service: ServiceProcess, link: Connection, expected: bytes, replay: Callable[[], Any], tmp_path: Path
+) -> None:
     """Bytes without meaning on all topics and queries, of this stream and of others, leave the file as it is."""
     keys = Keys()
     kinds = {"detections": Detections, "points": Points, "tracks": Tracks, "problems": Problem}
@@ -109,7 +136,7 @@ def test_garbage_on_every_key(service: ServiceProcess, link: Connection, expecte
                             link.query(keys.query(stream, what), payload, encoding_of(SessionParameters), timeout=60.0)
 
         with Disturbance(disturb) as disturbance:
-            result = replay(service, tmp_path)
+            result = replay()
     assert len(streams) == 2, "the stream itself was not disturbed"
     assert disturbance.count > 50
     assert result["missing"] == 0
@@ -120,7 +147,7 @@ def test_garbage_on_every_key(service: ServiceProcess, link: Connection, expecte
 
 
 def test_classes_that_no_profile_has(
-    service: ServiceProcess, link: Connection, expected: bytes, tmp_path: Path
+    service: ServiceProcess, link: Connection, expected: bytes, replay: Callable[[], Any], tmp_path: Path
 ) -> None:
     """A stream full of unknown classes gets tracks of none of them, and disturbs nobody."""
     seen: list[Problem] = []
@@ -142,7 +169,7 @@ def test_classes_that_no_profile_has(
             )
 
         with Disturbance(disturb):
-            result = replay(service, tmp_path)
+            result = replay()
         messages = []
         while (received := tracks.receive(0.5)) is not None:
             messages.append(received.tracks)
@@ -154,7 +181,7 @@ def test_classes_that_no_profile_has(
 
 
 def test_two_publishers_of_one_stream(
-    service: ServiceProcess, link: Connection, expected: bytes, tmp_path: Path
+    service: ServiceProcess, link: Connection, expected: bytes, replay: Callable[[], Any], tmp_path: Path
 ) -> None:
     """Two programs that fight for the name of a stream leave other streams alone."""
     rng = np.random.default_rng(1)
@@ -172,7 +199,7 @@ def test_two_publishers_of_one_stream(
             )
 
         with Disturbance(disturb):
-            result = replay(service, tmp_path)
+            result = replay()
     assert result["missing"] == 0
     assert (tmp_path / "0000.txt").read_bytes() == expected
 

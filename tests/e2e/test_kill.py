@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 KILLS = int(os.environ.get("OPTIPMB_TEST_KILLS", "3"))
 SEED = int(os.environ.get("OPTIPMB_TEST_SEED", "1"))
-FRAMES = 120
+FRAMES = 60
 FEW = 10
 RESTART_S = 200.0  # on a machine that is busy with other things
 SEQUENCES = ("0000", "0002", "0004", "0011")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from commands import kill, optipmb, result_of, start
+from commands import kill, result_of, run_here, start
 from mcap.reader import make_reader
 from optipmb_client import Connection, Subscriber
 from optipmb_client.child import ServiceProcess
@@ -62,11 +62,16 @@ def newest_tracks(path: Path) -> dict[tuple[str, int], bytes]:
     return {key: encode(tracks.model_copy(update={"delivery": None})) for key, tracks in found.items()}
 
 
+def here(*arguments: object) -> int:
+    """Run the client's command in this process, where no output is looked at."""
+    return run([str(one) for one in arguments])
+
+
 def recorded_replay(service: ServiceProcess, folder: Path, data: tuple[object, ...]) -> Path:
     """Replay data through a service while it is recorded; give the recording."""
     path = folder / "incident.mcap"
     with recording(service, path) as process:
-        result_of(optipmb("replay", *data, "--connect", service.endpoint, "--out", folder / "replay", "--json"))
+        assert here("replay", *data, "--connect", service.endpoint, "--out", folder / "replay") == 0
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=DEADLINE_S)
         assert process.returncode == 0, err
@@ -74,13 +79,13 @@ def recorded_replay(service: ServiceProcess, folder: Path, data: tuple[object, .
     return path
 
 
-def play_into_another(path: Path, folder: Path, *options: object) -> None:
+def play_into_another(path: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Play a recording into a service that knows nothing, and record that; all tracks must be the same bytes."""
     with ServiceProcess() as fresh:
         fresh.wait_until_ready()
         with recording(fresh, folder / "again.mcap") as process:
             result = result_of(
-                optipmb("play", path, "--as-recorded", *options, "--connect", fresh.endpoint, "--json"),
+                run_here(capsys, "play", path, "--as-recorded", "--connect", fresh.endpoint, "--json"),
             )
             process.send_signal(signal.SIGINT)
             process.communicate(timeout=DEADLINE_S)
@@ -96,7 +101,9 @@ def play_into_another(path: Path, folder: Path, *options: object) -> None:
         assert stream["other_values"] is False
 
 
-def test_four_streams_played_into_a_fresh_service(service: ServiceProcess, tmp_path: Path) -> None:
+def test_four_streams_played_into_a_fresh_service(
+    service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Ids, sessions, numbers, stamps and every byte of the tracks are those of the recording; offline, too."""
     path = recorded_replay(service, tmp_path, (*SCENE, *FOUR))
     with path.open("rb") as file:
@@ -105,8 +112,10 @@ def test_four_streams_played_into_a_fresh_service(service: ServiceProcess, tmp_p
     assert summary.statistics is not None
     topics = {channel.topic.rsplit("/", 1)[1] for channel in summary.channels.values()}
     assert topics == {"detections", "points", "tracks", "scene", "pose", "figures", "parameters"}
-    play_into_another(path, tmp_path)
-    offline = result_of(optipmb("track", "--dataset", "mcap", "--root", path, "--out", tmp_path / "offline", "--json"))
+    play_into_another(path, tmp_path, capsys)
+    offline = result_of(
+        run_here(capsys, "track", "--dataset", "mcap", "--root", path, "--out", tmp_path / "offline", "--json")
+    )
     for entry in offline["sequences"]:
         name = entry["name"].rsplit(".", 1)[1]
         replayed = (tmp_path / "replay" / f"{name}.txt").read_bytes()
@@ -120,25 +129,33 @@ def incident(service: ServiceProcess, tmp_path_factory: pytest.TempPathFactory) 
     return recorded_replay(service, tmp_path_factory.mktemp("incident"), SCENE)
 
 
-def test_a_recording_is_played_again_and_again(service: ServiceProcess, incident: Path, tmp_path: Path) -> None:
+def test_a_recording_is_played_again_and_again(
+    service: ServiceProcess, incident: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Under names of its own it meets no session, so the same service plays it twice, with the same result files."""
     for folder in ("one", "two"):
-        done = optipmb("play", incident, "--connect", service.endpoint, "--out", tmp_path / folder, "--speed", 4)
+        done = run_here(
+            capsys, "play", incident, "--connect", service.endpoint, "--out", tmp_path / folder, "--speed", 4
+        )
         assert done.returncode == 0, done.stderr
         assert f"{FRAMES} of {FRAMES} equal to the recorded tracks" in done.stdout
     (one,), (two,) = ((tmp_path / folder).glob("*.txt") for folder in ("one", "two"))
     assert one.read_bytes() == two.read_bytes() == (incident.parent / "replay" / "0000.txt").read_bytes()
 
 
-def test_tracks_that_differ_are_told(service: ServiceProcess, incident: Path) -> None:
+def test_tracks_that_differ_are_told(
+    service: ServiceProcess, incident: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """With other parameters the tracks are others: status 1 and the number of the first frame that differs."""
-    done = optipmb("play", incident, "--connect", service.endpoint, "--profile", "kitti")
+    done = run_here(capsys, "play", incident, "--connect", service.endpoint, "--profile", "kitti")
     assert done.returncode == 1
     assert "differ from the recorded ones, the first is number" in done.stderr
     assert "profile kitti here has other values than what was in force" in done.stderr
 
 
-def test_a_killed_recording_still_plays(service: ServiceProcess, tmp_path: Path) -> None:
+def test_a_killed_recording_still_plays(
+    service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """SIGKILL in the middle of a stream: what was written until a second before is there, and plays the same."""
     path = tmp_path / "cut.mcap"
     with recording(service, path) as process, Subscriber("replay/*/0000", service.endpoint) as tracks:
@@ -152,17 +169,17 @@ def test_a_killed_recording_still_plays(service: ServiceProcess, tmp_path: Path)
     cut = RecordingFile(path)
     assert sum(one.topic == "tracks" for one in cut) >= 30 - 25  # at 10 Hz, a flush a second on a busy machine
     assert cut.cut
-    done = optipmb("play", path, "--connect", service.endpoint)
+    done = run_here(capsys, "play", path, "--connect", service.endpoint)
     assert "was cut off" in done.stderr
     assert "equal to the recorded tracks" in done.stdout
     assert done.returncode == 0, done.stderr
 
 
-def test_kitti(service: ServiceProcess, tmp_path: Path) -> None:
+def test_kitti(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Real detections, with the clouds that there are."""
     data = ("--dataset", "kitti", "--root", kitti_root(), "--detections", "pointrcnn")
-    path = recorded_replay(service, tmp_path, (*data, "--sequences", "0002", "0003", "--streams", 2))
-    play_into_another(path, tmp_path)
+    path = recorded_replay(service, tmp_path, (*data, "--sequences", "0002"))
+    play_into_another(path, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(

@@ -2,16 +2,17 @@
 
 from pathlib import Path
 
-from commands import kill, optipmb, result_of, start
+import pytest
+from commands import kill, result_of, run_here, start
 from optipmb_client import Subscriber
 from optipmb_client.child import ServiceProcess
 
 
-def test_streams_at_work_are_shown(service: ServiceProcess, tmp_path: Path) -> None:
+def test_streams_at_work_are_shown(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """While a replay runs, its stream is listed with rate and latency, in the table and as JSON."""
     with Subscriber("replay/*/0003", service.endpoint) as tracks:
         replay = start(
-            *("replay", "--dataset", "scene", "--option", "frames=600", "--option", "clouds=0", "--sequences", "0003"),
+            *("replay", "--dataset", "scene", "--option", "frames=200", "--option", "clouds=0", "--sequences", "0003"),
             *("--speed", "2", "--connect", service.endpoint, "--out", tmp_path),
         )
         try:
@@ -20,8 +21,8 @@ def test_streams_at_work_are_shown(service: ServiceProcess, tmp_path: Path) -> N
             stream = received.tracks.stream
             for _ in range(30):
                 assert tracks.receive(60.0) is not None
-            result = result_of(optipmb("status", "--connect", service.endpoint, "--json"))
-            table = optipmb("status", "--connect", service.endpoint)
+            result = result_of(run_here(capsys, "status", "--connect", service.endpoint, "--json"))
+            table = run_here(capsys, "status", "--connect", service.endpoint)
         finally:
             kill(replay)
     (status,) = result["services"]
