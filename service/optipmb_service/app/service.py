@@ -352,8 +352,9 @@ async def _serve(
     health.report(service)
     settle()
     with grpc_edge(settings, service.client, health.metrics.add):
-        parent.ready(service)
+        # In this order: who sees the ready line may send at once, and finds this event before those of a session.
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+        parent.ready(service)
         while not asked.is_set():
             await asked.wait(HOUSEKEEPING_S)
             service.housekeeping()

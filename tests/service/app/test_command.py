@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from optipmb_schemas import Keys, ServiceStatus, SessionParameters
+from optipmb_service.app import cli
 from router import Node, Sensor
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
@@ -22,16 +23,15 @@ SENSOR = Sensor()
 END_S = 30.0
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_in_order(number: signal.Signals) -> None:
-    """After SIGINT or SIGTERM in the midst of a stream it ends by itself with status 0."""
+def test_a_signal_ends_it_in_order() -> None:
+    """After SIGINT in the midst of a stream it ends by itself with status 0."""
     with ServiceProcess("--instance", "one") as service:
         assert service.wait_ready() == f"ready instance=one endpoints={service.endpoint}"
         with Node(service.endpoint) as node:
             node.send(*(SENSOR.detections(seq) for seq in range(5)))
             assert len(node.tracks(SENSOR.stream, 5)) == 5
             node.send(SENSOR.detections(5, has_points=True))
-            status, seconds = service.end(number)
+            status, seconds = service.end(signal.SIGINT)
         assert (status, service.output) == (0, [])
         assert seconds < END_S
         assert "Traceback" not in service.errors
@@ -56,7 +56,7 @@ def test_a_signal_during_the_start_ends_it() -> None:
 
 
 def test_the_last_frames_are_tracked() -> None:
-    """Frames that were received before the signal still become tracks."""
+    """Frames that were received before a SIGTERM still become tracks, and it ends with status 0, in order."""
     with ServiceProcess() as service:
         service.wait_ready()
         with Node(service.endpoint) as node:
@@ -68,7 +68,8 @@ def test_the_last_frames_are_tracked() -> None:
             service.process.send_signal(signal.SIGTERM)
             node.tracks(SENSOR.stream, 2)
             gone.wait(lambda items: items[-1:] and items[-1][1] == b"-", "the end of the alive token")  # type: ignore[arg-type,return-value]  # a list is as good as its truth
-        assert service.wait_end() == 0
+        assert (service.wait_end(END_S), service.output) == (0, [])
+        assert "Traceback" not in service.errors
 
 
 def test_a_killed_service_is_seen_at_once_and_may_come_back() -> None:
@@ -121,24 +122,50 @@ def test_a_port_in_use_is_one_clear_line() -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--nonsense",), "No such option"),
-        (("nonsense",), "No such command"),
-        (("--listen", "7447"), "an endpoint looks like"),
         (("--profile", "unheard-of"), "profile: expected one of kitti, "),
         (("--profile", "/no/such/file.toml"), "/no/such/file.toml"),
-        (("--settings", "/no/such/file.toml"), "No such file"),
-        (("--instance", "a/b"), "instance"),
-        (("--log-format", "xml"), "'console' or 'json'"),
+        (("--settings", "OWN"), "unheard-of"),
     ],
 )
-def test_wrong_use_is_one_clear_line(options: tuple[str, ...], says: str) -> None:
-    """Status 2 and one line on stderr that says what is wrong; nothing on stdout."""
-    with ServiceProcess(*options, listen=False) as service:
+def test_a_profile_that_there_is_not_is_one_clear_line(options: tuple[str, str], says: str, tmp_path: Path) -> None:
+    """A process that cannot read its profiles ends with status 2 and one line on stderr; nothing is on stdout."""
+    own = tmp_path / "settings.toml"
+    own.write_text("[profiles]\n'a/*' = 'unheard-of'")
+    with ServiceProcess(*(one.replace("OWN", str(own)) for one in options), listen=False) as service:
         assert service.wait_end(120) == 2
         assert service.errors.count("\n") == 1
         assert service.errors.startswith("optipmb-service: ")
         assert says in service.errors
         assert service.output == []
+
+
+def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *options: str, says: str) -> None:
+    """Run the command in this process, which must refuse its options before anything is started."""
+    monkeypatch.setattr(cli, "_run_one", lambda _: pytest.fail("it was started"))
+    with pytest.raises(SystemExit) as ended:
+        cli.main(options)
+    shown = capsys.readouterr()
+    assert (ended.value.code, shown.out, shown.err.count("\n")) == (2, "", 1)
+    assert shown.err.startswith("optipmb-service: ")
+    assert says in shown.err
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--nonsense",), "No such option"),
+        (("nonsense",), "No such command"),
+        (("--listen", "7447"), "an endpoint looks like"),
+        (("--settings", "/no/such/file.toml"), "No such file"),
+        (("--instance", "a/b"), "instance"),
+        (("--log-format", "xml"), "'console' or 'json'"),
+    ],
+)
+def test_wrong_use_is_one_clear_line(
+    options: tuple[str, ...], says: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Status 2 and one line on stderr that says what is wrong; nothing on stdout."""
+    refused(capsys, monkeypatch, *options, says=says)
 
 
 @pytest.mark.parametrize(
@@ -147,18 +174,16 @@ def test_wrong_use_is_one_clear_line(options: tuple[str, ...], says: str) -> Non
         ("cloud_wait_s = -1", "cloud_wait_s (from the file)"),
         ("no_such_setting = 1", "no_such_setting"),
         ("listen = 'tcp/[", "settings file"),
-        ("[profiles]\n'a/*' = 'unheard-of'", "unheard-of"),
         ("[limits]\nmax_bytes = 'many'", "limits.max_bytes"),
     ],
 )
-def test_a_bad_settings_file_is_one_clear_line(tmp_path: Path, text: str, says: str) -> None:
+def test_a_bad_settings_file_is_one_clear_line(
+    tmp_path: Path, text: str, says: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Status 2 and one line that names the setting and where it came from."""
     file = tmp_path / "settings.toml"
     file.write_text(text)
-    with ServiceProcess("--settings", str(file), listen=False) as service:
-        assert service.wait_end(120) == 2
-        assert service.errors.count("\n") == 1
-        assert says in service.errors
+    refused(capsys, monkeypatch, "--settings", str(file), says=says)
 
 
 def test_json_logs_and_an_own_profile(tmp_path: Path) -> None:
