@@ -61,7 +61,7 @@ def metrics() -> str:
 
 def _setting(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
     default = field.get_default(call_default_factory=False) if field.default_factory is None else None
-    shown = "" if default is None or default == () else f"`{_plain(default)}`"
+    shown = "required" if field.is_required() else "" if default is None or default == () else f"`{_plain(default)}`"
     bounds = [
         f"{sign} {_plain(getattr(rule, kind))}"
         for rule in field.metadata

@@ -199,17 +199,17 @@ class Settings(BaseSettings):
     )
     profiles: dict[str, str] = Field(
         default_factory=dict,
-        description="table of stream pattern (as `site/*/lidar*`) to profile name or file; the first match holds",
+        description="table of stream pattern (as `site/*/lidar*`) to profile name or file; the first match applies",
     )
     cloud_wait_s: float = Field(default=0.1, ge=0, le=60, description="longest wait of a frame for its point cloud")
     cloud_memory_s: float = Field(
         default=2.0,
         ge=0,
         le=3600,
-        description="frames that do not say whether a cloud comes wait if one came this lately, in stamps",
+        description="frames without `has_points` wait for a cloud if the stream had one within this time, in stamps",
     )
     gap_limit_s: float = Field(
-        default=5.0, gt=0, le=86400, description="a larger step of the stamps, ahead or back, starts the session anew"
+        default=5.0, gt=0, le=86400, description="a larger step of the stamps, ahead or back, restarts the session"
     )
     rewind_s: float = Field(
         default=1.0,
@@ -236,7 +236,7 @@ class Settings(BaseSettings):
         default=16, ge=1, le=1024, description="point clouds kept per stream; the oldest is shed beyond it"
     )
     workers: int = Field(
-        default=1, ge=1, le=64, description="processes that track, each a share of the streams; 1: this process itself"
+        default=1, ge=1, le=64, description="processes that track, each some of the streams; 1: this process itself"
     )
     max_pairs: int = Field(
         default=20_000,

@@ -18,58 +18,58 @@ if TYPE_CHECKING:
 
 EVENTS: Final = {
     "starting": "The service compiles or loads its kernels; the first start after an installation takes a minute.",
-    "connecting": "As a client it waits for a router; nothing else happens until one answers. Check `connect`.",
+    "connecting": "The service is a client and waits for a router. If this lasts, check `connect`.",
     "http": "Health, metrics and the live page are served at `address`.",
-    "ready": "Streams and queries are served. stdout has the ready line.",
+    "ready": "Streams and queries are served; the ready line was printed to stdout.",
     "grpc": "gRPC is served at `address`.",
     "grpc_call": "A call over gRPC has ended (level debug).",
-    "grpc_connections": "Fewer connections over gRPC are allowed than the setting says, for want of files.",
-    "grpc_invalid": "A message of the network was not valid and was not sent on to callers.",
-    "grpc_certificates": "Renewed certificates of gRPC cannot be read; those before them go on.",
-    "unknown_environment": "Variables that start with `OPTIPMB_` and are no setting: usually a typing error.",
-    "peer_connected": "A node, router or service is linked to this process.",
-    "peer_lost": "That link is gone. A client links again by itself and recovers what the caches still hold.",
+    "grpc_connections": "Fewer gRPC connections than the setting are allowed, by the limit of open files.",
+    "grpc_invalid": "An invalid message from the network was not forwarded to callers.",
+    "grpc_certificates": "Renewed gRPC certificates cannot be read; the previous ones stay in use.",
+    "unknown_environment": "Variables that start with `OPTIPMB_` but are not settings, usually misspelt.",
+    "peer_connected": "A node, router or service has connected to this process.",
+    "peer_lost": "That connection is lost. A client reconnects and recovers what the caches still hold.",
     "session_opened": "A stream sent its first valid message, or parameters were set for it.",
-    "session_restored": "A stream's session goes on from its checkpoint; what it missed is asked of the publishers.",
+    "session_restored": "A session continues from its checkpoint; missed frames are requested from publishers.",
     "session_begun": "A density began: `first` frame, `publisher` restarted with a jump, a `jump` of stamps, `reset`, "
-    "`parameters`, a `pose` far off, a density of too much `effort`, the end of a `quarantine`. Repeated jumps: check"
+    "`parameters`, an implausible `pose`, too much `effort`, the end of a `quarantine`. Repeated jumps: check"
     " the sensor's clock.",
-    "session_quarantined": "Tracking a stream raised `error`: its frames are refused until a reset or another start of "
+    "session_quarantined": "Tracking a stream raised `error`: its frames are refused until a reset or a restart of "
     "the publisher. Its last frames are saved; report them.",
     "stream_degraded": "A message took `took_s` of processor time; the stream's messages are refused for `refused_s`.",
     "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` elsewhere, lacking `memory`,"
     " `evicted` for a stream of another site, or `superseded` by another instance.",
     "checkpoint_torn": "A checkpoint cannot be read; it is set aside and the one before it is used.",
     "checkpoint_refused": "Another instance has taken the stream over; this one's checkpoint was not written.",
-    "checkpoints_expired": "The checkpoints of so many streams went: nothing was saved of them for `keep_days`.",
-    "checkpoint_failed": "The checkpoint of one stream cannot be made: a fault of the service, report it."
-    " The stream goes on, others are kept; the state is `degraded`.",
-    "store_failed": "Checkpoints cannot be written (disk full, read-only?): tracking goes on, the state is `degraded`.",
+    "checkpoints_expired": "Checkpoints of streams without a new one for `keep_days` were deleted.",
+    "checkpoint_failed": "The checkpoint of one stream cannot be made: a bug, report it."
+    " The stream continues, other checkpoints are written; the state is `degraded`.",
+    "store_failed": "Checkpoints cannot be written (disk full, read-only): tracking goes on, the state is `degraded`.",
     "store_back": "Checkpoints are written again.",
-    "write_lease_lapsed": "This process was frozen, starved or cut off: nothing is published until it has looked"
+    "write_lease_lapsed": "This process was frozen, starved or cut off: nothing is published until it has checked"
     " whether another instance took over.",
-    "write_lease_renewed": "It has looked; what is still its own goes on.",
+    "write_lease_renewed": "The check is done; streams that it still owns continue.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",
-    "stream_back": "Frames came again.",
-    "problem": "Something was refused or lost; `count` equal ones since the last line. See the problems below.",
-    "ros2_mismatch": "An endpoint of ROS does not fit ours: another type or definition, or a quality of service that"
-    " DDS would refuse. `message` says which node, and what it should be.",
+    "stream_back": "Frames arrive again.",
+    "problem": "A message was refused or lost; `count` of this kind since the last line. See the table of problems.",
+    "ros2_mismatch": "An endpoint of ROS 2 does not match: another type or definition, or a quality of service that"
+    " DDS would refuse. `message` names the node and what is expected.",
     "claim_failed": "The tracks of a stream cannot be published; the network is closing.",
-    "publish_failed": "Tracks could not be handed to Zenoh; the network is closing.",
-    "reply_failed": "Who asked was gone before the answer.",
+    "publish_failed": "Tracks could not be passed to Zenoh; the network is closing.",
+    "reply_failed": "The client of a query had left before the reply.",
     "query": "A query was answered (level debug).",
-    "internal_error": "A fault of the service, with its traceback: report it. The stream goes on.",
+    "internal_error": "A bug, with its traceback: report it. The stream continues.",
     "worker_started": "The parent has started a worker process.",
     "worker_ended": "A worker process has ended by itself, with this status (below 0: killed by this signal). It is"
-    " started again after `again_s`, and its streams come back; until then the state is `degraded`.",
-    "worker_stuck": "A worker has given no sign of life for `silent_s`; it is killed and started again.",
-    "worker_killed": "A worker process did not end, or answer, in time.",
+    " restarted after `again_s` and continues its streams; until then the state is `degraded`.",
+    "worker_stuck": "A worker has not responded for `silent_s`; it is killed and restarted.",
+    "worker_killed": "A worker process did not end or respond in time and was killed.",
     "metrics_unreadable": "The metrics of a worker cannot be read; those of the others are shown.",
     "parent_gone": "A worker noticed that its parent has died, and ends.",
-    "stream_moved": "An operator gave the stream to another worker.",
-    "stop_asked": "SIGINT or SIGTERM came, or the parent ends its worker; it ends within two seconds.",
-    "stop_asked_again": "Another signal came; it changes nothing.",
-    "stopped": "The end. `drained` is false when a step was abandoned because it took too long.",
+    "stream_moved": "An operator moved the stream to another worker.",
+    "stop_asked": "SIGINT or SIGTERM, or the parent ends its worker; it stops within two seconds.",
+    "stop_asked_again": "Another signal, which has no effect.",
+    "stopped": "The service has stopped. `drained` is false when a step took too long and was abandoned.",
 }
 """Every event that is logged, and what an operator makes of it."""
 

@@ -7,22 +7,22 @@ from typing import Final
 import optipmb_schemas as schemas
 
 CODES: Final = {
-    "malformed": ("The bytes are no message.", "Check the publisher's encoder; compare with the JSON Schemas."),
-    "wrong_type": ("Another message type than belongs on the key.", "Check the key and the encoding of the publisher."),
-    "unsupported_version": ("A major version that this service does not know.", "Update the service or the publisher."),
+    "malformed": ("The bytes are not a message.", "Check the publisher's encoder; compare with the JSON Schemas."),
+    "wrong_type": ("The message type does not belong on this key.", "Check the key and the encoding of the publisher."),
+    "unsupported_version": ("The service does not support this major version.", "Update the service or the publisher."),
     "too_large": ("A size, count or nesting above the limit.", "Send less, or raise `limits`."),
     "missing_field": ("A required field is absent.", "Send the field that `path` names."),
     "invalid_value": ("A field has a wrong value; the whole frame is refused.", "Look at `path`: NaN, sizes, scores?"),
     "unknown_class": (
-        "Objects of a class that the profile lacks are left out; told once per session.",
+        "Objects of a class that the profile lacks are left out; reported once per session.",
         "Choose another profile, or send the names of its classes.",
     ),
     "late": (
         "The frame came later than the window in which tracks are corrected.",
         "Publish in order, or raise `rewind_s`.",
     ),
-    "duplicate_epoch": ("A publisher that another one has replaced still sends.", "Stop one of the two publishers."),
-    "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or give more processors."),
+    "duplicate_epoch": ("A publisher that was replaced by another one still sends.", "Stop one of the two publishers."),
+    "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or add processors."),
     "refused": (
         "No room for another session, or a change that needs a restart.",
         "Raise `max_sessions` or quotas; see `path`.",
@@ -32,23 +32,23 @@ CODES: Final = {
         "Send less, or raise `node_rate`, `node_mb_s`, `site_rate`, `site_mb_s`.",
     ),
     "astray": (
-        "The sensor cannot have got there since its last frame; the frame is refused.",
+        "The sensor cannot have reached this pose since its last frame; the frame is refused.",
         "Check the localisation; if it is right, raise `max_speed`.",
     ),
     "time_jump": (
-        "The stamp lies far from those before it; the frame is refused until several in a row agree.",
+        "The stamp is far from those before it; frames are refused until several in a row agree.",
         "Check the sensor's clock.",
     ),
     "restarted": (
-        "The session began anew: its tracks have ended, ids go on. `received` says why, and how far the stamps jumped.",
-        "After a `jump` or `pose`: check clock and localisation. A `publisher` that was restarted later: nothing.",
+        "The session restarted: its tracks ended, ids continue. `received` has the reason and the jump of stamps.",
+        "After `jump` or `pose`: check clock and localisation. After `publisher` (a restart): nothing.",
     ),
     "overload": (
-        "The frame needs more computing than one may, or the frames of the stream did; it is refused.",
+        "The frame, or the stream, exceeds its limit of computing time; the frame is refused.",
         "Suppress overlapping boxes in the detector, send less, or raise `max_pairs`, `step_limit_s`.",
     ),
     "internal": (
-        "A fault of the service; the session is quarantined, its last frames are saved.",
+        "A bug in the service; the session is quarantined, its last frames are saved.",
         "Report it with the saved file; `optipmb track --dump` replays it.",
     ),
     "quarantined": (
