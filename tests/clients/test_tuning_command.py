@@ -1,21 +1,10 @@
-"""The commands tune and ablate, on generated scenes."""
+"""The command tune, on generated scenes."""
 
 import json
-from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
 from optipmb_client.cli import run
-from optipmb_client.tuning import ROWS
-from optipmb_client.tuning.caution import Jury
-from optipmb_client.tuning.evidence import prune, weigh
-from optipmb_client.tuning.material import load, of_class
-from optipmb_client.tuning.objective import Bench
-from optipmb_client.tuning.scoring import rules_of, scorer_of
-from optipmb_client.tuning.values import Value, only, value_of, with_values
-from optipmb_client.tuning.watch import Quiet
-from tuning_cases import Habits, recorded
 
 import optipmb
 
@@ -94,40 +83,6 @@ def test_wrong_wishes_are_told_in_one_line(
     assert "\n" not in error
 
 
-@pytest.fixture
-def bench() -> Iterator[Bench]:
-    """Three recordings of cars."""
-    whole, rules = optipmb.load_profile("kitti-paper"), rules_of("scene")
-    sequences = [recorded(Habits(), seed, frames=25, objects=10, name=f"{seed:04d}") for seed in range(3)]
-    clips = [of_class(load(one, whole, rules), "Car", rules) for one in sequences]
-    with Bench([clips], scorer_of("scene", "Car", sequences), "mota") as made:
-        yield made
-
-
-def test_a_change_that_does_not_pay_is_taken_back(bench: Bench) -> None:
-    """Of two changed values, the one with a use is kept and the idle one is put back; the use is told."""
-    start = with_values(only(optipmb.load_profile("kitti-paper"), "Car"), "Car", {"gate": 0.1})
-    before: dict[str, Value] = {"gate": 0.1, "birth.acceleration": value_of(start, "Car", "birth.acceleration")}
-    made = partial(with_values, start, "Car")
-    jury = Jury(bench, range(3), start)
-    chosen = prune(jury, made, before, {"gate": 4.0, "birth.acceleration": 1.1}, 1.0, Quiet())
-    assert chosen == {"gate": 4.0}
-    (found,) = weigh(jury, made, before, chosen, Quiet())
-    assert (found.path, found.start, found.value, found.positive, found.groups) == ("gate", 0.1, 4.0, 3, 3)
-    assert found.gain > 3.0 * found.error > 0.0
-
-
-def test_the_start_needs_no_caution_and_others_do(bench: Bench) -> None:
-    """The cautious score of the start is its score; that of others is less than theirs by their error."""
-    start = only(optipmb.load_profile("kitti-paper"), "Car")
-    jury = Jury(bench, range(3), start)
-    assert jury.score(start, 5.0) == jury.gain(start).value
-    other = with_values(start, "Car", {"score_filter": 0.6})
-    found = jury.gain(other)
-    assert found.error > 0.0
-    assert jury.score(other, 2.0) == pytest.approx(found.value - 2.0 * found.error)
-
-
 def test_the_page_uses_options_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     """Every command of docs/tuning.md has a help, and every option in it is named there."""
     lines = [line for line in PAGE.read_text().splitlines() if line.startswith("optipmb ")]
@@ -137,24 +92,3 @@ def test_the_page_uses_options_that_there_are(capsys: pytest.CaptureFixture[str]
         assert run([command, "--help"]) == 0
         text = capsys.readouterr().out
         assert all(word in text for word in words if word.startswith("--")), line
-
-
-def test_the_ablation_has_the_sixteen_rows_of_the_paper(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All choices of four modules, each once, from none to all; as a table and as JSON."""
-    monkeypatch.setenv("COLUMNS", "200")  # a narrow terminal has the table in parts
-    assert len(set(ROWS)) == 16
-    assert (ROWS[0], len(ROWS[-1])) == (frozenset(), 4)
-    assert run(["ablate", *SCENE, "--classes", "Car"]) == 0
-    lines = capsys.readouterr().out.strip().splitlines()
-    assert len(lines) == 18
-    assert lines[-1].split()[:4] == ["x"] * 4
-    assert run(["ablate", *SCENE, "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["rows"]
-    assert [sum(row["modules"].values()) for row in rows] == [len(on) for on in ROWS]
-    for row in rows:
-        assert row["frames_per_second"] > 0.0
-        assert set(row["classes"]) == {"Car", "Pedestrian", "Cyclist"}
-        assert row["overall"]["FN"] == sum(one["FN"] for one in row["classes"].values())
-    assert len({json.dumps(row["overall"]) for row in rows}) > 4

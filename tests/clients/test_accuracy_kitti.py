@@ -1,0 +1,47 @@
+"""How accurate the profile that ships is on KITTI: below these figures something has been lost."""
+
+import pytest
+from accuracy import figures, material
+from greedy import greedy_tracks
+from kalman import kalman_tracks
+from optipmb_client.evaluation.calibration import CalibrationResult
+from optipmb_client.tuning.calibrate import cross_calibration
+from optipmb_client.tuning.values import only
+
+import optipmb
+
+
+def calibration(profile: str, detections: str, name: str) -> CalibrationResult:
+    """How well the tracks of one class know themselves, each sequence with the calibration that the others give."""
+    scorers, clips = material(profile, detections)
+    return cross_calibration(clips[name], scorers[name], only(optipmb.load_profile(profile), name))
+
+
+@pytest.mark.parametrize(("name", "lead"), [("Car", 0.02), ("Pedestrian", 0.04), ("Cyclist", 0.1)])
+def test_kitti_is_tracked_better_than_by_simple_trackers(name: str, lead: float) -> None:
+    """The same detections, the same evaluator: sAMOTA and MOTA lead those of the greedy and of AB3DMOT's tracker."""
+    scorers, clips = material("kitti", "pointrcnn")
+    own = figures("kitti", "pointrcnn", name)
+    for simple in (greedy_tracks, kalman_tracks):
+        other = scorers[name].figures([scorers[name].measure(clip, simple(clip, name)) for clip in clips[name]])
+        assert own.samota >= other.samota + lead
+        assert own.mota >= other.mota + lead
+        assert own.amota >= other.amota + lead
+
+
+@pytest.mark.parametrize("name", ["Car", "Pedestrian", "Cyclist"])
+def test_kitti_is_tracked_at_least_as_well_as_with_the_papers_values(name: str) -> None:
+    """Neither sAMOTA nor MOTA is less than with the values of the paper's table, by more than a thousandth."""
+    tuned, paper = figures("kitti", "pointrcnn", name), figures("kitti-paper", "pointrcnn", name)
+    assert tuned.samota >= paper.samota - 0.001
+    assert tuned.mota >= paper.mota - 0.001
+
+
+def test_car_tracks_know_themselves() -> None:
+    """In sequences left out NEES is 2 within what objects leave open, and existence comes true within ten points."""
+    found = calibration("kitti", "pointrcnn", "Car")
+    low, high = found.interval
+    assert low < 2.0 < high
+    rows = [one for one in found.deciles if one.count >= 100]
+    assert len(rows) == 10
+    assert all(abs(one.predicted - one.observed) < 0.1 for one in rows)

@@ -1,0 +1,57 @@
+"""How accurate the profile that ships is on nuScenes, and that its tables and itself come out again."""
+
+from pathlib import Path
+
+import pytest
+from accuracy import figures, material
+from greedy import greedy_tracks
+from optipmb_client.cli import run
+from real_data import nuscenes_root
+
+import optipmb
+
+DOCS = Path(__file__).parents[2] / "docs"
+PROFILES = Path(optipmb.__file__).parent / "profiles"
+
+
+@pytest.mark.parametrize(("name", "amota", "hota"), [("car", 0.85, 0.66), ("pedestrian", 0.92, 0.74)])
+def test_nuscenes_is_tracked_like_by_the_best_public_trackers(name: str, amota: float, hota: float) -> None:
+    """Official AMOTA (theirs: 0.866, 0.886), HOTA of all that is written (0.608, 0.609), at most three switches."""
+    found = figures("nuscenes", "centerpoint", name)
+    assert found.amota >= amota
+    assert found.hota_all >= hota
+    assert found.ids <= 3
+
+
+@pytest.mark.parametrize("detections", ["centerpoint", "pointpillars"])
+def test_no_class_is_tracked_worse_than_greedily(detections: str) -> None:
+    """With either detector, one without velocities: each class that is found has at least the greedy AMOTA."""
+    scorers, clips = material("nuscenes", detections)
+    compared = 0
+    for name, scorer in scorers.items():
+        if any(len(frame.score) for clip in clips[name] for frame in clip.frames):
+            simple = scorer.figures([scorer.measure(clip, greedy_tracks(clip, name)) for clip in clips[name]])
+            assert figures("nuscenes", detections, name).amota >= simple.amota, name
+            compared += 1
+    assert compared >= 2
+
+
+def test_the_tables_of_the_ablation_come_out_as_they_are_written(capsys: pytest.CaptureFixture[str]) -> None:
+    """`optipmb ablate` prints the sixteen rows of each class that docs/ablation.md has, but for frames per second."""
+    data = ["--dataset", "nuscenes", "--root", str(nuscenes_root()), "--detections", "centerpoint"]
+    assert run(["ablate", *data, "--markdown"]) == 0
+    rows = [line.rsplit("|", 2)[0] for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    assert len(rows) == 18 * 6  # five classes that are labelled, and all
+    page = (DOCS / "ablation.md").read_text(encoding="utf-8")
+    section = page[page.index("## nuScenes") :].split("\n## ")[0]
+    assert rows == [line.rsplit("|", 2)[0] for line in section.splitlines() if line.startswith("|")]
+
+
+def test_the_profile_that_ships_is_what_tuning_gives(tmp_path: Path) -> None:
+    """The command of docs/tuning.md for nuScenes writes the profile that ships, byte for byte."""
+    page = (DOCS / "tuning.md").read_text(encoding="utf-8")
+    (line,) = (line for line in page.splitlines() if line.startswith("optipmb tune") and "--name nuscenes" in line)
+    words = line.split()[1:]
+    words[words.index("--root") + 1], words[words.index("--out") + 1] = str(nuscenes_root()), str(tmp_path)
+    assert run(words) == 0
+    assert (tmp_path / "tuned.toml").read_bytes() == (PROFILES / "nuscenes.toml").read_bytes()

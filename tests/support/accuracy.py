@@ -1,0 +1,36 @@
+"""What profiles that ship reach on real data: figures of each class, computed once in a process."""
+
+from functools import cache
+
+from optipmb_client.datasets import open_dataset
+from optipmb_client.tuning.figures import Figures
+from optipmb_client.tuning.material import Clip, load, of_class, track_clip
+from optipmb_client.tuning.scoring import Scorer, rules_of, scorer_of
+from optipmb_client.tuning.values import only
+from real_data import kitti_root, nuscenes_root
+
+import optipmb
+
+
+@cache
+def material(dataset: str, detections: str) -> tuple[dict[str, Scorer], dict[str, list[Clip]]]:
+    """Scorers and clips of each class that is labelled."""
+    root = kitti_root() if dataset == "kitti" else nuscenes_root()
+    options = {"z_bottom": True} if detections == "pointpillars" else {}
+    sequences = open_dataset(dataset, root, detections, clouds=False, **options).sequences(["all"])
+    rules = rules_of(dataset)
+    clips = [load(one, optipmb.load_profile(dataset), rules) for one in sequences]
+    labelled = {str(name) for clip in clips for name in clip.truth.names[~clip.truth.ignored]}
+    names = [name for name in optipmb.load_profile(dataset).labels if name in labelled]
+    return (
+        {name: scorer_of(dataset, name, sequences) for name in names},
+        {name: [of_class(clip, name, rules) for clip in clips] for name in names},
+    )
+
+
+@cache
+def figures(profile: str, detections: str, name: str) -> Figures:
+    """The figures of one class by one profile."""
+    scorers, clips = material(profile.removesuffix("-paper"), detections)
+    parameters = only(optipmb.load_profile(profile), name)
+    return scorers[name].figures([scorers[name].measure(clip, track_clip(clip, parameters)) for clip in clips[name]])
