@@ -20,6 +20,9 @@ import zenoh_ros2_sdk as sdk
 from zenoh_ros2_sdk.session import ZenohSession
 from zenoh_ros2_sdk.utils import get_type_hash
 
+# As patient as the product: by default what has waited for a millisecond on a busy machine is dropped, reliable or not.
+DROP = "transport/link/tx/queue/congestion_control/drop"
+os.environ["ZENOH_CONFIG_OVERRIDE"] = f"{DROP}/wait_before_drop=1000000;{DROP}/max_wait_before_drop_fragments=5000000"
 SEPARATOR = "=" * 80 + "\nMSG: "
 DEADLINE_S = 60.0
 
@@ -81,8 +84,14 @@ class Ros2Client:
         """Wait until what came on a topic is as wanted, and give it."""
         with self._changed:
             met = self._changed.wait_for(lambda: true(self.received[topic]), DEADLINE_S)
-            assert met, f"{topic}: {self.received[topic][-1:]}"
+            assert met, f"{topic}: {len(self.received[topic])} messages; {self._diagnosis()}"
             return list(self.received[topic])
+
+    def _diagnosis(self) -> str:
+        """Give what the newest diagnostics say, for a failure."""
+        newest = self.received.get("/diagnostics", [])[-1:]
+        said = [(status.message, [(v.key, v.value) for v in status.values]) for one in newest for status in one.status]
+        return f"diagnostics: {said}"
 
     def close(self) -> None:
         """Close everything: the session is shared by all of the process."""
