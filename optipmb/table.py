@@ -197,5 +197,14 @@ def _left_over(parameters: ClassParameters, name: str) -> float:
     """R_x of `optipmb.reported`: 1 / (1 / R' - 1 / R), zero where boxes are reported as they are."""
     if parameters.reported_noise is None:
         return 0.0
-    precision = getattr(parameters.reported_noise, name) ** -2 - getattr(parameters.measurement_noise, name) ** -2
+    reported, measured = getattr(parameters.reported_noise, name), getattr(parameters.measurement_noise, name)
+    precision = _precision(reported) - _precision(measured)
     return float(1.0 / precision) if precision > 0.0 else 0.0
+
+
+def _precision(deviation: float) -> float:
+    """1 / R; infinite where it is larger than any number."""
+    try:
+        return float(deviation**-2)
+    except OverflowError:
+        return math.inf

@@ -58,12 +58,13 @@ def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -
 
 def _tracks(fields: Any, limits: Limits) -> pb.Tracks | None:
     """Return the tracks of fields that are as a service writes them, else None."""
-    if not fields.keys() >= _REQUIRED or len(fields["labels"]) > limits.max_labels:
+    # Fields that nobody here knows are of a newer version.
+    made = {name: value for name, value in fields.items() if name in _NAMES and value is not None}
+    if not made.keys() >= _REQUIRED or len(made["labels"]) > limits.max_labels:
         return None
     (rows,) = fields["id"]["shape"]
     if rows > limits.max_tracks:
         return None
-    made = {name: value for name, value in fields.items() if name in _NAMES}  # others are of a newer version
     for name, dtype, code, tail, size in _COLUMNS:
         block = made.get(name)
         if block is not None:
