@@ -73,9 +73,9 @@ lint: install
 types: install
 	$(BIN)/mypy
 
-# Kernels are compiled once, before processes that would each compile them. JOBS is more than two processors: many tests
-# wait for other processes. Those that measure memory and times run after the others, one by one.
-JOBS ?= 4
+# Kernels are compiled once, before processes that would each compile them. With more JOBS than processors it takes about
+# as long, and answers come late. Tests that measure memory and times run after the others, one by one.
+JOBS ?= 2
 tests-together: install
 	$(BIN)/optipmb warm-up
 	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not alone and not bounds"

@@ -257,7 +257,7 @@ def rounds(trees: Sequence[Path], options: argparse.Namespace) -> list[dict[str,
     command = [sys.executable, __file__, "--one", "--objects", str(options.objects), "--points", str(options.points)]
     for _ in range(options.rounds):
         started = [
-            subprocess.Popen(  # noqa: S603 - this file
+            subprocess.Popen(  # noqa: S603 - it calls itself, with numbers
                 command, env=os.environ | {"PYTHONPATH": roots(tree)}, stdout=subprocess.PIPE, text=True
             )
             for tree in trees
@@ -280,15 +280,15 @@ def main() -> None:
     parser.add_argument("--one", action="store_true", help="one round of the packages on the search path, as JSON")
     options = parser.parse_args()
     if options.one:
-        print(json.dumps(measured(options.objects, options.points)))  # noqa: T201 - the parent reads it
+        print(json.dumps(measured(options.objects, options.points)))
         return
     trees = [*([options.beside.resolve()] if options.beside else []), HERE]
     results = rounds(trees, options)
-    print("| part | " + " | ".join(["before", "after", "ratio"] if options.beside else ["us"]) + " |")  # noqa: T201
+    print("| part | " + " | ".join(["before", "after", "ratio"] if options.beside else ["us"]) + " |")
     for part in results[0]:
         values = [result[part] for result in results]
         shown = [f"{value:.1f}" for value in values] + [f"{values[-1] / values[0]:.2f}"] * (len(values) - 1)
-        print(f"| {part} | " + " | ".join(shown) + " |")  # noqa: T201
+        print(f"| {part} | " + " | ".join(shown) + " |")
 
 
 if __name__ == "__main__":

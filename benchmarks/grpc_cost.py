@@ -147,7 +147,7 @@ class Echo:
 
     def __init__(self, request: bytes, size: int) -> None:
         command = [sys.executable, __file__, "--echo", str(size)]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)  # noqa: S603 - this file
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)  # noqa: S603 - it calls itself, with a number
         assert self.process.stdout is not None
         channel = grpc.insecure_channel(f"127.0.0.1:{int(self.process.stdout.readline())}")
         self._request = request

@@ -178,7 +178,7 @@ def _once(pairs: Any) -> dict[str, Any]:
     return fields
 
 
-def _need(fact: bool) -> None:  # noqa: FBT001 - what it is asked is a fact
+def _need(fact: bool) -> None:  # noqa: FBT001 - one condition, as after assert
     if not fact:
         raise ValueError
 

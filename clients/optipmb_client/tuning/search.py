@@ -77,7 +77,7 @@ class Search:
         self._seed = seed
         self._distributions = {one.path: self._distribution(one) for one in space}
         storage.parent.mkdir(parents=True, exist_ok=True)
-        from sqlalchemy.pool import NullPool  # noqa: PLC0415  comes with Optuna
+        from sqlalchemy.pool import NullPool  # noqa: PLC0415  of Optuna, an extra that only this needs
 
         # A connection for each access, closed after it: those of a pool would stay open for as long as the process.
         kept = self._optuna.storages.RDBStorage(f"sqlite:///{storage}", engine_kwargs={"poolclass": NullPool})

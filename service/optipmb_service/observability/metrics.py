@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
-from prometheus_client.metrics_core import METRIC_TYPES, Metric
+from prometheus_client.metrics_core import Metric
 from prometheus_client.samples import Sample
 
 if TYPE_CHECKING:
@@ -213,14 +213,12 @@ def families(data: bytes) -> list[Metric]:
     made = []
     try:
         for name, meaning, kind, samples in json.loads(data):
-            if kind not in METRIC_TYPES:
-                raise ValueError(kind)
             one = Metric(str(name), str(meaning), kind)
             for sample, labels, value in samples:
                 one.samples.append(Sample(str(sample), {str(key): str(labels[key]) for key in labels}, float(value)))
             made.append(one)
-    except (TypeError, LookupError, AttributeError, RecursionError) as error:
-        raise ValueError(str(error)) from error
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+        raise ValueError(f"expected the metrics of a worker as JSON: {error}") from error
     return made
 
 
