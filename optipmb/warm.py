@@ -20,11 +20,12 @@ from optipmb.tracker import Tracker
 
 def kernels() -> dict[str, Any]:
     """Return the kernels by name: numba's dispatchers, whose `stats` and `signatures` say what was compiled."""
-    modules = {name: module for name, module in sys.modules.items() if name.startswith("optipmb.")}
+    loaded = sys.modules.copy()  # not the dictionary itself: other threads may import meanwhile
     return {
         f"{module}.{name}": value
-        for module in sorted(modules)
-        for name, value in vars(modules[module]).items()
+        for module in sorted(loaded)
+        if module.startswith("optipmb.")
+        for name, value in vars(loaded[module]).items()
         if isinstance(value, Dispatcher) and value.py_func.__module__ == module
     }
 

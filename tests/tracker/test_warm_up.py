@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -80,3 +81,20 @@ def test_all_kernels_are_counted() -> None:
             if isinstance(node, ast.FunctionDef) and any(ast.unparse(one) == "kernel" for one in node.decorator_list):
                 defined.add(f"optipmb.{path.stem}.{node.name}")
     assert set(kernels()) == defined
+
+
+def test_kernels_are_counted_while_another_thread_imports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A module that is imported while the loaded ones are looked through does no harm."""
+
+    class Importing(str):
+        """A module's name that imports another module whenever it is looked at."""
+
+        __slots__ = ()
+
+        def startswith(self, *prefix: Any) -> bool:
+            monkeypatch.setitem(sys.modules, "imported_meanwhile", ModuleType("imported_meanwhile"))
+            return super().startswith(*prefix)
+
+    monkeypatch.setitem(sys.modules, Importing("looked_at"), ModuleType("looked_at"))
+    assert kernels()
+    assert "imported_meanwhile" in sys.modules
