@@ -138,8 +138,7 @@ def test_a_stranger_with_a_certificate_may_do_nothing(network: Network, node: Pa
         stranger.read("**")
         stranger.put(KEYS.detections("garage/stranger/lidar"), b"stranger")
         assert stranger.tokens("**") == set()
-        node.put(KEYS.detections(LIDAR), b"node")
-        assert viewer.wait(lambda seen: (KEYS.detections(LIDAR), b"node") in seen)
+        assert node.deliver(KEYS.detections(LIDAR), b"node", viewer)
         assert stranger.ask(KEYS.all_status(), timeout=1.0) == []
         assert (KEYS.detections("garage/stranger/lidar"), b"stranger") not in viewer.seen
         assert stranger.seen == []
@@ -162,9 +161,7 @@ def test_a_node_cannot_write_for_another(node: Party, viewer: Party, topic: str)
     """What a node publishes under another node's name reaches nobody."""
     theirs, own = (f"{KEYS.prefix}/{name}/lidar/{topic}" for name in (OTHER, ROBOT))
     node.put(theirs, b"forged")
-    node.settle()  # closer together the second would be taken for a flood
-    node.put(own, b"own")
-    assert viewer.wait(lambda seen: (own, b"own") in seen)
+    assert node.deliver(own, b"own", viewer)
     assert (theirs, b"forged") not in viewer.seen
 
 
@@ -173,8 +170,7 @@ def test_a_node_cannot_write_results(node: Party, viewer: Party, topic: str) -> 
     """Tracks and problems come from services alone, also under the node's own name."""
     key = f"{KEYS.prefix}/{LIDAR}/{topic}"
     node.put(key, b"forged")
-    node.put(KEYS.detections(LIDAR), b"after")
-    assert viewer.wait(lambda seen: (KEYS.detections(LIDAR), b"after") in seen)
+    assert node.deliver(KEYS.detections(LIDAR), b"after", viewer)
     assert (key, b"forged") not in viewer.seen
 
 
@@ -185,8 +181,7 @@ def test_a_node_cannot_read_anothers_tracks(node: Party, network: Network, viewe
     node.read(pattern, own)
     with Party(network.config(SERVICE)) as tracker:
         tracker.put(theirs, b"theirs")
-        tracker.put(own, b"own")
-        assert node.wait(lambda seen: (own, b"own") in seen)
+        assert tracker.deliver(own, b"own", node)
         assert viewer.wait(lambda seen: (theirs, b"theirs") in seen)
     assert (theirs, b"theirs") not in node.seen
 
@@ -196,8 +191,7 @@ def test_a_node_cannot_read_anothers_detections(node: Party, network: Network, v
     key = KEYS.detections(f"{OTHER}/lidar")
     node.read(KEYS.all("detections"), key)
     with Party(network.config(SECOND)) as second:
-        second.put(key, b"theirs")
-        assert viewer.wait(lambda seen: (key, b"theirs") in seen)
+        assert second.deliver(key, b"theirs", viewer)
     assert node.seen == []
 
 
@@ -213,8 +207,7 @@ def test_a_node_cannot_claim_a_stream(node: Party, viewer: Party, service: Servi
     """A node cannot say that it tracks a stream, which would keep the services from doing so, nor pose as a service."""
     node.token(KEYS.owner(LIDAR, "forged"))
     node.token(KEYS.alive("forged"))
-    node.put(KEYS.detections(LIDAR), b"after")
-    assert viewer.wait(lambda seen: (KEYS.detections(LIDAR), b"after") in seen)
+    assert node.deliver(KEYS.detections(LIDAR), b"after", viewer)
     assert viewer.tokens(KEYS.all_alive()) == {KEYS.alive("tracker")}
     assert all("forged" not in token for token in viewer.tokens(KEYS.all_owners()))
 
@@ -233,8 +226,7 @@ def test_a_service_cannot_write_inputs(network: Network, viewer: Party) -> None:
     """A service writes tracks and no detections: with its key nobody can forge what sensors saw."""
     with Party(network.config(SERVICE)) as tracker:
         tracker.put(KEYS.detections(LIDAR), b"forged")
-        tracker.put(KEYS.tracks(LIDAR), b"after")
-        assert viewer.wait(lambda seen: (KEYS.tracks(LIDAR), b"after") in seen)
+        assert tracker.deliver(KEYS.tracks(LIDAR), b"after", viewer)
     assert (KEYS.detections(LIDAR), b"forged") not in viewer.seen
 
 
@@ -251,8 +243,7 @@ def test_a_viewer_reads_and_asks_but_changes_nothing(
     with Party(network.config(VIEWER)) as writer:
         writer.put(KEYS.detections(LIDAR), b"forged")
         assert len(writer.ask(KEYS.all_status())) == 1  # this link is in order: the put has passed the router
-    node.put(KEYS.detections(LIDAR), b"node")
-    assert viewer.wait(lambda seen: (KEYS.detections(LIDAR), b"node") in seen)
+    assert node.deliver(KEYS.detections(LIDAR), b"node", viewer)
     assert (KEYS.detections(LIDAR), b"forged") not in viewer.seen
 
 
@@ -271,10 +262,8 @@ def test_a_message_that_is_too_large_does_not_pass(node: Party, viewer: Party) -
     key = KEYS.points(LIDAR)
     small, large = bytes(900_000), bytes(1_100_000)
     node.put(key, large)
-    node.put(KEYS.detections(LIDAR), b"after")
-    assert viewer.wait(lambda seen: (KEYS.detections(LIDAR), b"after") in seen)
-    node.put(key, small)
-    assert viewer.wait(lambda seen: (key, small) in seen)
+    assert node.deliver(KEYS.detections(LIDAR), b"after", viewer)
+    assert node.deliver(key, small, viewer)
     assert (key, large) not in viewer.seen
 
 

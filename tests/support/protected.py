@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 MAKE = Path(__file__).parents[2] / "docker" / "security" / "make.py"
 DEADLINE_S = 60.0
+AGAIN_S = 0.1
+"""After this long a message that has not come is sent again."""
 REFUSAL_MS = 1500
 """How long a link that must not be had is asked for."""
 
@@ -127,14 +129,23 @@ class Party:
         """Return when the router has taken what was sent so far: it answers in order."""
         self.tokens(Keys().all_alive())
 
-    def wait(self, enough: Callable[[list[tuple[str, bytes]]], bool]) -> bool:
+    def wait(self, enough: Callable[[list[tuple[str, bytes]]], bool], deadline_s: float = DEADLINE_S) -> bool:
         """Wait until `enough` has come; False at the deadline."""
         with self._changed:
-            return self._changed.wait_for(lambda: enough(self.seen), DEADLINE_S)
+            return self._changed.wait_for(lambda: enough(self.seen), deadline_s)
 
     def put(self, key: str, payload: bytes) -> None:
         """Publish; who may not is not told."""
         self.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def deliver(self, key: str, payload: bytes, receiver: Party) -> bool:
+        """Publish until another has received it: the router may take two messages close together for a flood."""
+        ends = time.monotonic() + DEADLINE_S
+        while time.monotonic() < ends:
+            self.put(key, payload)
+            if receiver.wait(lambda seen: (key, payload) in seen, AGAIN_S):
+                return True
+        return False
 
     def token(self, key: str) -> None:
         """Declare that something is alive."""

@@ -11,9 +11,13 @@ from typing import TYPE_CHECKING
 import pytest
 from optipmb_schemas import Keys, ServiceStatus, SessionParameters
 from optipmb_service.app import cli
+from optipmb_service.app.worker import run_alone
+from optipmb_service.settings import load
 from router import Node, Sensor
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
+
+import optipmb
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,8 +27,13 @@ SENSOR = Sensor()
 END_S = 30.0
 
 
-def test_a_signal_ends_it_in_order() -> None:
-    """After SIGINT in the midst of a stream it ends by itself with status 0."""
+def test_a_start_is_short_and_a_signal_ends_it_in_order() -> None:
+    """With compiled kernels a start takes less than ten seconds of the processor, and SIGINT in a stream ends it well.
+
+    Compiling would take more.
+    """
+    optipmb.warm_up()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with ServiceProcess("--instance", "one") as service:
         assert service.wait_ready() == f"ready instance=one endpoints={service.endpoint}"
         with Node(service.endpoint) as node:
@@ -35,15 +44,8 @@ def test_a_signal_ends_it_in_order() -> None:
         assert (status, service.output) == (0, [])
         assert seconds < END_S
         assert "Traceback" not in service.errors
-
-
-def test_a_second_signal_does_no_harm() -> None:
-    """Signals sent again while it ends change nothing."""
-    with ServiceProcess() as service:
-        service.wait_ready()
-        status, seconds = service.end(signal.SIGTERM, signal.SIGINT, signal.SIGTERM)
-        assert status == 0
-        assert seconds < END_S
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert 0.1 < after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 10
 
 
 def test_a_signal_during_the_start_ends_it() -> None:
@@ -56,7 +58,7 @@ def test_a_signal_during_the_start_ends_it() -> None:
 
 
 def test_the_last_frames_are_tracked() -> None:
-    """Frames that were received before a SIGTERM still become tracks, and it ends with status 0, in order."""
+    """Frames received before a SIGTERM still become tracks, and it ends in order; more signals change nothing."""
     with ServiceProcess() as service:
         service.wait_ready()
         with Node(service.endpoint) as node:
@@ -65,7 +67,8 @@ def test_the_last_frames_are_tracked() -> None:
             gone = node.watch_alive(KEYS.all_alive())
             node.send(SENSOR.detections(1, has_points=True))
             node.ask(KEYS.query(SENSOR.stream, "parameters"), SessionParameters)
-            service.process.send_signal(signal.SIGTERM)
+            for number in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM):
+                service.process.send_signal(number)
             node.tracks(SENSOR.stream, 2)
             gone.wait(lambda items: items[-1:] and items[-1][1] == b"-", "the end of the alive token")  # type: ignore[arg-type,return-value]  # a list is as good as its truth
         assert (service.wait_end(END_S), service.output) == (0, [])
@@ -120,22 +123,28 @@ def test_a_port_in_use_is_one_clear_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (("--profile", "unheard-of"), "profile: expected one of kitti, "),
-        (("--profile", "/no/such/file.toml"), "/no/such/file.toml"),
-        (("--settings", "OWN"), "unheard-of"),
-    ],
+    ("profile", "says"), [("unheard-of", "profile: expected one of kitti, "), ("/no/such/file.toml",) * 2]
 )
-def test_a_profile_that_there_is_not_is_one_clear_line(options: tuple[str, str], says: str, tmp_path: Path) -> None:
-    """A process that cannot read its profiles ends with status 2 and one line on stderr; nothing is on stdout."""
+def test_a_profile_that_there_is_not_starts_nothing(
+    profile: str, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Status 2 and one line on stderr before anything is started; nothing is on stdout."""
+    assert run_alone(load(None, {"profile": profile}).settings) == 2
+    shown = capsys.readouterr()
+    assert (shown.out, shown.err.count("\n")) == ("", 1)
+    assert shown.err.startswith("optipmb-service: ")
+    assert says in shown.err
+
+
+def test_a_profile_of_some_streams_that_there_is_not_is_one_clear_line(tmp_path: Path) -> None:
+    """The process ends with status 2 and one line on stderr that names the profile; nothing is on stdout."""
     own = tmp_path / "settings.toml"
     own.write_text("[profiles]\n'a/*' = 'unheard-of'")
-    with ServiceProcess(*(one.replace("OWN", str(own)) for one in options), listen=False) as service:
+    with ServiceProcess("--settings", str(own), listen=False) as service:
         assert service.wait_end(120) == 2
         assert service.errors.count("\n") == 1
         assert service.errors.startswith("optipmb-service: ")
-        assert says in service.errors
+        assert "unheard-of" in service.errors
         assert service.output == []
 
 
@@ -205,17 +214,26 @@ def test_json_logs_and_an_own_profile(tmp_path: Path) -> None:
     assert [event for event in events if event in expected] == expected
 
 
-def test_settings_have_an_order(tmp_path: Path) -> None:
+def config(capsys: pytest.CaptureFixture[str], *options: str) -> str:
+    """Run `config` in this process; returns what it prints."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main(("config", *options))
+    shown = capsys.readouterr()
+    assert (ended.value.code, shown.err) == (0, "")
+    return shown.out
+
+
+def test_settings_have_an_order(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """An option is above the environment, the environment above the file, and `config` says which it was."""
     file = tmp_path / "settings.toml"
     file.write_text(
         "instance = 'file'\nprefix = 'file/v1'\nmax_sessions = 3\n[limits]\nmax_points = 10\nmax_bytes = 5000\n"
     )
-    environment = {"OPTIPMB_INSTANCE": "environment", "OPTIPMB_PREFIX": "env/v1", "OPTIPMB_LIMITS__MAX_POINTS": "20"}
-    options = ("config", "--json", "--settings", str(file), "--instance", "option")
-    with ServiceProcess(*options, environment=environment, listen=False) as service:
-        assert service.wait_end(120) == 0
-        printed = json.loads("\n".join(service.output))
+    for name, value in (("INSTANCE", "environment"), ("PREFIX", "env/v1"), ("LIMITS__MAX_POINTS", "20")):
+        monkeypatch.setenv(f"OPTIPMB_{name}", value)
+    printed = json.loads(config(capsys, "--json", "--settings", str(file), "--instance", "option"))
     values, sources = printed["settings"], printed["sources"]
     assert (values["instance"], values["prefix"], values["max_sessions"]) == ("option", "env/v1", 3)
     assert (values["limits"]["max_points"], values["limits"]["max_bytes"]) == (20, 5000)
@@ -227,27 +245,9 @@ def test_settings_have_an_order(tmp_path: Path) -> None:
     ]
 
 
-def test_what_config_prints_is_a_settings_file(tmp_path: Path) -> None:
+def test_what_config_prints_is_a_settings_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The output of `config` can be given to `--settings`."""
-    with ServiceProcess("config", "--instance", "one", "--connect", "tcp/127.0.0.1:1", listen=False) as service:
-        assert service.wait_end(120) == 0
-        printed = "\n".join(service.output)
     file = tmp_path / "settings.toml"
-    file.write_text(printed)
-    with ServiceProcess("config", "--json", "--settings", str(file), listen=False) as service:
-        assert service.wait_end(120) == 0
-        values = json.loads("\n".join(service.output))["settings"]
+    file.write_text(config(capsys, "--instance", "one", "--connect", "tcp/127.0.0.1:1"))
+    values = json.loads(config(capsys, "--json", "--settings", str(file)))["settings"]
     assert (values["instance"], values["connect"], values["router"]) == ("one", ["tcp/127.0.0.1:1"], False)
-
-
-def test_starting_takes_no_long_time() -> None:
-    """With compiled kernels in the cache a start takes less than ten seconds of the processor; compiling takes more."""
-    with ServiceProcess() as service:
-        service.wait_ready()
-        service.end()
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    with ServiceProcess() as service:
-        service.wait_ready()
-        service.end()
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert 0.1 < after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 10
