@@ -18,9 +18,8 @@ import typer
 from typer.main import get_command
 
 from optipmb_service import __version__
-from optipmb_service.app import health_command
+from optipmb_service.app import health_command, router
 from optipmb_service.app.loops import leave
-from optipmb_service.app.router import route
 from optipmb_service.observability import logs
 from optipmb_service.settings import DEFAULT_GRPC, DEFAULT_LISTEN, Loaded, Settings, SettingsInvalidError, load
 
@@ -138,7 +137,7 @@ def config_command(
 @_taking(RouterOptions)
 def router_command(**given: Unpack[RouterOptions]) -> None:
     """Run a Zenoh router alone, without tracking, until SIGINT or SIGTERM."""
-    leave(route(_begin(_load({**given, "router": True}))))
+    leave(asyncio.run(router.run(_begin(_load({**given, "router": True})))))
 
 
 @app.command("grpc")
@@ -158,7 +157,7 @@ def ros2_command(**given: Unpack[RouterOptions]) -> None:
     if not settings.ros2.streams:
         _wrong("setting ros2.streams: expected a table of streams and their topics in --settings, received none")
     run = _needed("optipmb_service.app.ros2", "ros2").run
-    leave(run(settings.model_copy(update={"router": False, "listen": ()})))
+    leave(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
 
 
 @app.command("health", add_help_option=False, context_settings=PASSED_ON)

@@ -5,8 +5,8 @@ The queue is bounded; when it is full the oldest message goes and is counted.
 
 from __future__ import annotations
 
+import asyncio
 import collections
-import signal
 import sys
 import threading
 import time
@@ -20,23 +20,27 @@ from optipmb_schemas.ros2.types import own_types
 
 from optipmb_service import __version__
 from optipmb_service.app.edges import monitoring
+from optipmb_service.app.loops import StopRequest, beat, unless
 from optipmb_service.observability.health import BEAT_S, ProcessHealth
 from optipmb_service.ros2 import graph
 from optipmb_service.ros2.bridge import Bridge
 from optipmb_service.ros2.diagnostics import DIAGNOSTICS, diagnostics
 from optipmb_service.ros2.matching import Matching, Wanted
-from optipmb_service.runtime.ports import HttpError, TransportError
+from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh.ros2 import Ros2Node
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import FrameType
 
     from optipmb_service.settings import Settings
+    from optipmb_service.zenoh.client import Message, Outgoing, Subscription
 
 QUEUE: Final = 2048
 QUEUE_BYTES: Final = 2**28
 """Messages that wait for the working thread, and their bytes."""
+
+CACHE: Final = 200
+"""Detections of a stream kept for a service that restarts: 10 s at 20 Hz."""
 
 DIAGNOSTICS_S: Final = 1.0
 TICK_S: Final = 0.02
@@ -64,7 +68,7 @@ class _Reporting:
     @property
     def state(self) -> str:
         """Whether it can be used."""
-        return "ready" if self._node.linked() else "unlinked"
+        return "ready" if self._node.client.linked() else "unlinked"
 
     def status(self) -> None:
         """Return nothing: the bridge tracks no streams."""
@@ -78,6 +82,8 @@ class _Process:
         self._node = node
         self._types = own_types()
         self._bridge = Bridge(settings.ros2, settings.instance, self._types, self, time.monotonic)
+        self._outgoing: dict[str, Outgoing] = {}
+        self._subscriptions: list[Subscription] = []
         self._queue: collections.deque[tuple[Callable[[], None], int]] = collections.deque()
         self._waiting_bytes = 0
         self._lock = threading.Lock()
@@ -100,8 +106,20 @@ class _Process:
                 clouds = wanted.type == CLOUD
                 self._node.subscribe(wanted.topic, wanted.type, wanted.hash, wanted.qos, take, clouds=clouds)
         self._node.watch(lambda endpoint, came: self._put(lambda: self._changed(endpoint, came=came)))
+        client = self._node.client
         for stream in self._settings.ros2.streams:
-            self._node.follow(stream, lambda *arrival: self._put(lambda: self._come_back(*arrival)))
+            self._outgoing[stream] = client.publish(stream, CACHE, cache_clouds=0, wanted=lambda: None)
+            for key in (client.keys.tracks(stream), client.keys.problems(stream)):
+                come_back = client.subscribe(key, lambda message: self._put(lambda: self._come_back(message)))
+                self._subscriptions.append(come_back)
+
+    def close(self) -> None:
+        """Withdraw everything and close the session."""
+        for subscription in self._subscriptions:
+            subscription.close()
+        for outgoing in self._outgoing.values():
+            outgoing.close()
+        self._node.close()
 
     def work(self, seconds: float) -> None:
         """Do what has come in, and what is due, for about so long."""
@@ -120,12 +138,16 @@ class _Process:
 
     def send(self, stream: str, message: schemas.Detections | schemas.Points) -> None:
         """Publish to the service."""
-        self._node.send(stream, message)
+        outgoing, payload = self._outgoing[stream], schemas.encode(message)
+        if isinstance(message, schemas.Points):
+            outgoing.points(payload)
+        else:
+            outgoing.detections(payload)
 
     def tell(self, problem: schemas.Problem) -> None:
         """Log a problem and publish it."""
         log.warning("problem", stream=problem.stream, code=problem.code, message=problem.message)
-        self._node.tell(problem)
+        self._node.client.publish_problem(problem)
 
     def publish(self, topic: str, message: Any) -> None:
         """Publish to ROS."""
@@ -193,14 +215,14 @@ class _Process:
         if len(payload) > (most := self._settings.limits.max_bytes):
             raise schemas.MessageError("too_large", "", f"at most {most} bytes", f"{len(payload)} bytes")
 
-    def _come_back(self, key: str, payload: bytes, encoding: str) -> None:
+    def _come_back(self, one: Message) -> None:
         try:
-            if key.endswith("/tracks"):
-                self._bridge.take_tracks(schemas.decode(payload, schemas.Tracks, encoding=encoding))
+            if one.key.endswith("/tracks"):
+                self._bridge.take_tracks(schemas.decode(one.payload, schemas.Tracks, encoding=one.encoding))
             else:
-                self._bridge.take_problem(schemas.decode(payload, schemas.Problem, encoding=encoding))
+                self._bridge.take_problem(schemas.decode(one.payload, schemas.Problem, encoding=one.encoding))
         except schemas.MessageError as error:
-            log.warning("problem", key=key, message=str(error))
+            log.warning("problem", key=one.key, message=str(error))
 
     def _changed(self, endpoint: graph.Endpoint, *, came: bool) -> None:
         for problem in self._matching.change(endpoint, came=came):
@@ -245,65 +267,38 @@ class _Process:
         self.publish(self._settings.ros2.diagnostics, message)
 
 
-def run(settings: Settings) -> int:
-    """Bridge until SIGINT or SIGTERM; to be called on the main thread.
+async def run(settings: Settings) -> int:
+    """Bridge until SIGINT or SIGTERM.
 
     Returns:
         The exit status: 0, or 1 when the network cannot be used.
     """
-    asked = threading.Event()
-
-    def ask(number: int, _frame: FrameType | None) -> None:
-        asked.set()
-        log.info("stop_asked", signal=signal.Signals(number).name)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, ask)
+    asked = StopRequest()
     health = ProcessHealth(settings.instance)
     log.info("starting", instance=settings.instance, version=__version__)
     try:
         with monitoring(settings, health):
             log.info("connecting", endpoints=settings.connect)
-            node = _opened(settings, asked)
+            connecting = asyncio.create_task(beat(health))
+            node = await unless(asked, lambda: Ros2Node(settings))
+            connecting.cancel()
             if node is None:
                 return 0
+            process = _Process(settings, node)
             try:
-                process = _Process(settings, node)
                 process.open()
                 health.report(_Reporting(node))
                 streams = ",".join(settings.ros2.streams)
                 print(f"ready ros2={streams} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
                 log.info("ready", instance=settings.instance, streams=streams, connect=settings.connect)
                 while not asked.is_set():
-                    health.beat()
-                    process.work(BEAT_S)
+                    health.beat()  # while the work goes on, and not while it does not
+                    await asyncio.to_thread(process.work, BEAT_S)
                 health.ends()
             finally:
-                node.close()
-    except (TransportError, HttpError) as error:
+                await asyncio.to_thread(process.close)
+    except (TransportError, EdgeError) as error:
         print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
         return 1
     log.info("stopped", drained=True)
     return 0
-
-
-def _opened(settings: Settings, asked: threading.Event) -> Ros2Node | None:
-    """Return a node as soon as there is a router; None when the end was asked for before."""
-    found: list[Ros2Node | TransportError] = []
-
-    def wait() -> None:
-        try:
-            found.append(Ros2Node(settings))
-        except TransportError as error:
-            found.append(error)
-
-    # A daemon: waiting for a router cannot be interrupted, and must not keep the process.
-    thread = threading.Thread(target=wait, name="start", daemon=True)
-    thread.start()
-    while thread.is_alive() and not asked.is_set():
-        thread.join(0.05)
-    if not found:
-        return None
-    if isinstance(found[0], TransportError):
-        raise found[0]
-    return found[0]

@@ -6,9 +6,8 @@ the Zenoh configuration file. Health and readiness are those of the service.
 
 from __future__ import annotations
 
-import signal
+import asyncio
 import sys
-import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,13 +15,12 @@ import structlog
 
 from optipmb_service import __version__
 from optipmb_service.app.edges import monitoring
-from optipmb_service.observability.health import BEAT_S, ProcessHealth
+from optipmb_service.app.loops import StopRequest, beat
+from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh import Router
 
 if TYPE_CHECKING:
-    from types import FrameType
-
     from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
@@ -40,34 +38,29 @@ class _Routing:
         """Return nothing: a router has no streams."""
 
 
-def route(settings: Settings) -> int:
-    """Route until SIGINT or SIGTERM; to be called on the main thread.
+async def run(settings: Settings) -> int:
+    """Route until SIGINT or SIGTERM.
 
     Returns:
         The exit status: 0, or 1 when an address or the configuration cannot be used.
     """
-    asked = threading.Event()
-
-    def ask(number: int, _frame: FrameType | None) -> None:
-        asked.set()
-        log.info("stop_asked", signal=signal.Signals(number).name)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, ask)
+    asked = StopRequest()
     health = ProcessHealth(settings.instance)
     log.info("starting", instance=settings.instance, version=__version__)
+    beating = asyncio.create_task(beat(health))
     try:
         with monitoring(settings, health):
             router = Router(settings)
             health.report(_Routing())
             print(f"ready router={settings.instance} endpoints={','.join(settings.endpoints)}", flush=True)  # noqa: T201 - what starters wait for
             log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
-            while not asked.wait(BEAT_S):
-                health.beat()
+            await asked.wait()
             health.ends()
             router.close()
     except (TransportError, EdgeError) as error:
         print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
         return 1
+    finally:
+        beating.cancel()
     log.info("stopped", drained=True)
     return 0

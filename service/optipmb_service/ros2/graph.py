@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 __all__ = [
+    "GID",
     "NO_HASH",
     "PUBLISHER",
     "SUBSCRIPTION",
@@ -36,7 +37,8 @@ _NODE: Final = "NN"
 _PARTS: Final = 13
 _RELIABLE, _BEST_EFFORT = "1", "2"
 _TRANSIENT_LOCAL, _VOLATILE = "1", "2"
-_GID: Final = 16
+GID: Final = 16
+"""Bytes that say who published a message."""
 
 
 def mangled(name: str) -> str:
@@ -175,4 +177,4 @@ def parse_endpoint(key: str) -> Endpoint | None:
 
 def attachment(number: int, stamp_ns: int, gid: bytes) -> bytes:
     """Return what goes with each message: its number, when it was sent (ns since 1970), and who sent it (16 bytes)."""
-    return struct.pack("<qqB", number, stamp_ns, _GID) + gid[:_GID]
+    return struct.pack("<qqB", number, stamp_ns, GID) + gid

@@ -6,19 +6,16 @@ two apart. Everything here may be called by any thread; `ask` and `recent` wait 
 
 from __future__ import annotations
 
-import contextlib
-import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol, Self, cast
 
 import optipmb_schemas as schemas
-import structlog
 import zenoh
 import zenoh.ext
 
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import close, line, opened
-from optipmb_service.zenoh.handles import Undeclared, undeclare
+from optipmb_service.zenoh.handles import Putting, Readers, cached_publisher, publish_problem, undeclare
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,16 +25,7 @@ if TYPE_CHECKING:
 CHANNEL: Final = 1024
 """Messages between Zenoh and a draining thread; more than any publisher's history."""
 
-HEARTBEAT_S: Final = 0.2
-"""How long the loss of a newest message may stay unnoticed."""
-
 JOIN_S: Final = 5.0
-
-log = structlog.get_logger("optipmb_service")
-
-
-class _Publisher(Undeclared, Protocol):
-    def put(self, payload: bytes) -> object: ...
 
 
 class _Matching(Protocol):
@@ -79,25 +67,23 @@ class Outgoing:
         cache_clouds: int,
         wanted: Callable[[], None],
     ) -> None:
-        self._session = session
         self._matching: _Matching | None = None
-        try:
-            self._detections = self._cached(
-                keys.detections(stream), schemas.Detections, cache, zenoh.Priority.DATA_HIGH, express=True
+        self._detections = cached_publisher(session, keys.detections(stream), schemas.Detections, cache)
+        if cache_clouds:
+            low = zenoh.Priority.DATA_LOW
+            self._points = cached_publisher(
+                session, keys.points(stream), schemas.Points, cache_clouds, priority=low, express=False
             )
-            if cache_clouds:
-                self._points = self._cached(
-                    keys.points(stream), schemas.Points, cache_clouds, zenoh.Priority.DATA_LOW, express=False
-                )
-            else:
-                plain = session.declare_publisher(
-                    keys.points(stream),
-                    encoding=schemas.encoding_of(schemas.Points),
-                    congestion_control=zenoh.CongestionControl.DROP,
-                    priority=zenoh.Priority.DATA_LOW,
-                )
-                self._points, self._matching = cast("_Publisher", plain), cast("_Matching", plain)
-                plain.declare_matching_listener(lambda _status: wanted())
+            return
+        try:
+            plain = session.declare_publisher(
+                keys.points(stream),
+                encoding=schemas.encoding_of(schemas.Points),
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+            self._points, self._matching = cast("Putting", plain), cast("_Matching", plain)
+            plain.declare_matching_listener(lambda _status: wanted())
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
 
@@ -127,23 +113,8 @@ class Outgoing:
         undeclare(self._detections)
         undeclare(self._points)
 
-    def _cached(
-        self, key: str, kind: type[schemas.Message], cache: int, priority: zenoh.Priority, *, express: bool
-    ) -> _Publisher:
-        return zenoh.ext.declare_advanced_publisher(
-            self._session,
-            key,
-            encoding=schemas.encoding_of(kind),
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=priority,
-            express=express,
-            cache=zenoh.ext.CacheConfig(cache),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
-            publisher_detection=True,
-        )
-
     @staticmethod
-    def _put(publisher: _Publisher, payload: bytes) -> None:
+    def _put(publisher: Putting, payload: bytes) -> None:
         try:
             publisher.put(payload)
         except zenoh.ZError as error:
@@ -164,7 +135,7 @@ class Subscription:
 
     def __init__(self, session: zenoh.Session, key: str, receive: Callable[[Message], None]) -> None:
         try:
-            self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+            subscriber: Any = zenoh.ext.declare_advanced_subscriber(
                 session,
                 key,
                 zenoh.handlers.FifoChannel(CHANNEL),
@@ -172,25 +143,17 @@ class Subscription:
             )
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
-        self._receive = receive
-        self._thread = threading.Thread(
-            target=self._drain, args=(self._subscriber.handler,), name=f"reader {key}", daemon=True
-        )
-        self._thread.start()
+
+        def take(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                receive(_message(sample))
+
+        self._readers = Readers()
+        self._readers.add(key, subscriber, subscriber.handler, take)
 
     def close(self) -> None:
         """End it; nothing is handed over afterwards."""
-        undeclare(self._subscriber)
-        self._thread.join(JOIN_S)
-
-    def _drain(self, handler: Any) -> None:
-        with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
-            for sample in handler:
-                if sample.kind == zenoh.SampleKind.PUT:
-                    try:
-                        self._receive(_message(sample))
-                    except Exception:
-                        log.exception("internal_error", reader="subscription")  # one message must not end the reading
+        self._readers.stop(JOIN_S)
 
 
 class Client:
@@ -227,6 +190,10 @@ class Client:
     def publish(self, stream: str, cache: int, cache_clouds: int, wanted: Callable[[], None]) -> Outgoing:
         """Open the publishers of a stream; arguments and errors are those of `Outgoing`."""
         return Outgoing(self._session, self.keys, stream, cache, cache_clouds, wanted)
+
+    def publish_problem(self, problem: schemas.Problem) -> None:
+        """Send a problem of a stream."""
+        publish_problem(self._session, self.keys, problem)
 
     def subscribe(self, key: str, receive: Callable[[Message], None]) -> Subscription:
         """Hand over what is published from now on under a key expression, on a thread of its own."""

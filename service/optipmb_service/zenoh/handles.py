@@ -1,18 +1,28 @@
-"""What the transport hands out: the publisher of a stream's tracks, a liveliness token, a query to be answered."""
+"""What is declared on a session, typed: publishers, tokens, queries, and the threads that read what comes in."""
 
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Protocol, cast
+import threading
+from typing import TYPE_CHECKING, Final, Protocol, TypeVar, cast
 
 import optipmb_schemas as schemas
+import structlog
 import zenoh
+import zenoh.ext
 
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
+
+HEARTBEAT_S: Final = 0.2
+"""How long the loss of the newest message of a cached publisher may stay unnoticed."""
+
+log = structlog.get_logger("optipmb_service")
+
+_T = TypeVar("_T")
 
 
 # What is used of Zenoh's objects, typed: its own stubs leave parts untyped.
@@ -26,14 +36,90 @@ class _Dropped(Protocol):
     def drop(self) -> object: ...
 
 
-class _Publisher(Undeclared, Protocol):
-    def put(self, payload: bytes) -> object: ...
+class Putting(Undeclared, Protocol):
+    """A publisher of Zenoh's own."""
+
+    def put(self, payload: bytes) -> object: ...  # noqa: D102 - send it
+
+
+class Readers:
+    """What is read: each thing that was declared has a thread of its own, and no message ends the reading."""
+
+    def __init__(self) -> None:
+        self._reading: list[tuple[Undeclared, threading.Thread]] = []
+
+    def add(self, name: str, declared: Undeclared, handler: Iterable[_T], receive: Callable[[_T], None]) -> None:
+        """Hand over what comes in, one after the other, until the end."""
+
+        def drain() -> None:
+            with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
+                for item in handler:
+                    try:
+                        receive(item)
+                    except Exception:
+                        log.exception("internal_error", reader=name)  # one message must not end the reading
+
+        thread = threading.Thread(target=drain, name=f"reader-{name}", daemon=True)
+        thread.start()
+        self._reading.append((declared, thread))
+
+    def stop(self, timeout: float) -> None:
+        """Withdraw everything; what was received before is handed over within `timeout` seconds each."""
+        for declared, _ in self._reading:
+            undeclare(declared)
+        for _, thread in self._reading:
+            thread.join(timeout)
+        self._reading.clear()
+
+
+def cached_publisher(
+    session: zenoh.Session,
+    key: str,
+    kind: type[schemas.Message],
+    cache: int,
+    *,
+    priority: zenoh.Priority = zenoh.Priority.DATA_HIGH,
+    express: bool = True,
+) -> Putting:
+    """Declare a publisher that keeps its newest messages for subscribers that lost some or come late.
+
+    Raises:
+        TransportError: the session is closed.
+    """
+    try:
+        return zenoh.ext.declare_advanced_publisher(
+            session,
+            key,
+            encoding=schemas.encoding_of(kind),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=priority,
+            express=express,
+            cache=zenoh.ext.CacheConfig(cache),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
+            publisher_detection=True,
+        )
+    except zenoh.ZError as error:
+        raise TransportError(line(error)) from error
+
+
+def publish_problem(session: zenoh.Session, keys: schemas.Keys, problem: schemas.Problem) -> None:
+    """Send a problem on its stream's key; one without a stream has no key and is not sent."""
+    if not problem.stream:
+        return
+    with contextlib.suppress(zenoh.ZError):  # at the end: the session is closed
+        session.put(
+            keys.problems(problem.stream),
+            schemas.encode(problem),
+            encoding=schemas.encoding_of(problem),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_LOW,
+        )
 
 
 class Publisher:
     """The publisher of a stream's tracks."""
 
-    def __init__(self, publisher: _Publisher, forget: Callable[[Publisher], None]) -> None:
+    def __init__(self, publisher: Putting, forget: Callable[[Publisher], None]) -> None:
         self._publisher = publisher
         self._forget = forget
 

@@ -6,24 +6,22 @@ for what is TRANSIENT_LOCAL.
 
 from __future__ import annotations
 
-import contextlib
 import secrets
-import threading
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-import optipmb_schemas as schemas
-import structlog
 import zenoh
 import zenoh.ext
 
 from optipmb_service.ros2 import graph
 from optipmb_service.runtime.ports import TransportError
-from optipmb_service.zenoh.connection import close, line, opened
-from optipmb_service.zenoh.handles import undeclare
+from optipmb_service.zenoh.client import Client
+from optipmb_service.zenoh.connection import line, opened
+from optipmb_service.zenoh.handles import Readers, undeclare
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable
 
     from optipmb_service.settings import Settings
     from optipmb_service.zenoh.handles import Undeclared
@@ -32,14 +30,20 @@ CHANNEL: Final = 1024
 CLOUDS: Final = 8
 """Clouds between Zenoh and the reader; the oldest goes beyond it."""
 
-CACHE: Final = 200
-"""Detections kept for a service that restarts: 10 s at 20 Hz."""
-
-HEARTBEAT_S: Final = 0.2
 HISTORY: Final = 100
 """Static transforms that are asked of each publisher."""
 
-log = structlog.get_logger("optipmb_service")
+JOIN_S: Final = 1.0
+
+
+@dataclass
+class _Publication:
+    """What a topic is published with: for nodes that hash types, and for those of Humble, which do not."""
+
+    hashed: Any
+    unhashed: Any
+    gid: bytes
+    number: int = 0
 
 
 class Ros2Node:
@@ -53,36 +57,29 @@ class Ros2Node:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._keys = schemas.Keys(settings.prefix)
         self._session = opened(settings)
+        self.client = Client(self._session, settings.prefix)
+        """The client of the service."""
         self._domain = settings.ros2.domain
         self._node = graph.Node(self._domain, str(self._session.info.zid()), settings.ros2.node)
         self._entities = 0
         self._held: list[Undeclared] = []
-        self._readers: list[tuple[Undeclared, threading.Thread]] = []
-        self._publishers: dict[str, tuple[Any, bytes, int]] = {}
-        self._senders: dict[tuple[str, type[schemas.Message]], Any] = {}
-        self._lock = threading.Lock()
+        self._readers = Readers()
+        self._publications: dict[str, _Publication] = {}
         self._token(self._node.token())
-
-    @property
-    def session(self) -> str:
-        """The id of the Zenoh session, as tokens name it."""
-        return self._node.session
-
-    def linked(self) -> bool:
-        """Whether there is a router."""
-        return bool(self._session.info.routers_zid())
-
-    # ROS
 
     def advertise(self, topic: str, type_name: str, type_hash: str) -> None:
         """Declare a publisher and its token."""
         endpoint = self._endpoint(graph.PUBLISHER, topic, type_name, type_hash, graph.Qos())
-        key = graph.TopicKey(self._domain, topic, type_name, type_hash).key
-        publisher = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
-        self._held.append(publisher)
-        self._publishers[topic] = (publisher, secrets.token_bytes(16), 0)
+        hashed, unhashed = (
+            self._session.declare_publisher(
+                graph.TopicKey(self._domain, topic, type_name, one).key,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
+            for one in (type_hash, graph.NO_HASH)
+        )
+        self._held += [hashed, unhashed]
+        self._publications[topic] = _Publication(hashed, unhashed, secrets.token_bytes(graph.GID))
         self._token(endpoint.token())
 
     def publish(self, topic: str, payload: bytes) -> None:
@@ -91,10 +88,15 @@ class Ros2Node:
         Raises:
             TransportError: the session is closed.
         """
-        publisher, gid, number = self._publishers[topic]
-        self._publishers[topic] = (publisher, gid, number + 1)
-        with _closed_told():
-            publisher.put(payload, attachment=graph.attachment(number + 1, time.time_ns(), gid))
+        publication = self._publications[topic]
+        publication.number += 1
+        attachment = graph.attachment(publication.number, time.time_ns(), publication.gid)
+        try:
+            publication.hashed.put(payload, attachment=attachment)
+            if publication.unhashed.matching_status.matching:
+                publication.unhashed.put(payload, attachment=attachment)
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
 
     def subscribe(
         self,
@@ -126,7 +128,7 @@ class Ros2Node:
             if key is not None and sample.kind == zenoh.SampleKind.PUT:
                 receive(key, sample.payload.to_bytes())
 
-        self._read(topic, subscriber, take)
+        self._readers.add(topic, subscriber, subscriber.handler, take)
         self._token(endpoint.token())
 
     def watch(self, changed: Callable[[graph.Endpoint, bool], None]) -> None:
@@ -140,53 +142,14 @@ class Ros2Node:
             if endpoint is not None and endpoint.node.session != self._node.session:
                 changed(endpoint, sample.kind == zenoh.SampleKind.PUT)
 
-        self._read("graph", tokens, take)
-
-    # The service
-
-    def send(self, stream: str, message: schemas.Detections | schemas.Points) -> None:
-        """Publish detections, which stay for recovery, or a cloud, to the service.
-
-        Raises:
-            TransportError: the session is closed.
-        """
-        with _closed_told():
-            self._sender(stream, type(message)).put(schemas.encode(message))
-
-    def tell(self, problem: schemas.Problem) -> None:
-        """Publish a problem of a stream.
-
-        Raises:
-            TransportError: the session is closed.
-        """
-        with _closed_told():
-            key, encoding = self._keys.problems(problem.stream), schemas.encoding_of(problem)
-            self._session.put(key, schemas.encode(problem), encoding=encoding)
-
-    def follow(self, stream: str, receive: Callable[[str, bytes, str], None]) -> None:
-        """Hand over the tracks and problems of a stream: key, payload, encoding."""
-        for key in (self._keys.tracks(stream), self._keys.problems(stream)):
-            subscriber = zenoh.ext.declare_advanced_subscriber(
-                self._session,
-                key,
-                zenoh.handlers.FifoChannel(CHANNEL),
-                recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
-            )
-            self._read(
-                key,
-                subscriber,
-                lambda sample: receive(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)),
-            )
+        self._readers.add("graph", tokens, tokens.handler, take)
 
     def close(self) -> None:
         """Withdraw everything and close the session."""
-        for declared, _ in self._readers:
-            undeclare(declared)
-        for _, thread in self._readers:
-            thread.join(1.0)
+        self._readers.stop(JOIN_S)
         for declared in reversed(self._held):
             undeclare(declared)
-        close(self._session)
+        self.client.close()
 
     def _endpoint(self, kind: str, topic: str, type_name: str, type_hash: str, qos: graph.Qos) -> graph.Endpoint:
         self._entities += 1
@@ -194,55 +157,3 @@ class Ros2Node:
 
     def _token(self, key: str) -> None:
         self._held.append(self._session.liveliness().declare_token(key))
-
-    def _sender(self, stream: str, kind: type[schemas.Message]) -> Any:
-        with self._lock:
-            if (stream, kind) not in self._senders:
-                encoding = schemas.encoding_of(kind)
-                if kind is schemas.Points:
-                    sender: Any = self._session.declare_publisher(
-                        self._keys.points(stream),
-                        encoding=encoding,
-                        congestion_control=zenoh.CongestionControl.DROP,
-                        priority=zenoh.Priority.DATA_LOW,
-                    )
-                else:
-                    sender = zenoh.ext.declare_advanced_publisher(
-                        self._session,
-                        self._keys.detections(stream),
-                        encoding=encoding,
-                        congestion_control=zenoh.CongestionControl.DROP,
-                        priority=zenoh.Priority.DATA_HIGH,
-                        express=True,
-                        cache=zenoh.ext.CacheConfig(CACHE),
-                        sample_miss_detection=zenoh.ext.MissDetectionConfig(
-                            heartbeat=HEARTBEAT_S, sporadic_heartbeat=None
-                        ),
-                        publisher_detection=True,
-                    )
-                self._held.append(sender)
-                self._senders[stream, kind] = sender
-            return self._senders[stream, kind]
-
-    def _read(self, name: str, declared: Any, receive: Callable[[zenoh.Sample], None]) -> None:
-        handler: Iterable[zenoh.Sample] = declared.handler
-
-        def drain() -> None:
-            with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
-                for sample in handler:
-                    try:
-                        receive(sample)
-                    except Exception:
-                        log.exception("internal_error", reader=name)  # one message must not end the reading
-
-        thread = threading.Thread(target=drain, name=f"reader-{name}", daemon=True)
-        thread.start()
-        self._readers.append((declared, thread))
-
-
-@contextlib.contextmanager
-def _closed_told() -> Iterator[None]:
-    try:
-        yield
-    except zenoh.ZError as error:
-        raise TransportError(line(error)) from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import optipmb_schemas as schemas
 import structlog
@@ -15,7 +15,15 @@ import zenoh.ext
 from optipmb_service.runtime.ports import Packet, TransportError
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.connection import close, line, opened
-from optipmb_service.zenoh.handles import Publisher, Question, Token, undeclare
+from optipmb_service.zenoh.handles import (
+    Publisher,
+    Question,
+    Readers,
+    Token,
+    cached_publisher,
+    publish_problem,
+    undeclare,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -33,9 +41,6 @@ HISTORY_S: Final = 60.0
 TRACKS_CACHE: Final = 50
 """Tracks kept per stream for subscribers that lost some or come late: 5 s at 10 Hz. Most of what a stream holds."""
 
-HEARTBEAT_S: Final = 0.2
-"""How long the loss of the newest tracks may stay unnoticed."""
-
 CLAIM: Final = "/claim"
 """Ending of the liveliness keys by which instances settle who may have a stream, before one says that it has."""
 
@@ -46,8 +51,6 @@ OWNERS_S: Final = 1.0
 """How long the network may take to say who owns a stream; it takes less than a millisecond."""
 
 log = structlog.get_logger("optipmb_service")
-
-_T = TypeVar("_T")
 
 
 class Transport:
@@ -67,7 +70,7 @@ class Transport:
         self._max_bytes = settings.limits.max_bytes
         self._is_router = settings.is_router
         self._session = opened(settings)
-        self._readers: list[tuple[Undeclared, threading.Thread]] = []
+        self._readers = Readers()
         self._claims: set[Publisher] = set()
         self._lock = threading.Lock()
         self._alive: Undeclared | None = None
@@ -79,9 +82,11 @@ class Transport:
     ) -> None:
         """Hand over the detections and point clouds on all keys that are wanted, each on a thread of its own."""
         detections = self._subscriber("detections", CHANNEL)
-        self._read("detections", detections, detections.handler, lambda sample: self._receive(sample, on_frame, wanted))
+        self._readers.add(
+            "detections", detections, detections.handler, lambda sample: self._receive(sample, on_frame, wanted)
+        )
         points = self._subscriber("points", CHANNEL // 16)
-        self._read("points", points, points.handler, lambda sample: self._receive(sample, on_cloud, wanted))
+        self._readers.add("points", points, points.handler, lambda sample: self._receive(sample, on_cloud, wanted))
 
     def _subscriber(self, topic: schemas.Topic, channel: int) -> zenoh.ext.AdvancedSubscriber[Any]:
         """Subscribe to a topic of all streams, with what the publishers' caches hold: also of clouds, if they do."""
@@ -112,7 +117,7 @@ class Transport:
 
     def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
         queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(CHANNEL // 16))
-        self._read("queries", queryable, queryable.handler, _answering(answer))
+        self._readers.add("queries", queryable, queryable.handler, _answering(answer))
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
         """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
@@ -156,20 +161,7 @@ class Transport:
         listener = self._session.info.declare_transport_events_listener(
             zenoh.handlers.FifoChannel(CHANNEL // 16), history=True
         )
-        self._read("links", listener, listener.handler, _log_link)
-
-    def _read(self, name: str, declared: Undeclared, handler: Iterable[_T], receive: Callable[[_T], None]) -> None:
-        def drain() -> None:
-            with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
-                for item in handler:
-                    try:
-                        receive(item)
-                    except Exception:
-                        log.exception("internal_error", reader=name)  # one message must not end the reading
-
-        thread = threading.Thread(target=drain, name=f"reader-{name}", daemon=True)
-        thread.start()
-        self._readers.append((declared, thread))
+        self._readers.add("links", listener, listener.handler, _log_link)
 
     def _receive(self, sample: zenoh.Sample, receive: Callable[[Packet], None], wanted: Callable[[str], bool]) -> None:
         key = str(sample.key_expr)
@@ -192,20 +184,7 @@ class Transport:
         Raises:
             TransportError: the session is closed.
         """
-        try:
-            publisher = zenoh.ext.declare_advanced_publisher(
-                self._session,
-                self._keys.tracks(stream),
-                encoding=schemas.encoding_of(schemas.Tracks),
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.DATA_HIGH,
-                express=True,
-                cache=zenoh.ext.CacheConfig(TRACKS_CACHE),
-                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
-                publisher_detection=True,
-            )
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
+        publisher = cached_publisher(self._session, self._keys.tracks(stream), schemas.Tracks, TRACKS_CACHE)
         claim = Publisher(publisher, self._forget)
         with self._lock:
             self._claims.add(claim)
@@ -213,16 +192,7 @@ class Transport:
 
     def publish_problem(self, problem: schemas.Problem) -> None:
         """Send a problem on its stream's key; one without a stream has no key and is not sent."""
-        if not problem.stream:
-            return
-        with contextlib.suppress(zenoh.ZError):  # at the end: the session is closed
-            self._session.put(
-                self._keys.problems(problem.stream),
-                schemas.encode(problem),
-                encoding=schemas.encoding_of(problem),
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.DATA_LOW,
-            )
+        publish_problem(self._session, self._keys, problem)
 
     # Owners
 
@@ -240,7 +210,7 @@ class Transport:
             key = str(sample.key_expr)
             told(self._keys.stream_of(key), self._keys.instance_of(key), sample.kind == zenoh.SampleKind.PUT)
 
-        self._read("owners", tokens, tokens.handler, receive)
+        self._readers.add("owners", tokens, tokens.handler, receive)
 
     def declare_claim(self, stream: str) -> Token | None:
         """Say that this instance wants a stream; None at the end, when the session is closed."""
@@ -284,11 +254,7 @@ class Transport:
         if self._alive is not None:
             undeclare(self._alive)
             self._alive = None
-        for declared, _ in self._readers:
-            undeclare(declared)
-        for _, thread in self._readers:
-            thread.join(timeout)
-        self._readers.clear()
+        self._readers.stop(timeout)
 
     def close(self) -> None:
         """Withdraw everything and close the session."""
