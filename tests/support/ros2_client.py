@@ -17,6 +17,7 @@ from optipmb_schemas.ros2.types import own_types
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")  # what it imports looks for git, which nothing here needs
 
 import zenoh_ros2_sdk as sdk
+from zenoh_ros2_sdk import discovery
 from zenoh_ros2_sdk.session import ZenohSession
 from zenoh_ros2_sdk.utils import get_type_hash
 
@@ -68,13 +69,13 @@ class Ros2Client:
         message = _built(publisher.session_mgr.store, kind, fields)
         publisher.publish(**{name: getattr(message, name) for name in message.__dataclass_fields__})
 
-    def subscribe(self, topic: str, kind: str, **options: Any) -> None:
-        """Collect what comes on a topic."""
-        self.received[topic] = []
+    def subscribe(self, topic: str, kind: str, *, name: str = "", **options: Any) -> None:
+        """Collect what comes on a topic, under another name where one is given."""
+        received = self.received[name or topic] = []
 
         def take(message: Any) -> None:
             with self._changed:
-                self.received[topic].append(message)
+                received.append(message)
                 self._changed.notify_all()
 
         about = {"msg_definition": own_types().definition(kind), "type_hash": hash_by_sdk(kind)}
@@ -86,6 +87,15 @@ class Ros2Client:
             met = self._changed.wait_for(lambda: true(self.received[topic]), DEADLINE_S)
             assert met, f"{topic}: {len(self.received[topic])} messages; {self._diagnosis()}"
             return list(self.received[topic])
+
+    def endpoints(self, topic: str) -> list[tuple[str, str, str, str]]:
+        """Give what another program says of the endpoints of a topic: kind, node, type, hash of the type."""
+        about = discovery.get_topic_info(topic, **self._where, timeout=DEADLINE_S, verbose=True)
+        return [
+            (kind, f"{one.node_namespace.rstrip('/')}/{one.node_name}", one.topic_type, one.type_hash)
+            for kind, found in (("publisher", about.publishers), ("subscription", about.subscribers))
+            for one in found
+        ]
 
     def _diagnosis(self) -> str:
         """Give what the newest diagnostics say, for a failure."""

@@ -165,9 +165,9 @@ def graph_pattern(domain: int) -> str:
 def parse_endpoint(key: str) -> Endpoint | None:
     """Return the publisher or subscription of a token; None for other tokens, and for what is none."""
     parts = key.split("/")
-    if len(parts) != _PARTS or parts[0] != _SPACE or parts[5] not in {PUBLISHER, SUBSCRIPTION}:
+    if len(parts) < _PARTS or parts[0] != _SPACE or parts[5] not in {PUBLISHER, SUBSCRIPTION}:
         return None
-    _, domain, session, node, entity, kind, _, namespace, name, topic, type_, hash_, qos = parts
+    _, domain, session, node, entity, kind, _, namespace, name, topic, type_, hash_, qos = parts[:_PARTS]
     offered = parse_qos(qos)
     if offered is None or not (domain.isdecimal() and node.isdecimal() and entity.isdecimal()):
         return None
