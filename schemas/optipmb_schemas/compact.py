@@ -1,15 +1,18 @@
-"""Detections as our encoder writes them, read without the steps that other forms need; all else is left to the models.
+"""Detections in their usual form, read without the steps that other forms need; all else is left to the models.
 
-Nothing is refused here. A payload that is not plainly a valid message in this form (blocks of little-endian float64
-and int64, known fields only, each once) gives None: the walk and the models read it then, or say what is wrong with
-it. So there is one set of rules and one set of errors, and a test holds what is accepted here equal to the models.
+The usual form has columns of little-endian float64 and int64 and known fields only, each once, whether in msgpack
+(`read_detections`) or in protobuf (`protobuf.convert`, which brings its fields to `checked`). Nothing is refused here.
+What is not plainly a valid message in this form gives None: the walk and the models read it then, or say what is wrong
+with it. So there is one set of rules and one set of errors, and tests hold what is accepted here equal to the models.
 
 The bounds are those of `structure`. A payload is short enough here that whatever is built from it is small, every value
 in it is looked at, and so it holds no more values, no deeper nesting and no longer texts than the limits allow.
 """
 
 import sys
+from collections.abc import Callable
 from functools import lru_cache
+from math import prod
 from struct import unpack
 from typing import Any, Final
 
@@ -35,8 +38,7 @@ _KNOWN: Final = frozenset(Detections.model_fields)
 _REQUIRED: Final = frozenset(name for name, field in Detections.model_fields.items() if field.is_required())
 _BLOCK: Final = frozenset({"dtype", "shape", "data"})
 _PADDED: Final = _BLOCK | {"pad"}
-_WHOLE: Final = frozenset({"i8", "<i8"})
-_REAL: Final = frozenset({"f8", "<f8"})
+_DTYPES: Final = {"i8": frozenset({"i8", "<i8"}), "f8": frozenset({"f8", "<f8"})}
 _COLUMNS: Final = (("center", 3), ("size", 3), ("yaw", 1), ("score", 1), ("velocity", 2))
 _RANGES: Final = tuple(Detections.arrays[name] for name, _ in _COLUMNS)
 _LOWEST: Final = np.array([np.nextafter(one.low, np.inf) if one.above else one.low for one in _RANGES])
@@ -61,20 +63,29 @@ def read_detections(payload: bytes, limits: Limits) -> Detections | None:
             max_array_len=_LABELS,
             max_map_len=len(_KNOWN),
         )
-        return _message(pairs, limits)
+        fields = _once(pairs)
+        if fields.get("pose") is not None:
+            fields["pose"] = _pose(fields["pose"])
+        return checked(fields, dict(fields["label"])["shape"][0], _data, limits)
     except (ValueError, TypeError, LookupError):
         return None
 
 
-def _message(pairs: Any, limits: Limits) -> Detections:
-    """Return the message of the pairs of a map.
+def checked(
+    fields: dict[str, Any], count: int, data: Callable[[Any, str, list[int]], bytes], limits: Limits
+) -> Detections:
+    """Return the message of its fields, whose columns are still in the form in which they came.
+
+    Args:
+        fields: the values by name, the pose as a model.
+        count: number of detections.
+        data: returns the bytes of a column that has a number type and a shape; ValueError if it has others.
+        limits: what is accepted at most.
 
     Raises:
         ValueError, TypeError, LookupError: it is for the models.
     """
-    fields = _once(pairs)
-    labels, label = fields["labels"], fields["label"]
-    count = dict(label)["shape"][0]
+    labels = fields["labels"]
     _need(_REQUIRED <= fields.keys() <= _KNOWN)
     _need(type(labels) is list and type(count) is int and 0 < count <= limits.max_detections)
     for name in ("seq", "stamp_ns"):
@@ -82,26 +93,35 @@ def _message(pairs: Any, limits: Limits) -> Detections:
     _need(type(fields["epoch"]) is bytes and len(fields["epoch"]) == _EPOCH)
     _need(type(fields["stream"]) is str and fields["frame"] in _FRAMES)
     _need(fields.get("has_points") is None or type(fields["has_points"]) is bool)
+    _need(fields.get("pose") is not None or fields["frame"] == "world")
     _stream(fields["stream"])
     _need(len(labels) <= limits.max_labels)
     fields["labels"] = _labels(tuple(labels))
-    fields["label"] = index = np.frombuffer(_data(label, _WHOLE, [count], 8 * count), np.int64)
+    fields["label"] = index = np.frombuffer(data(fields["label"], "i8", [count]), np.int64)
     _need(int(index.view(np.uint64).max()) < len(labels))  # a negative one is larger than any
-    _read_columns(fields, count)
-    if fields.get("pose") is not None:
-        fields["pose"] = _pose(fields["pose"])
-    else:
-        _need(fields["frame"] == "world")
+    _read_columns(fields, count, data)
     return Detections.trusted(**fields)
 
 
-def _read_columns(fields: dict[str, Any], count: int) -> None:
-    """Replace the blocks of numbers by arrays, all of which lie in one buffer, and check their ranges together."""
+def checked_pose(data: Callable[[str, int], bytes]) -> Pose:
+    """Return the pose whose numbers `data` returns, given the name and the length of each of its arrays.
+
+    Raises:
+        ValueError, TypeError, LookupError: it is for the models.
+    """
+    arrays = {}
+    for name, length, low, high in _POSE:
+        numbers = data(name, length)
+        _need(all(low <= value <= high for value in unpack(f"<{length}d", numbers)))
+        arrays[name] = np.frombuffer(numbers, np.float64)
+    unit_quaternion(arrays["quaternion"])
+    return Pose.trusted(**arrays)
+
+
+def _read_columns(fields: dict[str, Any], count: int, data: Callable[[Any, str, list[int]], bytes]) -> None:
+    """Replace the columns of numbers by arrays, all of which lie in one buffer, and check their ranges together."""
     columns = _COLUMNS if fields.get("velocity") is not None else _COLUMNS[:-1]
-    parts: list[bytes] = []
-    for name, width in columns:
-        shape = [count, width] if width > 1 else [count]
-        parts.append(_data(fields[name], _REAL, shape, 8 * width * count))
+    parts = [data(fields[name], "f8", [count, width] if width > 1 else [count]) for name, width in columns]
     numbers = np.frombuffer(b"".join(parts), np.float64)
     starts, ends = _bounds(count)
     lowest = np.minimum.reduceat(numbers, starts[: len(columns)])
@@ -130,16 +150,10 @@ def _bounds(count: int) -> tuple[NDArray[np.intp], list[int]]:
 def _pose(pairs: Any) -> Pose:
     blocks = _once(pairs)
     _need(len(blocks) == len(_POSE))
-    arrays = {}
-    for name, length, low, high in _POSE:
-        data = _data(blocks[name], _REAL, [length], 8 * length)
-        _need(all(low <= value <= high for value in unpack(f"<{length}d", data)))
-        arrays[name] = np.frombuffer(data, np.float64)
-    unit_quaternion(arrays["quaternion"])
-    return Pose.trusted(**arrays)
+    return checked_pose(lambda name, length: _data(blocks[name], "f8", [length]))
 
 
-def _data(pairs: Any, dtypes: frozenset[str], shape: list[int], size: int) -> bytes:
+def _data(pairs: Any, dtype: str, shape: list[int]) -> bytes:
     """Return the bytes of a block of a type and shape."""
     block: dict[str, Any] = dict(pairs)
     data: bytes = block["data"]
@@ -147,11 +161,11 @@ def _data(pairs: Any, dtypes: frozenset[str], shape: list[int], size: int) -> by
         type(pairs) is tuple
         and len(block) == len(pairs)
         and (block.keys() == _BLOCK or (block.keys() == _PADDED and type(block["pad"]) is bytes))
-        and block["dtype"] in dtypes
+        and block["dtype"] in _DTYPES[dtype]
         and block["shape"] == shape
         and [*map(type, block["shape"])] == [*map(type, shape)]  # 1.0 and true equal 1
         and type(data) is bytes
-        and len(data) == size
+        and len(data) == 8 * prod(shape)
     ):
         return data
     raise ValueError

@@ -69,7 +69,7 @@ def protobuf(data: bytes) -> None:
         return
     with contextlib.suppress(schemas.MessageError):
         tracks = transcode(data[1:], encoding=schemas.encoding_of(schemas.Tracks), limits=LIMITS)
-        CONFIRMED.of(tracks)
+        CONFIRMED.of(tracks.message())
     kind = REQUESTS[data[0] % len(REQUESTS)]
     try:
         request = convert.parse(data[1:], kind)

@@ -4,9 +4,11 @@
 limits and the same errors. It is total: it returns a model or raises `MessageError`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any, Final, TypeVar
+from math import prod
+from struct import pack
+from typing import Any, Final, TypeVar, cast
 
 import numpy as np
 from google.protobuf import struct_pb2
@@ -18,8 +20,10 @@ from numpy.typing import NDArray
 
 from optipmb_schemas.blocks import DTYPES
 from optipmb_schemas.codec import build
+from optipmb_schemas.compact import checked, checked_pose
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import DEFAULT, Limits
+from optipmb_schemas.messages import Detections
 from optipmb_schemas.model import Message
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
@@ -30,6 +34,7 @@ _DTYPE_NAMES: Final[dict[int, str]] = {
     code: name.rpartition("_")[2].lower() for name, code in pb.DataType.items() if code
 }
 DTYPE_CODES: Final[dict[np.dtype[Any], Any]] = {DTYPES[name]: code for code, name in _DTYPE_NAMES.items()}
+_USUAL: Final = {"i8": pb.DATA_TYPE_I8, "f8": pb.DATA_TYPE_F8}
 _FRAMES: Final[dict[int, str]] = {pb.FRAME_WORLD: "world", pb.FRAME_SENSOR: "sensor"}
 _FRAME_CODES: Final = {name: code for code, name in _FRAMES.items()}
 
@@ -69,6 +74,8 @@ def from_proto(proto: ProtoMessage, kind: type[T], limits: Limits = DEFAULT) -> 
     Raises:
         MessageError: whenever it is not a valid message within the limits.
     """
+    if kind is Detections and (message := _usual_detections(proto, limits)) is not None:
+        return cast("T", message)
     return build(_fields(proto), kind, limits)
 
 
@@ -83,6 +90,32 @@ def select(array: pb.Array, rows: NDArray[np.bool_]) -> None:
     left = column(array)[rows]
     array.shape[0] = len(left)
     array.data = left.tobytes()
+
+
+def _usual_detections(proto: Any, limits: Limits) -> Detections | None:
+    """Return detections in their usual form; None when they are in another, or not valid."""
+    try:
+        fields = {field.name: value for field, value in proto.ListFields()}
+        fields["labels"], fields["frame"] = list(proto.labels), _FRAMES[proto.frame]
+        if "pose" in fields:
+            fields["pose"] = checked_pose(lambda name, length: _doubles(getattr(proto.pose, name), length))
+        return checked(fields, proto.label.shape[0], _usual_data, limits)
+    except (ValueError, TypeError, LookupError):
+        return None
+
+
+def _usual_data(array: pb.Array, dtype: str, shape: list[int]) -> bytes:
+    """Return the bytes of an array of a type and shape."""
+    data = array.data
+    if array.dtype != _USUAL[dtype] or array.shape != shape or len(data) != 8 * prod(shape):
+        raise ValueError
+    return data
+
+
+def _doubles(values: Sequence[float], length: int) -> bytes:
+    if len(values) != length:
+        raise ValueError
+    return pack(f"<{length}d", *values)
 
 
 def _array(array: NDArray[Any]) -> pb.Array:

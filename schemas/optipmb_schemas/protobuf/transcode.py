@@ -5,8 +5,10 @@ the rows of the others and the bytes of its shape. A receiver that wants more ha
 the service's own (JSON, other number types) are decoded as everywhere.
 """
 
+from dataclasses import dataclass
+from functools import lru_cache
 from math import prod
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import msgpack
 
@@ -18,22 +20,53 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import DTYPE_CODES, to_proto
 from optipmb_schemas.structure import check_msgpack
 
-__all__ = ["transcode"]
+__all__ = ["EncodedTracks", "transcode"]
+
+UNCHECKED: Final = 2**18
+"""Bytes of a payload of which msgpack may build what it claims without a walk before: at most some 16 MB."""
+
+MOST_ITEMS: Final = 256
+"""Items of one list or map in a payload that was not walked over."""
 
 _ENCODING: Final = encoding_of(Tracks)
-_NAMES: Final = frozenset(Tracks.names)
 _REQUIRED: Final = frozenset(name for name, info in Tracks.model_fields.items() if info.is_required())
-_COLUMNS: Final = [
-    (name, one.dtype, DTYPE_CODES[dtype], list(one.shape[1:]), prod(map(int, one.shape[1:])) * dtype.itemsize)
+_SCALARS: Final = tuple(name for name in Tracks.names if name not in Tracks.arrays)
+_SHAPES: Final = [
+    (name, one.dtype, [*map(int, one.shape[1:])], prod(map(int, one.shape[1:])) * DTYPES[one.dtype].itemsize)
     for name, one in Tracks.arrays.items()
-    for dtype in (DTYPES[one.dtype],)
 ]
-"""Of each array field: name, number type and its code in protobuf, shape of a row, and bytes of a row."""
+"""Of each array field: name, number type, shape of a row, and bytes of a row."""
 
 _msgpack: Any = msgpack  # its type information is partial
 
 
-def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -> pb.Tracks:
+@dataclass(frozen=True, slots=True)
+class EncodedTracks:
+    """The tracks of one frame in protobuf, and what tells this publication of them from others."""
+
+    stream: str
+    epoch: bytes
+    seq: int
+    stamp_ns: int
+    revision: int
+    run: int
+    payload: bytes
+    """The message `Tracks`, serialized."""
+
+    @classmethod
+    def of(cls, proto: pb.Tracks, columns: bytes = b"") -> Self:
+        """Return the tracks of a message, and of columns that are serialized already."""
+        payload = proto.SerializeToString() + columns
+        return cls(
+            proto.stream, proto.epoch, proto.seq, proto.stamp_ns, proto.revision, proto.delivery.run, payload
+        )  # fmt: skip
+
+    def message(self) -> pb.Tracks:
+        """Return the message."""
+        return pb.Tracks.FromString(self.payload)
+
+
+def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -> EncodedTracks:
     """Return encoded tracks in protobuf, their columns as they are.
 
     Args:
@@ -45,31 +78,60 @@ def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -
         MessageError: they are no tracks within the limits.
     """
     if encoding == _ENCODING and len(payload) <= limits.max_bytes:
-        check_msgpack(payload, limits)
+        most = MOST_ITEMS
+        if len(payload) > min(UNCHECKED, limits.max_values):
+            check_msgpack(payload, limits)
+            most = limits.max_values
         try:
-            tracks = _tracks(_msgpack.unpackb(payload), limits)
+            fields = _msgpack.unpackb(
+                payload, ext_hook=_refuse, max_str_len=limits.max_text, max_array_len=most, max_map_len=most
+            )
+            tracks = _tracks(fields, limits)
         except (AttributeError, KeyError, IndexError, TypeError, ValueError):
             tracks = None  # decoding says what is wrong, if anything is
         if tracks is not None:
             return tracks
-    proto: pb.Tracks = to_proto(decode(payload, Tracks, encoding=encoding, limits=limits))
-    return proto
+    return EncodedTracks.of(to_proto(decode(payload, Tracks, encoding=encoding, limits=limits)))
 
 
-def _tracks(fields: Any, limits: Limits) -> pb.Tracks | None:
-    """Return the tracks of fields that are as a service writes them, else None."""
-    # Fields that nobody here knows are of a newer version.
-    made = {name: value for name, value in fields.items() if name in _NAMES and value is not None}
-    if not made.keys() >= _REQUIRED or len(made["labels"]) > limits.max_labels:
+def _tracks(fields: Any, limits: Limits) -> EncodedTracks | None:
+    """Return the tracks of fields that are as a service writes them, else None.
+
+    Fields that are not known here are of a newer version, and are left out.
+    """
+    fields = {name: value for name, value in fields.items() if value is not None}
+    if not fields.keys() >= _REQUIRED or len(fields["labels"]) > limits.max_labels:
         return None
     (rows,) = fields["id"]["shape"]
-    if rows > limits.max_tracks:
+    if type(rows) is not int or not 0 <= rows <= limits.max_tracks:
         return None
-    for name, dtype, code, tail, size in _COLUMNS:
-        block = made.get(name)
+    prefixes = _prefixes(rows)
+    parts: list[bytes] = []
+    for name, dtype, tail, size in _SHAPES:
+        block = fields.get(name)
         if block is not None:
-            shape, data = block["shape"], block["data"]
-            if block["dtype"] != dtype or shape != [rows, *tail] or len(data) != rows * size:
+            data = block["data"]
+            if block["dtype"] != dtype or block["shape"] != [rows, *tail] or type(data) is not bytes:
                 return None
-            made[name] = {"dtype": code, "shape": shape, "data": data}
-    return pb.Tracks(**made)
+            if len(data) != rows * size:
+                return None
+            parts += (prefixes[name], data)
+    scalars = {name: fields[name] for name in _SCALARS if name in fields}
+    return EncodedTracks.of(pb.Tracks(**scalars), b"".join(parts))
+
+
+@lru_cache(512)
+def _prefixes(rows: int) -> dict[str, bytes]:
+    """Return of each column of so many rows what stands before its data in the serialized message."""
+    prefixes = {}
+    for name, dtype, tail, size in _SHAPES:
+        proto: Any = pb.Tracks()
+        array = pb.Array(dtype=DTYPE_CODES[DTYPES[dtype]], shape=[rows, *tail], data=bytes(rows * size))
+        getattr(proto, name).CopyFrom(array)
+        field: bytes = proto.SerializeToString()
+        prefixes[name] = field[: len(field) - rows * size]
+    return prefixes
+
+
+def _refuse(code: int, _data: bytes) -> None:
+    raise ValueError(code)

@@ -11,7 +11,7 @@ import optipmb_schemas as schemas
 import structlog
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-from optipmb_schemas.protobuf.transcode import transcode
+from optipmb_schemas.protobuf.transcode import EncodedTracks, transcode
 
 from optipmb_service.grpc.outbox import varint
 from optipmb_service.grpc.selection import Selection
@@ -34,11 +34,11 @@ log = structlog.get_logger("optipmb_service")
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Something that came, as a response of any streaming method; tracks have the number of their frame."""
+    """Something that came, as a response of any streaming method, and the tracks that it is of, if it is of any."""
 
     stream: str
     response: bytes
-    tracks: pb.Tracks | None = None
+    tracks: EncodedTracks | None = None
 
 
 class Listener(Protocol):
@@ -48,7 +48,7 @@ class Listener(Protocol):
     def selection(self) -> Selection:
         """What it wants of tracks."""
 
-    def passes(self, tracks: pb.Tracks) -> bool:
+    def passes(self, tracks: EncodedTracks) -> bool:
         """Tell whether it wants the tracks of this frame; called on a thread of the feed."""
 
     def take(self, item: Item) -> None:
@@ -96,7 +96,7 @@ class Feeds:
                 if feed.subscription is not None:
                     await asyncio.shield(asyncio.to_thread(feed.subscription.close))
 
-    async def recent(self, key: str) -> list[pb.Tracks]:
+    async def recent(self, key: str) -> list[EncodedTracks]:
         """Return the tracks that the services keep under a key expression, each stream's as they were published.
 
         Raises:
@@ -104,7 +104,7 @@ class Feeds:
         """
         return await asyncio.to_thread(self._recent, key)
 
-    def _recent(self, key: str) -> list[pb.Tracks]:
+    def _recent(self, key: str) -> list[EncodedTracks]:
         messages = self._client.recent(key, HISTORY_S)
         return [tracks for one in messages if (tracks := self._tracks(one)) is not None]
 
@@ -128,7 +128,7 @@ class Feeds:
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(_hand_over, handed)
 
-    def _tracks(self, message: Message) -> pb.Tracks | None:
+    def _tracks(self, message: Message) -> EncodedTracks | None:
         try:
             return transcode(message.payload, encoding=message.encoding)
         except schemas.MessageError as error:
@@ -143,9 +143,9 @@ class Feeds:
             return None
 
 
-def tracks_item(tracks: pb.Tracks, selection: Selection = EVERYTHING) -> Item:
+def tracks_item(tracks: EncodedTracks, selection: Selection = EVERYTHING) -> Item:
     """Return tracks as a response."""
-    payload = selection.of(tracks).SerializeToString()
+    payload = selection.of(tracks.message()).SerializeToString() if selection.key else tracks.payload
     return Item(tracks.stream, b"".join((_TRACKS, varint(len(payload)), payload)), tracks)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from optipmb_schemas.protobuf import tracking_pb2 as pb
+    from optipmb_schemas.protobuf.transcode import EncodedTracks
 
     from optipmb_service.grpc.feeds import Item
 
@@ -39,7 +39,7 @@ class Fresh:
         elif item.tracks is None or _publication(item.tracks) not in self._known:
             self._take(item)
 
-    def begin(self, held: Iterable[pb.Tracks]) -> None:
+    def begin(self, held: Iterable[EncodedTracks]) -> None:
         """Take in what the caches hold, and pass on what else came while they were asked."""
         self._known = {_publication(tracks) for tracks in held}
         early, self._early = self._early or [], None
@@ -47,10 +47,10 @@ class Fresh:
             self.put(item)
 
 
-def order(tracks: pb.Tracks) -> tuple[int, int]:
+def order(tracks: EncodedTracks) -> tuple[int, int]:
     """Return what later publications of a frame have more of: the run, and in it the revision."""
-    return tracks.delivery.run, tracks.revision
+    return tracks.run, tracks.revision
 
 
-def _publication(tracks: pb.Tracks) -> Publication:
+def _publication(tracks: EncodedTracks) -> Publication:
     return (tracks.stream, tracks.epoch, tracks.seq, *order(tracks))

@@ -18,6 +18,8 @@ from optipmb_service.grpc.outbox import Outbox
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable
 
+    from optipmb_schemas.protobuf.transcode import EncodedTracks
+
     from optipmb_service.grpc.calls import Call
     from optipmb_service.grpc.selection import Selection
     from optipmb_service.zenoh.client import Outgoing
@@ -179,7 +181,7 @@ class _Answers:
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
 
-    def passes(self, _tracks: pb.Tracks) -> bool:
+    def passes(self, _tracks: EncodedTracks) -> bool:
         """Tell whether they are wanted: all are."""
         return True
 
@@ -242,7 +244,7 @@ async def track(call: Call) -> None:
     call.check_ending()
 
 
-def _already_tracked(held: Iterable[pb.Tracks], first: Input, outbox: Outbox) -> set[tuple[bytes, int]]:
+def _already_tracked(held: Iterable[EncodedTracks], first: Input, outbox: Outbox) -> set[tuple[bytes, int]]:
     """Answer what a caller that comes back sends again: it may have been tracked, and is not tracked twice."""
     known: set[tuple[bytes, int]] = set()
     if not isinstance(first, schemas.Detections | schemas.Points):

@@ -17,6 +17,8 @@ from optipmb_service.grpc.selection import Pace, Selection
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from optipmb_schemas.protobuf.transcode import EncodedTracks
+
     from optipmb_service.grpc.calls import Call
 
 QUEUE: Final = 16
@@ -42,7 +44,7 @@ class _Subscriber:
         self._fresh = Fresh(lambda item: self.outbox.put(item.stream, item.response))
         self.take, self.begin = self._fresh.put, self._fresh.begin
 
-    def passes(self, tracks: pb.Tracks) -> bool:
+    def passes(self, tracks: EncodedTracks) -> bool:
         return self._pace.passes(tracks.stream, tracks.stamp_ns)
 
 
@@ -83,9 +85,9 @@ async def query_tracks(call: Call) -> None:
             await call.write(tracks_item(tracks, selection).response)
 
 
-def newest(publications: Iterable[pb.Tracks]) -> list[pb.Tracks]:
+def newest(publications: Iterable[EncodedTracks]) -> list[EncodedTracks]:
     """Return what holds of each frame, by stream and stamp: that of the latest run, and in it the latest revision."""
-    holding: dict[tuple[str, bytes, int], pb.Tracks] = {}
+    holding: dict[tuple[str, bytes, int], EncodedTracks] = {}
     for tracks in publications:
         key = tracks.stream, tracks.epoch, tracks.seq
         known = holding.get(key)

@@ -34,7 +34,7 @@ class Selection:
 
     def __init__(self, asked: pb.TrackFilter) -> None:
         self.key = asked.SerializeToString(deterministic=True)
-        """Equal filters have equal keys."""
+        """Equal filters have equal keys; that of a filter which leaves nothing out is empty."""
         for name, values in (("classes", asked.classes), ("fields", asked.fields)):
             if len(values) > MAX_NAMES:
                 raise schemas.MessageError("too_large", f"filter.{name}", f"at most {MAX_NAMES}", str(len(values)))
@@ -54,8 +54,6 @@ class Selection:
 
     def of(self, tracks: pb.Tracks) -> pb.Tracks:
         """Return what is wanted of the tracks of a frame."""
-        if not self.key:
-            return tracks
         rows = self._rows(tracks)
         chosen = pb.Tracks()
         chosen.CopyFrom(tracks)
