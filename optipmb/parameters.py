@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 OpenProbability = Annotated[float, Field(gt=0.0, lt=1.0)]
-Positive = Annotated[float, Field(gt=0.0, le=1e9)]
+Positive = Annotated[float, Field(ge=1e-9, le=1e9)]
+"""Far enough from zero and from infinity that squares and quotients of such numbers stay finite."""
 NonNegative = Annotated[float, Field(ge=0.0, le=1e9)]
 
 
