@@ -55,6 +55,8 @@ LOOKED_AT: Final = 20
 """Sequences, and"""
 LOOKED_INTO: Final = 300
 """frames of each that tell rate and scores."""
+GLANCE: Final = 20
+"""Frames of each that tell whether the rate is about that of a profile: clouds, if there are any, take long to read."""
 ATTEMPTS: Final = 3
 
 
@@ -248,7 +250,7 @@ def doubts(parameters: Parameters, sequences: Sequence[DataSequence]) -> Iterato
     if missing:
         hint = _renamed(missing, parameters.labels)
         yield f"profile {parameters.name} does not track {', '.join(missing)}: left out{hint}"
-    period, nominal = _period(sequences), parameters.nominal_period
+    period, nominal = _period(sequences, GLANCE), parameters.nominal_period
     if period is not None and not 1.0 / FAR <= period / nominal <= FAR:
         yield (
             f"frames come at {1.0 / period:.3g} Hz, profile {parameters.name} is for {1.0 / nominal:.3g} Hz: "
@@ -261,12 +263,12 @@ def _renamed(labels: Sequence[str], known: tuple[str, ...]) -> str:
     return f" ({' '.join(pairs)} renames classes of a table; --profile auto takes any)" if pairs else ""
 
 
-def _period(sequences: Sequence[DataSequence]) -> float | None:
-    """Return the median time in seconds between neighbouring frames at the start of the first sequences."""
+def _period(sequences: Sequence[DataSequence], frames: int) -> float | None:
+    """Return the median time in seconds between neighbouring frames, so many, at the start of the first sequences."""
     steps = [
         (after.stamp_ns - before.stamp_ns) / 1e9
         for one in sequences[:LOOKED_AT]
-        for before, after in itertools.pairwise(itertools.islice(one.frames(), LOOKED_INTO))
+        for before, after in itertools.pairwise(itertools.islice(one.frames(), frames))
     ]
     return median(steps) or None if steps else None
 
@@ -279,7 +281,7 @@ def _made_for(sequences: Sequence[DataSequence]) -> Parameters:
             for label, score in zip(frame.label.tolist(), frame.score.tolist(), strict=True):
                 scores[frame.labels[label]].append(score)
     try:
-        return generic_parameters(labels or ("object",), _period(sequences) or USUAL_PERIOD, scores)
+        return generic_parameters(labels or ("object",), _period(sequences, LOOKED_INTO) or USUAL_PERIOD, scores)
     except OptipmbError as error:
         raise UsageError(f"--profile {AUTO}: {error}") from error
 
