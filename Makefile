@@ -81,7 +81,7 @@ tests-together: install
 	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not alone and not bounds"
 
 tests-alone: install
-	$(BIN)/pytest -m alone
+	$(BIN)/pytest tests/e2e -m alone
 
 # Compiling all kernels a second time takes a minute; what is compiled is kept in .pytest_cache.
 bounds: install

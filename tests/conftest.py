@@ -16,7 +16,7 @@ HERE = Path(__file__).parent
 # What a shell starts in the background ignores it, and hands that on to what it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-ALONE = ("e2e/test_load.py", "e2e/test_soak.py", "service/runtime/test_memory.py")
+ALONE = ("e2e/test_load.py", "e2e/test_soak.py")
 """Files whose tests measure memory and times (`-m alone`); all others wait for conditions and run side by side."""
 
 # The same examples in every run; `--hypothesis-profile default` looks at others.

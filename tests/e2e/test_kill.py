@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 KILLS = int(os.environ.get("OPTIPMB_TEST_KILLS", "3"))
 FEW = 10
-FRAMES = 120 if KILLS > FEW else 60
+FRAMES = 120 if KILLS > FEW else 40
 SEED = int(os.environ.get("OPTIPMB_TEST_SEED", "1"))
 RESTART_S = 200.0  # on a machine that is busy with other things
 SEQUENCES = ("0000", "0002", "0004", "0011")

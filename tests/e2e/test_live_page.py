@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 from browser import browser, console, requested, size, wait
 from optipmb_client import Publisher
+from processes import descendants, wait_until_ended
 from routers import free_endpoint
 from service_process import ServiceProcess
 
@@ -163,8 +164,11 @@ def phone(chrome: Chrome) -> None:
     shown_moving(chrome)
 
 
-def test_streams_of_worker_processes_are_shown_too() -> None:
-    """With several processes the page of the whole gets the tracks of whichever worker has the stream."""
+def test_streams_of_workers_are_shown_and_workers_end_with_their_parent() -> None:
+    """With several processes the page of the whole gets the tracks of whichever worker has the stream.
+
+    And kill -9 of the parent, which can tell nobody, leaves no worker behind.
+    """
     with service("--workers", "2") as whole:
         whole.wait_ready()
         with publishing(CARS, "car", 4.0), publishing(WALKERS, "pedestrian", 1.0):
@@ -173,4 +177,7 @@ def test_streams_of_worker_processes_are_shown_too() -> None:
                 with urllib.request.urlopen(address, timeout=DEADLINE_S) as events:  # noqa: S310 - our own
                     frame = next(json.loads(line[6:]) for line in events if line.startswith(b"data: "))
                 assert frame["labels"][frame["tracks"][0][1]] == label
-        assert whole.end()[0] == 0
+            children = descendants(whole.process.pid)
+            assert len(children) == 2
+            whole.process.kill()
+            assert wait_until_ended(children, DEADLINE_S) == set()

@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from commands import optipmb
+from commands import optipmb, result_of, run_here
 
 if TYPE_CHECKING:
+    import pytest
     from optipmb_client.child import ServiceProcess
 
 STREAMS, RATE, SECONDS = 3, 20, 2
 
 
-def test_a_load_counts_exactly(service: ServiceProcess) -> None:
+def test_a_load_counts_exactly(service: ServiceProcess, capsys: pytest.CaptureFixture[str]) -> None:
     """Every frame sent comes back, with its cloud; the service has tracked as many, and keeps no session afterwards."""
     options = ("--streams", STREAMS, "--rate", RATE, "--seconds", SECONDS, "--objects", 5, "--points", 1000)
     result = optipmb("load", "--connect", service.endpoint, *options, "--json")
@@ -23,14 +24,14 @@ def test_a_load_counts_exactly(service: ServiceProcess) -> None:
     assert (run["sent"], run["received"], run["lost"], run["repeated"], run["cloudless"]) == (frames, frames, 0, 0, 0)
     assert 0 < run["p50_ms"] <= run["p99_ms"] <= run["max_ms"]
     assert sum(run["stages_p50_ms"].values()) < 2 * run["p50_ms"]
-    (status,) = json.loads(optipmb("status", "--connect", service.endpoint, "--json").stdout)["services"]
+    (status,) = result_of(run_here(capsys, "status", "--connect", service.endpoint, "--json"))["services"]
     assert status["frames"] == frames
     assert status.get("sessions", []) == []
 
 
-def test_a_latency_that_is_not_held_is_told(service: ServiceProcess) -> None:
+def test_a_latency_that_is_not_held_is_told(service: ServiceProcess, capsys: pytest.CaptureFixture[str]) -> None:
     """A limit that nothing can hold ends with status 1."""
     options = ("--streams", 1, "--rate", 20, "--seconds", 1, "--latency-ms", 0.1)
-    result = optipmb("load", "--connect", service.endpoint, *options)
+    result = run_here(capsys, "load", "--connect", service.endpoint, *options)
     assert result.returncode == 1
     assert "not held" in result.stdout

@@ -16,8 +16,12 @@ from processes import descendants, running, wait_until_ended
 START_S = 240.0
 
 
-def test_a_service_comes_up_and_ends(tmp_path: Path) -> None:
-    """It answers at its endpoint while the context lasts, ends with status 0 after it, and its log is kept."""
+def test_a_service_comes_up_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It answers at its endpoint while the context lasts, ends with status 0 after it, and its log is kept.
+
+    Settings in the environment are meant for other services and do not reach it: the one here would end its start.
+    """
+    monkeypatch.setenv("OPTIPMB_MAX_SESSIONS", "none")
     log = tmp_path / "folder" / "service.log"
     with ServiceProcess(log=log) as service:
         service.wait_until_ready(START_S)
@@ -39,29 +43,21 @@ def test_a_service_that_cannot_start_is_told_with_its_words() -> None:
     assert not running(service.process.pid)
 
 
-def test_settings_of_this_process_do_not_reach_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Settings in the environment are meant for other services than the one started here."""
-    monkeypatch.setenv("OPTIPMB_MAX_SESSIONS", "none")
-    with ServiceProcess() as service:
-        service.wait_until_ready(START_S)
-
-
 def test_a_frozen_service_is_killed() -> None:
-    """A service that does not follow SIGTERM is killed after its grace."""
+    """A service that does not follow SIGTERM, here one that is frozen in its start, is killed after its grace."""
     with ServiceProcess(grace_s=0.5) as service:
-        service.wait_until_ready(START_S)
         service.process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, service.process.pid, os.WSTOPPED)
         begun = time.monotonic()
     assert time.monotonic() - begun >= 0.5
     assert service.process.returncode == -signal.SIGKILL
 
 
 def test_the_service_ends_when_its_parent_is_killed() -> None:
-    """SIGKILL of the parent, which can clean up nothing, takes the service along."""
+    """SIGKILL of the parent, which can clean up nothing, takes the service along, also while that starts."""
     code = (
         "from optipmb_client.child import ServiceProcess\n"
         "with ServiceProcess() as service:\n"
-        f"    service.wait_until_ready({START_S})\n"
         "    print(service.process.pid, flush=True)\n"
         "    service.process.wait()\n"
     )

@@ -1,8 +1,9 @@
 """The bridge to ROS 2 with a node by zenoh-ros2-sdk on the other side, over a real router and a real service."""
 
+import itertools
 import json
-import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +17,18 @@ from optipmb_client.offline import read_profile, track_sequence
 from optipmb_schemas.ros2.arrays import CLOUD
 from optipmb_schemas.ros2.tracks import TOPICS, TRACKED
 from optipmb_schemas.ros2.types import own_types
+from optipmb_service.app import cli
 from optipmb_service.ros2 import graph
 from ros2_client import Ros2Client, hash_by_sdk
 from routers import open_client
 from service_process import ServiceProcess
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 
-DOMAIN = 7
-STREAM = "garage/robot/lidar"
+DOMAINS = itertools.count(7)
 TF = "tf2_msgs/msg/TFMessage"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 TRACKS = "/detector/boxes/tracks"
 START_NS = 10**18
-pytestmark = pytest.mark.alone
 
 PATIENCE_S = 20.0
 """How long clouds and transforms are waited for that do come, on a busy machine."""
@@ -41,7 +41,20 @@ def scene() -> DataSequence:
     return sequence
 
 
-@pytest.fixture
+@dataclass(frozen=True)
+class Robot:
+    """A stream and a domain of ROS that no other test uses, at the router of one service for all tests."""
+
+    endpoint: str
+    domain: int
+
+    @property
+    def stream(self) -> str:
+        """The stream."""
+        return f"garage/robot-{self.domain}/lidar"
+
+
+@pytest.fixture(scope="module")
 def service() -> Iterator[ServiceProcess]:
     """A service that is a router, and waits long enough for clouds on a busy machine."""
     with ServiceProcess("--profile", "scene", environment={"OPTIPMB_CLOUD_WAIT_S": str(PATIENCE_S)}) as process:
@@ -49,14 +62,20 @@ def service() -> Iterator[ServiceProcess]:
         yield process
 
 
-def bridge(service: ServiceProcess, folder: Path, *, points: str = "", tf_wait_s: float = PATIENCE_S) -> ServiceProcess:
+@pytest.fixture
+def robot(service: ServiceProcess) -> Robot:
+    """A robot of a test's own."""
+    return Robot(service.endpoint, next(DOMAINS))
+
+
+def bridge(robot: Robot, folder: Path, *, points: str = "", tf_wait_s: float = PATIENCE_S) -> ServiceProcess:
     """Start the bridge, for a topic of points where one is named; use it as a context manager."""
     file = folder / "ros2.toml"
-    stream = f'[ros2.streams."{STREAM}"]\ndetections = "/detector/boxes"\n'
+    stream = f'[ros2.streams."{robot.stream}"]\ndetections = "/detector/boxes"\n'
     clouds = f'points = "{points}"\n' if points else ""
-    file.write_text(f"[ros2]\ndomain = {DOMAIN}\ntf_wait_s = {tf_wait_s}\n{stream}{clouds}")
-    process = ServiceProcess("ros2", "--settings", str(file), "--connect", service.endpoint, listen=False)
-    assert process.wait_ready().startswith(f"ready ros2={STREAM} ")
+    file.write_text(f"[ros2]\ndomain = {robot.domain}\ntf_wait_s = {tf_wait_s}\n{stream}{clouds}")
+    process = ServiceProcess("ros2", "--settings", str(file), "--connect", robot.endpoint, listen=False)
+    assert process.wait_ready().startswith(f"ready ros2={robot.stream} ")
     return process
 
 
@@ -70,9 +89,9 @@ def frames_of(sequence: DataSequence) -> list[list[bags.Sent]]:
     return frames[:-1]
 
 
-def publish_static(session: zenoh.Session, message: dict[str, Any]) -> Any:
+def publish_static(session: zenoh.Session, domain: int, message: dict[str, Any]) -> Any:
     """Publish a static transform as rmw_zenoh does, with a cache for who comes late; keep what is returned."""
-    key = graph.TopicKey(DOMAIN, "/tf_static", TF, hash_by_sdk(TF)).key
+    key = graph.TopicKey(domain, "/tf_static", TF, hash_by_sdk(TF)).key
     publisher = zenoh.ext.declare_advanced_publisher(
         session,
         key,
@@ -130,9 +149,9 @@ def told(client: Ros2Client, text: str) -> str:
     return texts(client.wait("/diagnostics", lambda got: bool(texts(got))))[0]
 
 
-def ready_client(service: ServiceProcess) -> Ros2Client:
+def ready_client(robot: Robot) -> Ros2Client:
     """Start a node that listens to what the bridge publishes; returns when the bridge is heard."""
-    client = Ros2Client(service.endpoint, DOMAIN)
+    client = Ros2Client(robot.endpoint, robot.domain)
     for topic, kind in (*((TRACKS + end, kind) for end, kind in TOPICS.items()), ("/diagnostics", DIAGNOSTICS)):
         client.subscribe(topic, kind)
     client.wait("/diagnostics", bool)
@@ -145,13 +164,13 @@ def test_hashes_of_types_are_those_of_another_library(kind: str) -> None:
     assert own_types().hash_of(kind) == hash_by_sdk(kind)
 
 
-def test_topics_become_tracks_of_another_node(service: ServiceProcess, scene: DataSequence, tmp_path: Path) -> None:
+def test_topics_become_tracks_of_another_node(robot: Robot, scene: DataSequence, tmp_path: Path) -> None:
     """Detections, clouds and tf of a node that is not ours come back as the tracks of the same data, also to Humble."""
     frames = frames_of(scene)
     static = next(one.message for one in frames[0] if one.topic == "/tf_static")
-    with open_client(service.endpoint) as session, bridge(service, tmp_path, points="/points") as process:
-        publisher = publish_static(session, static)
-        with ready_client(service) as client:
+    with open_client(robot.endpoint) as session, bridge(robot, tmp_path, points="/points") as process:
+        publisher = publish_static(session, robot.domain, static)
+        with ready_client(robot) as client:
             client.subscribe(TRACKS, TRACKED, name="of Humble", type_hash=graph.NO_HASH)
             play(client, frames)
             tracked = client.received[TRACKS]
@@ -180,21 +199,21 @@ def test_topics_become_tracks_of_another_node(service: ServiceProcess, scene: Da
         assert len(shown[index].markers) > len(tracks.id)
 
 
-def test_either_side_may_restart(service: ServiceProcess, scene: DataSequence, tmp_path: Path) -> None:
+def test_either_side_may_restart(robot: Robot, scene: DataSequence, tmp_path: Path) -> None:
     """After a restart of the node, and a kill of the bridge, tracks go on with their ids."""
     frames = frames_of(scene)
     static = next(one.message for one in frames[0] if one.topic == "/tf_static")
-    with open_client(service.endpoint) as session:
-        publisher = publish_static(session, static)
-        with bridge(service, tmp_path, points="/points") as process:
-            with ready_client(service) as client:
+    with open_client(robot.endpoint) as session:
+        publisher = publish_static(session, robot.domain, static)
+        with bridge(robot, tmp_path, points="/points") as process:
+            with ready_client(robot) as client:
                 play(client, frames[:6])
                 before = ids(client.received[TRACKS][-1])
-            with ready_client(service) as client:
+            with ready_client(robot) as client:
                 play(client, frames[6:10])
                 between = ids(client.received[TRACKS][-1])
             process.process.kill()
-        with bridge(service, tmp_path, points="/points"), ready_client(service) as client:
+        with bridge(robot, tmp_path, points="/points"), ready_client(robot) as client:
             play(client, frames[10:])
             after = ids(client.received[TRACKS][-1])
             counted = told(client, "tracking")
@@ -204,11 +223,11 @@ def test_either_side_may_restart(service: ServiceProcess, scene: DataSequence, t
     assert counted
 
 
-def test_what_is_wrong_on_the_other_side_is_told(service: ServiceProcess, scene: DataSequence, tmp_path: Path) -> None:
+def test_what_is_wrong_on_the_other_side_is_told(robot: Robot, scene: DataSequence, tmp_path: Path) -> None:
     """A clock that starts late, frames that tf lacks, quality of service or definitions that do not fit are told."""
     frames = frames_of(scene)
     boxes = json.loads(json.dumps(next(one for one in frames[0] if one.topic == "/detector/boxes").message))
-    with bridge(service, tmp_path, points="/points", tf_wait_s=1.0) as process, ready_client(service) as client:
+    with bridge(robot, tmp_path, points="/points", tf_wait_s=1.0) as process, ready_client(robot) as client:
         boxes["header"]["stamp"] = {"sec": 0, "nanosec": 0}
         client.publish("/detector/boxes", bags.VISION, boxes)
         assert "simulated clock that has not started" in told(client, "header.stamp")
@@ -236,10 +255,10 @@ def test_what_is_wrong_on_the_other_side_is_told(service: ServiceProcess, scene:
         assert ids(client.received[TRACKS][-1])
 
 
-def test_a_clock_that_is_set_back_starts_anew(service: ServiceProcess, scene: DataSequence, tmp_path: Path) -> None:
+def test_a_clock_that_is_set_back_starts_anew(robot: Robot, scene: DataSequence, tmp_path: Path) -> None:
     """When a simulation starts again, transforms of before are forgotten, and tracks come again."""
     frames = [[one for one in frame if one.topic != "/points"] for frame in frames_of(scene)[:4]]
-    with bridge(service, tmp_path), ready_client(service) as client:
+    with bridge(robot, tmp_path), ready_client(robot) as client:
         play(client, frames)
         back = json.loads(json.dumps([[list(one) for one in frame] for frame in frames]))
         for frame in back:
@@ -266,18 +285,20 @@ def _shift(message: Any, seconds: int) -> None:
             _shift(one, seconds)
 
 
-def test_the_command_says_what_it_needs(tmp_path: Path) -> None:
+def test_the_command_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Without streams, and with a topic that is none, the command ends with status 2 and one clear line."""
     file = tmp_path / "ros2.toml"
     for text, expected in (
-        ("", "setting ros2.streams: expected a table of streams"),
         ('[ros2.streams."a/b/c"]\ndetections = "boxes"', "a topic looks like /lidar/points, received 'boxes'"),
         ('[ros2.streams."a/b"]\ndetections = "/boxes"', "setting ros2.streams (from the file): a stream is named"),
     ):
         file.write_text(text)
-        with ServiceProcess("ros2", "--settings", str(file), listen=False) as process:
-            assert process.process.wait(60) == 2
-            ends = time.monotonic() + 5
-            while not process.errors and time.monotonic() < ends:
-                time.sleep(0.01)
-            assert expected in process.errors
+        with pytest.raises(SystemExit, match="2"):
+            cli.main(("ros2", "--settings", str(file)))
+        (line,) = capsys.readouterr().err.splitlines()
+        assert expected in line
+    file.write_text("")
+    with ServiceProcess("ros2", "--settings", str(file), listen=False) as process:
+        assert process.wait_end() == 2
+        (line,) = process.errors.splitlines()
+        assert "setting ros2.streams: expected a table of streams" in line

@@ -8,7 +8,7 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from commands import optipmb as optipmb_command
+from commands import run_here
 from optipmb_schemas import Keys, MoveRequest, ServiceStatus, Tracks, decode
 from optipmb_service.cluster.assignment import worker_of
 from optipmb_service.session.session import Session
@@ -175,28 +175,18 @@ def test_a_stream_can_be_moved(service: ServiceProcess) -> None:
         assert (problem.path, problem.received) == ("worker", "2")
 
 
-def test_the_command_moves(service: ServiceProcess) -> None:
+def test_the_command_moves(service: ServiceProcess, capsys: pytest.CaptureFixture[str]) -> None:
     """`optipmb move` moves, also ahead of the first frame, and says no with status 1 and one line."""
     stream = "moves/command/lidar"
     target = 1 - worker_of(stream, 2)
-    assert optipmb_command("move", stream, "--to", target, "--connect", service.endpoint).returncode == 0
+    assert run_here(capsys, "move", stream, "--to", target, "--connect", service.endpoint).returncode == 0
     with Node(service.endpoint) as node:
         node.send(Sensor(stream=stream).detections(0))
         node.tracks(stream, 1)
         assert workers_of(node.ask(KEYS.status("pair"), ServiceStatus))[stream] == target
-    refused = optipmb_command("move", stream, "--to", 7, "--connect", service.endpoint)
+    refused = run_here(capsys, "move", stream, "--to", 7, "--connect", service.endpoint)
     assert (refused.returncode, refused.stderr.count("\n")) == (1, 1)
     assert "from 0 to 1" in refused.stderr
-
-
-def test_workers_end_with_their_parent() -> None:
-    """Kill -9 of the parent, which can tell nobody, leaves no worker behind."""
-    with ServiceProcess(*OPTIONS) as service:
-        service.wait_ready()
-        children = descendants(service.process.pid)
-        assert len(children) == 2
-        service.process.kill()
-        assert wait_until_ended(children, 60.0) == set()
 
 
 def test_what_cannot_start_says_so_once() -> None:

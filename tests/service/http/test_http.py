@@ -254,24 +254,8 @@ def test_metrics_count_what_happened(tmp_path: Path) -> None:
         assert same[f"{NAMESPACE}frames_total", ()] == 6
 
 
-def test_figures_outlive_their_sessions() -> None:
-    """Counters never fall, also when a session ends; the series of its stream go with it."""
-    with ServiceProcess("--http", "127.0.0.1:0", "--log-format", "json") as service:
-        address = address_of(service)
-        service.wait_ready()
-        with Node(service.endpoint) as node:
-            node.send(*(SENSOR.detections(seq) for seq in range(5)))
-            node.tracks(SENSOR.stream, 5)
-            assert node.query(KEYS.query(SENSOR.stream, "reset"), json.dumps({"close": True}).encode())[0][0]
-            figures = samples(get(address, "/metrics")[1])
-        assert figures[f"{NAMESPACE}frames_total", ()] == 5
-        assert figures[f"{NAMESPACE}tracks", ()] == 0
-        assert figures[f"{NAMESPACE}tracks_started_total", ()] == figures[f"{NAMESPACE}tracks_ended_total", ()] > 0
-        assert (f"{NAMESPACE}stream_frames_total", (("stream", SENSOR.stream),)) not in figures
-
-
-def test_streams_with_series_of_their_own_are_bounded() -> None:
-    """Only so many streams have series; the others are counted."""
+def test_series_of_streams_are_bounded_and_figures_outlive_sessions() -> None:
+    """Only so many streams have series, which go with the sessions; counters never fall when sessions end."""
     options = ("--http", "127.0.0.1:0", "--log-format", "json")
     with ServiceProcess(*options, environment={"OPTIPMB_HTTP_STREAMS": "2"}) as service:
         address = address_of(service)
@@ -279,14 +263,24 @@ def test_streams_with_series_of_their_own_are_bounded() -> None:
         streams = [f"site/node/lidar-{number}" for number in range(5)]
         with Node(service.endpoint) as node:
             for stream in streams:
-                node.send(Sensor(stream).detections(0))
+                node.send(*(Sensor(stream).detections(seq) for seq in range(5)))
             for stream in streams:
-                node.tracks(stream, 1)
-        figures = samples(get(address, "/metrics")[1])
-        listed = {labels for name, labels in figures if name == f"{NAMESPACE}stream_frames_total"}
-        assert listed == {(("stream", stream),) for stream in streams[:2]}
-        assert figures[f"{NAMESPACE}streams_unlisted", ()] == 3
-        assert figures[f"{NAMESPACE}frames_total", ()] == 5
+                node.tracks(stream, 5)
+            busy = samples(get(address, "/metrics")[1])
+            for stream in streams:
+                assert node.query(KEYS.query(stream, "reset"), json.dumps({"close": True}).encode())[0][0]
+            ended = samples(get(address, "/metrics")[1])
+
+    def listed(figures: Samples) -> set[tuple[tuple[str, str], ...]]:
+        return {labels for name, labels in figures if name == f"{NAMESPACE}stream_frames_total"}
+
+    assert listed(busy) == {(("stream", stream),) for stream in streams[:2]}
+    assert listed(ended) == set()
+    assert busy[f"{NAMESPACE}streams_unlisted", ()] == 3
+    assert busy[f"{NAMESPACE}tracks", ()] > ended[f"{NAMESPACE}tracks", ()] == 0
+    for figures in (busy, ended):
+        assert figures[f"{NAMESPACE}frames_total", ()] == 25
+    assert ended[f"{NAMESPACE}tracks_started_total", ()] == ended[f"{NAMESPACE}tracks_ended_total", ()] > 0
 
 
 def test_the_health_command() -> None:
