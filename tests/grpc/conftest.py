@@ -1,4 +1,4 @@
-"""A service with its own router and a gateway beside it, as processes, for the tests of a module."""
+"""A service with its own router and a gateway beside it, as processes, for all tests; each test has its own stream."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 NUMBERS = itertools.count()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def service() -> Iterator[ServiceProcess]:
     """A service with its own router."""
     with ServiceProcess() as process:
@@ -23,7 +23,7 @@ def service() -> Iterator[ServiceProcess]:
         yield process
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def gateway(service: ServiceProcess) -> Iterator[GatewayProcess]:
     """A gateway of that service."""
     with GatewayProcess(service.endpoint) as process:
@@ -40,4 +40,4 @@ def stub(gateway: GatewayProcess) -> Any:
 @pytest.fixture
 def stream() -> str:
     """A stream that no other test uses."""
-    return f"garage/robot-{next(NUMBERS)}/lidar"
+    return f"yard/robot-{next(NUMBERS)}/lidar"
