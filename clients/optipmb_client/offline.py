@@ -19,6 +19,7 @@ from optipmb import (
     Parameters,
     PointCloud,
     Pose,
+    StepResult,
     Tracker,
     Tracks,
     generic_parameters,
@@ -33,6 +34,7 @@ from optipmb_client.datasets import DataSequence, Dataset, DatasetArguments, Det
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.geometry import Floats, Ints
 from optipmb_client.recording import Latency, Results, latency, selected_frames
+from optipmb_client.smoothing import Smoother
 
 __all__ = [
     "AUTO",
@@ -165,6 +167,7 @@ class Job:
     parameters: Parameters
     classes: tuple[str, ...] = ()
     modules: Modules | None = None
+    smooth: bool = False
 
 
 @dataclass(frozen=True)
@@ -297,8 +300,16 @@ def track_sequence(
     Raises:
         UsageError: A frame holds values that the tracker refuses.
     """
-    tracker = Tracker(parameters, modules)
     names = tuple(parameters.classes)
+    for given, result, left_out, took in _steps(parameters, sequence, classes, modules):
+        yield given, NamedTracks(result.tracks, names), left_out, took
+
+
+def _steps(
+    parameters: Parameters, sequence: DataSequence, classes: Sequence[str], modules: Modules | None
+) -> Iterator[tuple[DetectionFrame, StepResult, int, int]]:
+    """Yield what `track_sequence` does, with the whole result of each step."""
+    tracker = Tracker(parameters, modules)
     density = tracker.initial()
     for given in selected_frames(sequence, classes):
         try:
@@ -322,7 +333,7 @@ def track_sequence(
         result = tracker.step(density, frame)
         took = time.perf_counter_ns() - begun
         density = result.density
-        yield given, NamedTracks(result.tracks, names), left_out, took
+        yield given, result, left_out, took
 
 
 def run(job: Job, sequence: DataSequence | None = None, on_frame: Callable[[], None] = lambda: None) -> Tracked:
@@ -341,13 +352,19 @@ def run(job: Job, sequence: DataSequence | None = None, on_frame: Callable[[], N
     results: dict[int, NamedTracks] = {}
     steps: list[int] = []
     clouds = detections = left_out = 0
-    for frame, tracks, missed, took in track_sequence(job.parameters, sequence, job.classes, job.modules):
-        results[frame.index] = tracks
+    names = tuple(job.parameters.classes)
+    smoother = Smoother(job.parameters) if job.smooth else None
+    for frame, result, missed, took in _steps(job.parameters, sequence, job.classes, job.modules):
+        results[frame.index] = NamedTracks(result.tracks, names)
+        if smoother is not None:
+            smoother.add(frame.index, result.density, result.tracks)
         steps.append(took)
         clouds += frame.cloud is not None
         detections += len(frame)
         left_out += missed
         on_frame()
+    if smoother is not None:
+        results = {index: NamedTracks(tracks, names) for index, tracks in smoother.tracks()}
     return Tracked(results, clouds, detections, left_out, tuple(steps), time.monotonic() - begun)
 
 
@@ -361,19 +378,21 @@ def track(  # noqa: PLR0913  one argument per decision of the caller
     classes: Sequence[str] = (),
     modules: Modules | None = None,
     full: bool = False,
+    smooth: bool = False,
     jobs: int = 1,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Iterator[TrackedSequence]:
     """Track sequences in `jobs` processes and write their results into `out`, a folder or a table.
 
     Yields each sequence when it is done and written, in their order. With `full`, all that is known of the tracks is
-    written too. The results are the same bytes with any number of processes.
+    written too. With `smooth`, states are given all frames of their track (`optipmb_client.smoothing`). The results are
+    the same bytes with any number of processes.
 
     Raises:
         UsageError: No such class, or values that the tracker refuses.
     """
     results = Results(dataset, out, full=full)
-    work = [Job(data, sequence.name, parameters, tuple(classes), modules) for sequence in sequences]
+    work = [Job(data, sequence.name, parameters, tuple(classes), modules, smooth) for sequence in sequences]
     done = (
         run_jobs(work, jobs)
         if jobs > 1

@@ -103,6 +103,25 @@ def predict(
     return mean, 0.5 * (covariance + covariance.T)
 
 
+def smooth(means: Array, covariances: Array, t: Array, Q: Array, tau: float) -> tuple[Array, Array]:
+    """The unscented Rauch-Tung-Striebel smoother (Särkkä 2008) over one track: (T, 6), (T, 6, 6), times (T,) in s."""
+    m_s, P_s = [means[-1].copy()], [covariances[-1].copy()]
+    for m, P, dt in reversed(list(zip(means[:-1], covariances[:-1], np.diff(t), strict=True))):
+        m_p, P_p = predict(m, P, Q, dt, tau)
+        D = np.zeros_like(P)
+        points = sigma_points(m, P)
+        for x in points:
+            moved = ctra(x, dt, tau) - m_p
+            moved[3] = wrap(moved[3])
+            D += np.outer(x - m, moved) / len(points)
+        G = D @ np.linalg.inv(P_p)
+        change = m_s[0] - m_p
+        change[3] = wrap(change[3])
+        m_s.insert(0, m + G @ change)
+        P_s.insert(0, P + G @ (P_s[0] - P_p) @ G.T)
+    return np.array(m_s), np.array(P_s)
+
+
 def measure(x: Array, *, with_velocity: bool) -> Array:
     """Eq. (Single Object Measurement Model): H(x) = [x, y, v cos phi, v sin phi, phi]."""
     px, py, v, phi = x[:4]

@@ -50,6 +50,10 @@ def track(  # noqa: PLR0913  these are the command's options
     profile: Profile = None,
     classes: Classes = None,
     full: Full = False,
+    smooth: Annotated[
+        bool,
+        typer.Option("--smooth", help="Estimate every state from all frames of its track, later ones too: for labels."),
+    ] = False,
     keep_input: Annotated[
         bool, typer.Option("--keep-input", help="Of a bag, with --out FILE.mcap: also copy what is in it.")
     ] = False,
@@ -68,6 +72,7 @@ def track(  # noqa: PLR0913  these are the command's options
     From a bag of ROS 2, --out FILE.mcap makes a bag with the tracks as TrackedObjects, Detection3DArray and markers.
 
     A profile may also be a TOML file here. Replaying the same data through a service gives the same files.
+    With --smooth, positions, headings and velocities also use later frames, which no service can.
 
     With --dump, the frames that a service saved are gone through once more instead. Status 1 and one line say which
     of them raises which error; status 0 that none does any more.
@@ -98,6 +103,7 @@ def track(  # noqa: PLR0913  these are the command's options
             parameters=parameters,
             classes=classes or (),
             full=full,
+            smooth=smooth,
             jobs=_jobs(jobs, chosen),
             on_frame=progress.advance,
         ):
