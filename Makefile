@@ -12,7 +12,7 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
-.PHONY: help docs release demo test bounds bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests-together tests-alone check lowest pythons repeat schemas wheel clean tune ablate
+.PHONY: help kernels docs release demo test bounds bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests-together tests-alone check lowest pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    lint, types, schemas, tests, wheel"
@@ -57,9 +57,10 @@ containers: install
 	$(BIN)/python docker/containers.py $(OPTIONAL)
 
 # The demonstration is among the tests (tests/e2e/test_demo.py); CI also runs the command, which installs less.
-# Tests that wait for conditions share the machine with all that waits for nobody; tests that measure come after it.
+# Types take as long as the kernels; then tests that wait for conditions share the machine with what waits for nobody; tests
+# that measure come last.
 test: install
-	$(MAKE) --jobs 5 lint types schemas wheel tests-together
+	$(MAKE) --jobs 5 types kernels lint schemas wheel tests-together
 	$(MAKE) tests-alone
 
 # For figures, nothing else should run on the machine. SERVICE holds options of the service, SECONDS how long a run takes.
@@ -73,11 +74,14 @@ lint: install
 types: install
 	$(BIN)/mypy
 
-# Kernels are compiled once, before processes that would each compile them. With more JOBS than processors it takes about
-# as long, and answers come late. Tests that measure memory and times run after the others, one by one.
-JOBS ?= 2
-tests-together: install
+# Kernels are compiled once, before processes that would each compile them.
+kernels: install
 	$(BIN)/optipmb warm-up
+
+# With more JOBS than processors it takes about as long, and answers come late. Tests that measure memory and times run
+# after the others, one by one.
+JOBS ?= 2
+tests-together: kernels
 	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not alone and not bounds"
 
 tests-alone: install
@@ -114,7 +118,7 @@ schemas: install
 	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md schemas/json
 	$(BIN)/python docs/reference.py --check docs/operation.md
 
-wheel: install
+wheel: kernels
 	sh tests/wheel.sh $(PYTHON) $(BIN)
 
 # The baseline is compared with and not obeyed: machines differ, and no test fails by a time. Processor time is counted,
