@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from optipmb_client import offline
 from optipmb_client.datasets import Dataset, open_dataset
+from optipmb_client.datasets.scene.lidar import Scan, scan
 from optipmb_client.evaluation.ab3dmot import ab3dmot_rules, evaluate_ab3dmot
 from optipmb_client.evaluation.cases import prepare
 from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
@@ -44,6 +46,20 @@ def test_a_class_alone_is_tracked_as_among_others() -> None:
         order, other = (np.lexsort((one.center[:, 0], one.frame)) for one in (alone, together))
         for column in ("frame", "center", "size", "yaw", "score"):
             assert np.array_equal(getattr(alone, column)[order], getattr(together, column)[other])
+
+
+def test_a_generated_scene_is_scanned_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Detections and truth come from the same scan of each frame."""
+    taken = []
+
+    def counted(*arguments: Any) -> Scan:
+        taken.append(1)
+        return scan(*arguments)
+
+    monkeypatch.setattr("optipmb_client.datasets.scene.dataset.scan", counted)
+    (sequence,) = open_dataset("scene", frames=3, clouds=False).sequences(["0000"])
+    load(sequence, PARAMETERS, rules_of("scene"))
+    assert len(taken) == 3
 
 
 def test_frames_in_which_nothing_can_happen_are_left_out_without_effect() -> None:

@@ -58,6 +58,7 @@ def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
         UsageError: it has values that the tracker refuses.
 
     """
+    frames = list(sequence.frames())  # first: a generated scene takes its truth from the scans that its frames needed
     truth = sequence.truth()
     if truth is None:
         raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
@@ -67,7 +68,7 @@ def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
     return Clip(
         name=sequence.name,
         labels=parameters.labels,
-        frames=prepare_frames(sequence.name, list(sequence.frames()), parameters),
+        frames=prepare_frames(sequence.name, frames, parameters),
         rotation=rotation,
         translation=translation,
         camera=getattr(sequence, "camera", None),
