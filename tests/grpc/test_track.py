@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import secrets
 import threading
 import time
@@ -188,3 +189,20 @@ def test_bytes_that_are_no_protobuf(gateway: Any) -> None:
 def test_a_call_without_a_message_ends(stub: Any) -> None:
     """Nothing in, nothing out, no error."""
     assert list(stub.Track(iter([]))) == []
+
+
+def test_acknowledgements_are_few(stub: Any, stream: str) -> None:
+    """One comes when the stream is open, and one within a second of a message that covers all until then."""
+    began = time.monotonic()
+    requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    for seq in range(40):
+        requests.put(detections(frame(seq, stream), pb.PublishRequest))
+    call = stub.Publish(iter(requests.get, None), timeout=DEADLINE_S)
+    numbers = [-1]
+    while numbers[-1] < 39:  # the call stays open: nothing but time brings them
+        newest = next(call).acknowledgement
+        numbers.append(newest.detections if newest.HasField("detections") else -1)
+    assert numbers == sorted(numbers)
+    assert len(numbers) <= 4 + time.monotonic() - began
+    requests.put(None)
+    assert {one.acknowledgement.detections for one in call} <= {39}

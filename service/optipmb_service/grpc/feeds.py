@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import collections
 import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
@@ -75,6 +76,8 @@ class Feeds:
         self._loop = loop
         self._invalid = invalid
         self._feeds: dict[str, _Feed] = {}
+        self._handed: collections.deque[tuple[Listener, Item]] = collections.deque()
+        self._waking = False
 
     @contextlib.asynccontextmanager
     async def joined(self, key: str, listener: Listener) -> AsyncIterator[None]:
@@ -124,9 +127,18 @@ class Feeds:
                 items = {one.selection.key: one.selection for one in wanting}
                 made = {key: tracks_item(tracks, selection) for key, selection in items.items()}
                 handed = [(one, made[one.selection.key]) for one in wanting]
-        if handed:
+        self._handed.extend(handed)
+        if handed and not self._waking:  # what is added after this was seen is still handed over
+            self._waking = True
             with contextlib.suppress(RuntimeError):  # the loop has ended
-                self._loop.call_soon_threadsafe(_hand_over, handed)
+                self._loop.call_soon_threadsafe(self._hand_over)
+
+    def _hand_over(self) -> None:
+        """Hand over all that has come, on the loop, which is woken once for it."""
+        self._waking = False
+        while self._handed:
+            listener, item = self._handed.popleft()
+            listener.take(item)
 
     def _tracks(self, message: Message) -> EncodedTracks | None:
         try:
@@ -153,8 +165,3 @@ def problem_item(problem: schemas.Problem) -> Item:
     """Return a problem as a response."""
     response = pb.SubscribeResponse(problem=convert.to_proto(problem))
     return Item(problem.stream, response.SerializeToString())
-
-
-def _hand_over(handed: list[tuple[Listener, Item]]) -> None:
-    for listener, item in handed:
-        listener.take(item)

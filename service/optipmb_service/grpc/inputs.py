@@ -16,7 +16,7 @@ from optipmb_service.grpc.fresh import Fresh
 from optipmb_service.grpc.outbox import Outbox
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable
+    from collections.abc import AsyncIterator, Callable, Iterable
 
     from optipmb_schemas.protobuf.transcode import EncodedTracks
 
@@ -39,8 +39,8 @@ WINDOW: Final = 64
 RESPONSES: Final = 256
 """Responses that may wait for a caller: more than the window, so that none are left out but for others' frames."""
 
-ACKNOWLEDGE_S: Final = 0.2
-"""Shortest time between two acknowledgements: one covers all frames since the last, to save messages."""
+ACKNOWLEDGE_S: Final = 1.0
+"""Longest time until a message is acknowledged: one acknowledgement covers all messages since the last."""
 
 WANTED_S: Final = 1.0
 """How long the first cloud waits for it to be known whether anybody takes clouds."""
@@ -84,8 +84,8 @@ class Incoming:
         return None if payload is None else self._read(payload)
 
     @contextlib.asynccontextmanager
-    async def opened(self, changed: asyncio.Event | None = None) -> AsyncIterator[Outgoing]:
-        """Keep the publishers open meanwhile; `changed` is set when it changes whether anybody takes clouds.
+    async def opened(self, changed: Callable[[], None] | None = None) -> AsyncIterator[Outgoing]:
+        """Keep the publishers open meanwhile; `changed` is called when it changes whether anybody takes clouds.
 
         Raises:
             TransportError: the network cannot be used.
@@ -95,7 +95,7 @@ class Incoming:
         def matched() -> None:
             self._matched.set()
             if changed is not None:
-                changed.set()
+                changed()
 
         def matching() -> None:
             with contextlib.suppress(RuntimeError):  # the loop has ended
@@ -262,50 +262,66 @@ async def publish(call: Call) -> None:
     message = await incoming.first()
     if message is None:
         return
-    changed = asyncio.Event()
+    progress = _Progress(outbox)
     async with (
         call.gateway.feeds.joined(call.gateway.client.keys.problems(incoming.stream), _Answers(outbox)),
-        incoming.opened(changed) as outgoing,
-        _acknowledging(outbox, outgoing, changed) as progress,
+        incoming.opened(progress.acknowledge) as outgoing,
         call.writing(outbox),
     ):
-        while message is not None:
-            if isinstance(message, schemas.Problem):
-                outbox.put(incoming.stream, problem_item(message).response)
-            elif isinstance(message, schemas.Detections | schemas.Points):
-                await incoming.send(message)
-                setattr(progress, "detections" if isinstance(message, schemas.Detections) else "points", message.seq)
-                changed.set()
-            message = await incoming.next()
-        _acknowledge(outbox, outgoing, progress)
+        progress.begin(outgoing)
+        try:
+            while message is not None:
+                if isinstance(message, schemas.Problem):
+                    outbox.put(incoming.stream, problem_item(message).response)
+                elif isinstance(message, schemas.Detections | schemas.Points):
+                    await incoming.send(message)
+                    progress.sent(message)
+                message = await incoming.next()
+            progress.acknowledge()
+        finally:
+            progress.end()
     call.check_ending()
 
 
-@contextlib.asynccontextmanager
-async def _acknowledging(
-    outbox: Outbox, outgoing: Outgoing, changed: asyncio.Event
-) -> AsyncIterator[pb.Acknowledgement]:
-    """Acknowledge at once, and soon when something has changed; the newest one stands for those before it."""
-    progress = pb.Acknowledgement()
-    _acknowledge(outbox, outgoing, progress)
+class _Progress:
+    """Says how far a publisher's messages have gone out; the newest acknowledgement stands for those before it.
 
-    async def follow() -> None:
-        while True:
-            await changed.wait()
-            changed.clear()
-            _acknowledge(outbox, outgoing, progress)
-            await asyncio.sleep(ACKNOWLEDGE_S)
+    Args:
+        outbox: for the caller.
+    """
 
-    task = asyncio.create_task(follow())
-    try:
-        yield progress
-    finally:
-        task.cancel()
+    def __init__(self, outbox: Outbox) -> None:
+        self._outbox = outbox
+        self._newest = pb.Acknowledgement()
+        self._outgoing: Outgoing | None = None
+        self._due: asyncio.TimerHandle | None = None
 
+    def begin(self, outgoing: Outgoing) -> None:
+        """Acknowledge that the stream is open."""
+        self._outgoing = outgoing
+        self.acknowledge()
 
-def _acknowledge(outbox: Outbox, outgoing: Outgoing, progress: pb.Acknowledgement) -> None:
-    progress.points_wanted = outgoing.points_wanted
-    outbox.replace(pb.PublishResponse(acknowledgement=progress).SerializeToString())
+    def sent(self, message: schemas.Detections | schemas.Points) -> None:
+        """Take in that a message has gone out; it is acknowledged soon."""
+        if isinstance(message, schemas.Detections):
+            self._newest.detections = message.seq
+        else:
+            self._newest.points = message.seq
+        if self._due is None:
+            self._due = asyncio.get_running_loop().call_later(ACKNOWLEDGE_S, self.acknowledge)
+
+    def acknowledge(self) -> None:
+        """Acknowledge all that has gone out, now."""
+        self.end()
+        if self._outgoing is not None:
+            self._newest.points_wanted = self._outgoing.points_wanted
+            self._outbox.replace(pb.PublishResponse(acknowledgement=self._newest).SerializeToString())
+
+    def end(self) -> None:
+        """Acknowledge nothing later."""
+        if self._due is not None:
+            self._due.cancel()
+            self._due = None
 
 
 def _bounded(name: str, value: int, most: int) -> None:
