@@ -12,7 +12,7 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
-.PHONY: help kernels docs release demo test bounds bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests-together tests-alone check lowest pythons repeat schemas wheel clean tune ablate
+.PHONY: help kernels docs release demo test bounds bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests-together tests-alone check lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    lint, types, schemas, tests, wheel"
@@ -20,6 +20,7 @@ help:
 	@echo "make bounds  call the tracker with every kernel compiled with bounds checks, which takes a minute"
 	@echo "make lowest  test the wheel with the oldest packages that it may be installed with"
 	@echo "make pythons test the wheel with every Python newer than 3.11 that this machine has"
+	@echo "make paths   go the first ten minutes of four users, from empty environments with the wheel, and print what they take"
 	@echo "make repeat  run make test N=10 times in fresh clones, with LOAD=0 processes that compute beside it"
 	@echo "make bench   time the tracker, its kernels, the codec and the service, beside the saved baseline"
 	@echo "make figures measure the tracker's figures of docs/performance.md, beside other trackers, and write the page"
@@ -104,6 +105,15 @@ lowest: install
 	mkdir -p out
 	$(BIN)/python tests/lowest.py >out/lowest.txt
 	sh tests/elsewhere.sh $(PYTHON) $(BIN) $(CURDIR)/out/lowest.txt
+
+# What stands in the README, from pip install to tracks; PATHS=csv, python, node or kitti walks one of them alone.
+PATHS ?=
+paths: install
+	mkdir -p out
+	rm -rf out/dist
+	$(BIN)/python -m build --wheel --outdir out/dist . >out/build.log
+	$(BIN)/python -m build --wheel --outdir out/dist node >>out/build.log
+	$(BIN)/python tests/paths.py out/dist $(PATHS)
 
 pythons: install
 	sh tests/pythons.sh $(BIN)

@@ -61,6 +61,20 @@ def rows_fit(
     return good
 
 
+def check_fitting(density: Density, labels: tuple[str, ...]) -> None:
+    """Refuse a density whose columns do not fit together.
+
+    Raises:
+        DensityError: names the column, with what was expected and received.
+    """
+    if fitting(density, len(labels)):
+        return
+    columns = columns_of(density)
+    density_of(density.stamp_ns, density.next_id, columns, labels)  # names the column
+    lengths = ", ".join(f"{name} {len(column)}" for name, column in columns.items())
+    raise DensityError("density", "columns of equal length", lengths)
+
+
 def columns_of(density: Density) -> dict[str, NDArray[Any]]:
     """Return the arrays of a density by name, always in the same order."""
     parts = (("bernoulli", density.bernoulli), ("poisson", density.poisson))
@@ -91,9 +105,13 @@ def density_of(
         if label.size and not (label.min() >= 0 and label.max() < len(labels)):
             raise DensityError(f"{part}.label", f"indices below {len(labels)}", f"{label.min()} to {label.max()}")
         if label.size and not 0 <= rows.born_ns.min() <= rows.born_ns.max() <= stamp_ns:
-            raise DensityError(f"{part}.born_ns", f"stamps up to {stamp_ns}", "others")
-    if len(bernoulli) and not (bernoulli.born_ns <= bernoulli.seen_ns).all() & (bernoulli.seen_ns <= stamp_ns).all():
-        raise DensityError("bernoulli.seen_ns", f"stamps from born_ns to {stamp_ns}", "others")
+            stamps = f"{rows.born_ns.min()} to {rows.born_ns.max()}"
+            raise DensityError(f"{part}.born_ns", f"stamps from 0 to {stamp_ns}", stamps)
+    wrong = (bernoulli.seen_ns < bernoulli.born_ns) | (bernoulli.seen_ns > stamp_ns)
+    if wrong.any():
+        row = int(wrong.argmax())
+        stamps = f"from born_ns, {bernoulli.born_ns[row]}, to {stamp_ns}"
+        raise DensityError(f"bernoulli.seen_ns[{row}]", f"a stamp {stamps}", str(bernoulli.seen_ns[row]))
     for path, column, high in (
         ("bernoulli.existence", bernoulli.existence, 1.0),
         ("bernoulli.score", bernoulli.score, 1.0),
@@ -103,7 +121,8 @@ def density_of(
             raise DensityError(path, f"numbers from 0 to {high:g}", f"{column.min():g} to {column.max():g}")
     ids = bernoulli.id
     if ids.size and not (np.diff(ids) > 0).all():
-        raise DensityError("bernoulli.id", "ascending ids", "others")
+        row = int((np.diff(ids) <= 0).argmax()) + 1
+        raise DensityError(f"bernoulli.id[{row}]", f"an id above the one before it, {ids[row - 1]}", str(ids[row]))
     if not 0 <= int(ids.max(initial=0)) < next_id < 2**63:
         raise DensityError("next_id", f"an id above {ids.max(initial=0)}", str(next_id))
     return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels))
@@ -125,7 +144,8 @@ def _rows(part: str, kind: type[_Rows], columns: Mapping[str, Any], *, earlier: 
         if column.ndim != like.ndim or len(column) != count:
             raise DensityError(path, f"{count} rows", _shown(column))
         if column.dtype.kind == "f" and not np.isfinite(column).all():
-            raise DensityError(path, "finite numbers", "others")
+            row = np.argwhere(~np.isfinite(column))[0]
+            raise DensityError(f"{path}[{row[0]}]", "finite numbers", str(column[tuple(row)]))
         found[name] = np.array(column, order="C")  # as kernels are compiled for: in one piece, and not read-only
     return kind(**found)
 

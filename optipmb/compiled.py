@@ -8,10 +8,12 @@ service may run many streams side by side without threads inside a frame. Divisi
 from __future__ import annotations
 
 import hashlib
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numba
+from numba.core import event
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,6 +32,29 @@ def _digest() -> str:
 
 
 _SOURCES: Final = _digest()
+
+
+class _FirstCompilation(event.Listener):
+    """Logs one line when this process first compiles a kernel of the package: a first frame may take a minute.
+
+    It is a warning, because Python prints those to standard error where a program has not configured logging.
+    """
+
+    said = False
+
+    def on_start(self, event: Any) -> None:
+        """Numba begins to compile a function that is not in its cache."""
+        if not self.said and event.data["dispatcher"].py_func.__module__.startswith(f"{__package__}."):
+            self.said = True
+            logging.getLogger(__package__).warning(
+                "optipmb: compiling the tracker, once after an installation; it takes up to a minute"
+            )
+
+    def on_end(self, event: Any) -> None:
+        """It has compiled the function."""
+
+
+event.register("numba:compile", _FirstCompilation())  # type: ignore[no-untyped-call]  # numba has no types
 
 
 def kernel(function: F) -> F:

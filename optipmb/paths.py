@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from optipmb.columns import fitting
+from optipmb.columns import check_fitting
 from optipmb.compiled import kernel
 from optipmb.density import PHI, STATE, Density, copy_state
 from optipmb.errors import DensityError, FrameError
 from optipmb.heading import doubt
 from optipmb.motion import predict_state
 from optipmb.records import record
-from optipmb.soundness import sound
+from optipmb.soundness import sound, unsound
 from optipmb.table import ClassTable
 
 if TYPE_CHECKING:
@@ -99,12 +99,14 @@ def predict_tracks(
     times = _horizons(horizons)
     table = ClassTable.of(parameters)
     if isinstance(tracks, Density):
-        if tracks.labels != parameters.labels or not fitting(tracks, len(parameters.labels)):
-            raise DensityError("density", f"columns of equal length, of the classes {parameters.labels}", "others")
+        if tracks.labels != parameters.labels:
+            classes = f"the classes of profile {parameters.name}, {parameters.labels}"
+            raise DensityError("density.labels", classes, str(tracks.labels)[:200])
+        check_fitting(tracks, parameters.labels)
         objects = tracks.bernoulli
         return _predict(objects.id, objects.label, objects.mean, objects.covariance, times, table)
     if not sound(tracks):
-        raise FrameError("tracks", "sound tracks", "others")
+        raise FrameError(*unsound(tracks))
     label = tracks.label
     if label.size and not 0 <= label.min() <= label.max() < len(parameters.labels):
         classes = f"indices below {len(parameters.labels)}"

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from optipmb.compiled import kernel
 from optipmb.density import STATE
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from optipmb.extract import Tracks
@@ -51,6 +52,20 @@ _SHAPES: Final[tuple[tuple[str, tuple[int, ...]], ...]] = (
     ("detection", ()),
     ("confirmed", ()),
 )
+_BOUNDS: Final[tuple[tuple[str, float, float], ...]] = (
+    ("center", -MAX_PLACE, MAX_PLACE),
+    ("size", 5e-324, MAX_VALUE),
+    ("yaw", -MAX_VALUE, MAX_VALUE),
+    ("heading_confidence", 0.0, 1.0),
+    ("velocity", -MAX_VALUE, MAX_VALUE),
+    ("yaw_rate", -MAX_VALUE, MAX_VALUE),
+    ("acceleration", -MAX_VALUE, MAX_VALUE),
+    ("existence", 0.0, 1.0),
+    ("score", 0.0, 1.0),
+    ("covariance", -MAX_COVARIANCE, MAX_COVARIANCE),
+    ("age", 0.0, MAX_AGE),
+    ("time_since_detection", 0.0, MAX_AGE),
+)
 
 
 def sound(tracks: Tracks) -> bool:
@@ -79,6 +94,21 @@ def sound(tracks: Tracks) -> bool:
             tracks.time_since_detection,
         )
     )
+
+
+def unsound(tracks: Tracks) -> tuple[str, str, str]:
+    """Return what is wrong with tracks that are not `sound`: path of the first value, expected, received."""
+    count = tracks.id.shape[0]
+    for name, shape in _SHAPES:
+        if getattr(tracks, name).shape != (count, *shape):
+            return f"tracks.{name}", f"shape {(count, *shape)}", f"shape {getattr(tracks, name).shape}"
+    for name, low, high in _BOUNDS:
+        values = getattr(tracks, name)
+        for place in np.argwhere(~((low <= values) & (values <= high)))[:1]:
+            least = f"from {low:g}" if low <= 0.0 else "above 0"
+            return f"tracks.{name}[{place[0]}]", f"a number {least} to {high:g}", f"{values[tuple(place)]:g}"
+    row = int((np.diff(tracks.id, prepend=-1) <= 0).argmax())
+    return f"tracks.id[{row}]", "ids that ascend, from 0", str(tracks.id[row])
 
 
 @kernel

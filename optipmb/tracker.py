@@ -10,11 +10,11 @@ import numpy as np
 
 from optipmb.association import associate
 from optipmb.birth import first_detected_states
-from optipmb.columns import columns_of, density_of, fitting
+from optipmb.columns import check_fitting
 from optipmb.density import NO_FRAME, STATE, Density, Poissons
 from optipmb.detection_probability import detection_probability, over_time
 from optipmb.effort import UNLIMITED, check_effort
-from optipmb.errors import DensityError, FrameError
+from optipmb.errors import FrameError
 from optipmb.extract import extract
 from optipmb.hypotheses import enumerate_hypotheses
 from optipmb.lightweight import light_weight_filter
@@ -240,9 +240,7 @@ class Tracker:
         for path, given in (("labels", frame.labels), ("density.labels", density.labels)):
             if given != labels:
                 raise FrameError(path, f"the classes of profile {self.parameters.name}, {labels}", str(given)[:200])
-        if not fitting(density, len(labels)):
-            density_of(density.stamp_ns, density.next_id, columns_of(density), labels)  # names the column
-            raise DensityError("density", "columns of equal length", "others")
+        check_fitting(density, labels)
 
     def _detection_probabilities(
         self, bernoulli: Bernoullis, poisson: Poissons, cloud: PointCloud | None, dt: float

@@ -195,7 +195,7 @@ class Settings(BaseSettings):
         " files in /dev/shm after a kill",
     )
     profile: str = Field(
-        default="nuscenes", min_length=1, description="profile of streams that no pattern names, a name or a TOML file"
+        default="generic", min_length=1, description="profile of streams that no pattern names, a name or a TOML file"
     )
     profiles: dict[str, str] = Field(
         default_factory=dict,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -138,13 +139,27 @@ def test_other_horizons_are_refused_by_name(horizons: Any, path: str) -> None:
 
 
 def test_tracks_of_another_profile_are_refused() -> None:
-    """Classes that the profile lacks, tracks that are not sound, a density of other classes or with other columns."""
+    """Classes that the profile lacks, tracks that are not sound, a density of other classes or with other columns.
+
+    The error names the value and says what was expected and what was received.
+    """
     _, result = followed()
     tracks, density = result.tracks, result.density
-    for wrong in (replace(tracks, label=tracks.label + 1), replace(tracks, yaw=tracks.yaw * np.nan)):
-        with pytest.raises(optipmb.FrameError, match="tracks"):
+    for wrong, text in (
+        (replace(tracks, label=tracks.label + 1), "tracks.label: expected indices below"),
+        (
+            replace(tracks, yaw=tracks.yaw * np.nan),
+            "tracks.yaw[0]: expected a number from -100000 to 100000, received nan",
+        ),
+        (replace(tracks, age=tracks.age[:1]), "tracks.age: expected shape (3,), received shape (1,)"),
+        (replace(tracks, id=tracks.id[::-1]), "tracks.id[1]: expected ids that ascend, from 0, received"),
+    ):
+        with pytest.raises(optipmb.FrameError, match=re.escape(text)):
             optipmb.predict_tracks(wrong, [1.0], KITTI)
     short = replace(density.bernoulli, mean=density.bernoulli.mean[:1])
-    for other in (replace(density, labels=("car",)), replace(density, bernoulli=short)):
-        with pytest.raises(optipmb.DensityError, match="density"):
+    for other, text in (
+        (replace(density, labels=("car",)), "density.labels: expected the classes of profile kitti, ('Car',"),
+        (replace(density, bernoulli=short), "bernoulli.covariance: expected 1 rows, received (3, 6, 6) float64"),
+    ):
+        with pytest.raises(optipmb.DensityError, match=re.escape(text)):
             optipmb.predict_tracks(other, [1.0], KITTI)

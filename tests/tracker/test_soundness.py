@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import optipmb
-from optipmb.soundness import MAX_AGE, MAX_COVARIANCE, MAX_PLACE, MAX_VALUE
+from optipmb.soundness import MAX_AGE, MAX_COVARIANCE, MAX_PLACE, MAX_VALUE, unsound
 
 ANYTHING = st.sampled_from([np.nan, np.inf, -np.inf, -1.0, -1e-300])
 SHAPES = {
@@ -51,3 +51,5 @@ def test_bounds_are_kept_in_every_column(data: st.DataObject, count: int, odd: s
     assert optipmb.sound(tracks) == plain(tracks)
     if not odd:
         assert optipmb.sound(tracks)
+    if not optipmb.sound(tracks):
+        assert unsound(tracks)[0].startswith(f"tracks.{odd}[")

@@ -7,12 +7,15 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
+import numba
 import pytest
+from numba.core import event
 
 import optipmb
+from optipmb import compiled
 from optipmb.warm import kernels
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
@@ -98,3 +101,15 @@ def test_kernels_are_counted_while_another_thread_imports(monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, Importing("looked_at"), ModuleType("looked_at"))
     assert kernels()
     assert "imported_meanwhile" in sys.modules
+
+
+def test_a_compilation_is_announced_once(caplog: pytest.LogCaptureFixture) -> None:
+    """The logger `optipmb` says once that a kernel of the package is compiled, and nothing of other functions."""
+    announcement = compiled._FirstCompilation()
+    for module in ("elsewhere", "optipmb.update", "optipmb.prune"):
+        function = FunctionType((lambda: None).__code__, {"__name__": module})
+        dispatcher = numba.njit(function)
+        announcement.on_start(event.Event("numba:compile", event.EventStatus.START, {"dispatcher": dispatcher}))
+    assert [record.message for record in caplog.records if record.name == "optipmb"] == [
+        "optipmb: compiling the tracker, once after an installation; it takes up to a minute"
+    ]

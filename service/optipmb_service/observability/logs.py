@@ -142,6 +142,15 @@ def configure(form: Literal["console", "json"], level: str, worker: int | None =
         wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
         logger_factory=structlog.WriteLoggerFactory(file=sys.stderr),
     )
+    logging.getLogger("optipmb").handlers = [_Library()]
+
+
+class _Library(logging.Handler):
+    """Passes on what the tracker logs, which knows nothing of this form."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log a record of the tracker."""
+        structlog.get_logger("optipmb_service").log(record.levelno, record.getMessage())
 
 
 def unknown_environment(names: tuple[str, ...]) -> None:

@@ -1,0 +1,230 @@
+"""The first ten minutes of four people: from an empty environment and the wheels to tracks, with what each of it took.
+
+What they type is taken from README.md and docs/messages.md. Nothing of the source tree can be imported.
+Called as: python tests/paths.py DIST [PATH...]
+    DIST  folder with the two wheels
+    PATH  those to walk: csv python node kitti; default: all
+"""
+
+import csv
+import os
+import re
+import shutil
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+MESSAGES = (ROOT / "docs" / "messages.md").read_text()
+CARS = ((0.0, 0.0, 8.0), (40.0, 4.0, -6.0))  # x, y, speed along x
+LIMIT_S = 1800
+KEPT = "(?i)(https?|no)_proxy$|ssl_|lang$"
+PYTHONS_OWN = "pip|setuptools|pkg_resources|_distutils|distutils"
+# Of downloads, so that a second run need not repeat them.
+CACHE = subprocess.run(
+    [sys.executable, "-m", "pip", "cache", "dir"], capture_output=True, text=True, check=True
+).stdout.strip()
+
+
+class Environment:
+    """A virtual environment with nothing but what is installed here; its user has no home and no caches of kernels."""
+
+    def __init__(self, base: Path, name: str, *requirements: str) -> None:
+        self.name = name
+        self.folder = base / name
+        self.work = base / f"{name}-work"
+        self.work.mkdir()
+        kept = {name: value for name, value in os.environ.items() if re.match(KEPT, name)}
+        self.variables = {
+            "PATH": "/usr/bin:/bin",
+            "HOME": str(self.work),
+            "PIP_CACHE_DIR": CACHE,
+            "COLUMNS": "80",
+            **kept,
+        }
+        subprocess.run([sys.executable, "-m", "venv", self.folder], check=True)
+        if requirements:
+            began = time.monotonic()
+            self.run("python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *requirements)
+            self.installed_s = time.monotonic() - began
+            said(f"{name}: pip install took {self.installed_s:.0f} s, {self.megabytes:.0f} MB beside Python and pip")
+
+    @property
+    def megabytes(self) -> float:
+        """What the packages take on the disk, as its blocks are counted."""
+        (site,) = self.folder.glob("lib/python3.*/site-packages")
+        ours = (one for one in site.iterdir() if not re.match(PYTHONS_OWN, one.name))
+        files = (file for one in ours for file in (one.rglob("*") if one.is_dir() else (one,)))
+        return sum(file.stat().st_blocks for file in files) * 512 / 2**20
+
+    def run(self, program: str, *arguments: object) -> str:
+        """Run a program of the environment and return what it printed; it must end well."""
+        command = [str(self.folder / "bin" / program), *map(str, arguments)]
+        done = subprocess.run(
+            command, cwd=self.work, env=self.variables, capture_output=True, text=True, timeout=LIMIT_S, check=False
+        )
+        if done.returncode:
+            sys.exit(f"{' '.join(command)}: status {done.returncode}\n{done.stdout}{done.stderr}")
+        return done.stdout
+
+    def start(self, program: str, *arguments: object) -> "subprocess.Popen[str]":
+        """Start a program of the environment; what it says on standard error goes into a file."""
+        command = [str(self.folder / "bin" / program), *map(str, arguments)]
+        with (self.work / f"{program}.log").open("w") as log:
+            return subprocess.Popen(
+                command, cwd=self.work, env=self.variables, stdout=subprocess.PIPE, stderr=log, text=True
+            )
+
+    def import_ms(self, module: str) -> float:
+        """Time the import of a module, without the start of the interpreter: median of five, after a first one."""
+        self.run("python", "-c", f"import {module}")
+        code = f"import time; b = time.perf_counter(); import {module}; print(time.perf_counter() - b)"
+        return 1e3 * statistics.median(float(self.run("python", "-c", code)) for _ in range(5))
+
+
+def said(text: str) -> None:
+    """Print a line, at once."""
+    print(text, flush=True)
+
+
+def timed(what: str, call: Callable[[], str]) -> str:
+    """Return what a call returns, and print how long it took."""
+    began = time.monotonic()
+    result = call()
+    said(f"  {what}: {time.monotonic() - began:.1f} s")
+    return result
+
+
+def blocks(text: str, language: str, mark: str) -> str:
+    """Return the one code block of a page that contains a text."""
+    (found,) = (one for one in re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE) if mark in one)
+    return found
+
+
+def checked(claim: object, text: str) -> None:
+    """End with a text unless a claim holds."""
+    if not claim:
+        sys.exit(text)
+
+
+def write_cars(path: Path) -> None:
+    """Write the detections of two cars at 10 Hz, as a user's own program would."""
+    with path.open("w", newline="") as file:
+        out = csv.writer(file)
+        out.writerow(["time", "x", "y", "z", "length", "width", "height", "heading", "confidence", "category"])
+        for k in range(50):
+            for x, y, speed in CARS:
+                heading = 0.0 if speed > 0 else 3.14
+                out.writerow([k / 10, x + speed * k / 10, y, 0.8, 4.5, 1.9, 1.6, heading, 0.9, "car"])
+
+
+def csv_in_and_out(base: Path, wheel: Path, _node: Path) -> None:
+    """A table to a table: with pip, and with pipx and uv, which give a command an environment of its own."""
+    place = Environment(base, "table", f"{wheel}[table]")
+    write_cars(place.work / "detections.csv")
+    command = blocks(README, "sh", "track detections.csv").splitlines()[-1].split()
+    for what in ("the first tracks, with compilation", "again"):
+        timed(what, lambda: place.run(*command))
+    with (place.work / "tracks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    checked(len({row["id"] for row in rows}) == len(CARS), f"expected {len(CARS)} tracks, received {rows[-3:]}")
+    checked(all(abs(float(row["vx"])) > 5 for row in rows[-2:]), f"expected moving cars, received {rows[-2:]}")
+
+    tools = Environment(base, "tools", "pipx", "uv")
+    for name, *install in (("pipx", "pipx", "install"), ("uv", "uv", "tool", "install", "--python", sys.executable)):
+        home = tools.work / name
+        tools.variables |= {"PIPX_HOME": f"{home}", "PIPX_BIN_DIR": f"{home}/bin"}
+        tools.variables |= {"UV_TOOL_DIR": f"{home}/tools", "UV_TOOL_BIN_DIR": f"{home}/bin"}
+        timed(" ".join(install[:3]), lambda install=(*install, f"{wheel}[table]"): tools.run(*install))
+        shown = tools.run(f"../../tools-work/{name}/bin/optipmb", "profiles")
+        checked("nuscenes" in shown, f"{name}: expected the profiles, received {shown}")
+
+
+def python(base: Path, wheel: Path, _node: Path) -> None:
+    """The library alone, with the lines of the README."""
+    place = Environment(base, "library", wheel)
+    said(f"  import optipmb: {place.import_ms('optipmb'):.0f} ms")
+    (place.work / "mine.py").write_text(blocks(README, "python", "OnlineTracker"))
+    for what in ("the first tracks, with compilation", "again"):
+        printed = timed(what, lambda: place.run("python", "mine.py"))
+    checked("'car'" in printed.splitlines()[-1], f"expected a car, received {printed}")
+
+
+def node(base: Path, wheel: Path, node_wheel: Path) -> None:
+    """A service, and a publisher and a subscriber in an environment without the tracker; a publisher without numpy."""
+    place = Environment(base, "service", f"{wheel}[service]")
+    nodes = Environment(base, "node", node_wheel)
+    said(f"  import optipmb_client: {nodes.import_ms('optipmb_client'):.0f} ms")
+    plain = Environment(base, "zenoh", "eclipse-zenoh")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    programs = {
+        "publisher.py": (nodes, blocks(README, "python", "Publisher(")),
+        "subscriber.py": (nodes, blocks(README, "python", "Subscriber(")),
+        "plain.py": (plain, blocks(MESSAGES, "python", "import zenoh")),
+    }
+    for name, (where, text) in programs.items():
+        (where.work / name).write_text(text.replace("7447", port))
+    service = place.start("optipmb-service", "--listen", f"tcp/127.0.0.1:{port}")
+    try:
+        timed("the service is ready, with compilation", lambda: service.stdout.readline() if service.stdout else "")
+        for program in ("publisher.py", "plain.py"):
+            listening = nodes.start("python", "subscriber.py")
+            began = time.monotonic()
+            programs[program][0].run("python", program)
+            printed, _ = listening.communicate(timeout=LIMIT_S)
+            stream = "garage/robot-1/lidar" if program == "publisher.py" else "garage/robot-2/lidar"
+            rows = [line for line in printed.splitlines() if line.startswith(stream)]
+            checked(len(rows) > 10, f"expected tracks of {stream}, received {printed}")
+            said(f"  {program}: {len(rows)} lines with tracks came in {time.monotonic() - began:.1f} s")
+    finally:
+        service.terminate()
+        service.wait(60)
+
+
+def kitti(base: Path, wheel: Path, _node: Path) -> None:
+    """The three commands of the README on KITTI."""
+    given = os.environ.get("KITTI_ROOT")
+    places = [Path(given)] if given else sorted(ROOT.parent.glob("*/data/kitti"))
+    data = next((one for one in places if (one / "detections").is_dir()), None)
+    if data is None:
+        said("kitti: skipped, no data: neither KITTI_ROOT nor data/kitti in a folder beside this repository")
+        return
+    place = Environment(base, "kitti", f"{wheel}[plot]")
+    for line in blocks(README, "sh", "--dataset kitti").splitlines():
+        words = line.replace("ROOT", str(data)).split()
+        printed = timed(" ".join(words[:2]), lambda words=words: place.run(*words))
+        if words[1] == "evaluate":
+            checked("sAMOTA" in printed, f"expected the figures of KITTI, received {printed}")
+            said(printed)
+    checked((place.work / "0000.png").stat().st_size > 10_000, "expected a picture")
+
+
+PATHS = {"csv": csv_in_and_out, "python": python, "node": node, "kitti": kitti}
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Walk the paths."""
+    folder, *names = arguments
+    (wheel,) = Path(folder).resolve().glob("optipmb-*.whl")
+    (node_wheel,) = Path(folder).resolve().glob("optipmb_node-*.whl")
+    base = Path(tempfile.mkdtemp(prefix="optipmb-paths-"))
+    try:
+        for name in names or PATHS:
+            began = time.monotonic()
+            PATHS[name](base, wheel, node_wheel)
+            minutes = (time.monotonic() - began) / 60
+            said(f"{name}: {minutes:.1f} minutes in all")
+    finally:
+        shutil.rmtree(base, ignore_errors=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
