@@ -153,7 +153,7 @@ def python(base: Path, wheel: Path, _node: Path) -> None:
     (place.work / "mine.py").write_text(blocks(README, "python", "OnlineTracker"))
     for what in ("the first tracks, with compilation", "again"):
         printed = timed(what, lambda: place.run("python", "mine.py"))
-    checked("'car'" in printed.splitlines()[-1], f"expected a car, received {printed}")
+    checked("'Car'" in printed.splitlines()[-1], f"expected a car, received {printed}")
 
 
 def node(base: Path, wheel: Path, node_wheel: Path) -> None:

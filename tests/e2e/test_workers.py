@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 KEYS = Keys()
-NUSCENES = optipmb.load_profile("nuscenes")
+DEFAULT = optipmb.load_profile("generic")
 STREAMS = [f"yard/node-{number}/lidar" for number in range(6)]
 VICTIMS = {worker_of(f"kill/{name}/lidar", 2): f"kill/{name}/lidar" for name in "abcd"}
 FRAMES = 12
@@ -82,7 +82,7 @@ def pid_of(service: ServiceProcess, worker: int) -> int:
 
 def alone(sensor: Sensor, frames: int) -> list[bytes]:
     """What a session alone makes of the frames."""
-    session = Session(sensor.stream, NUSCENES)
+    session = Session(sensor.stream, DEFAULT)
     outputs = [output for seq in range(frames) for output in session.on_detections(sensor.detections(seq), 0)]
     return [plain(output.tracks) for output in outputs if isinstance(output, Tracked)]
 

@@ -37,7 +37,8 @@ def start(_compiled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
 
         def begin(*, tracker: Any = None, share: Assignment | None = None, **options: Any) -> tuple[Service, str]:
             endpoint = free_endpoint()
-            given = {"listen": [endpoint], "instance": "test", "grace_s": 0.2, "store": "none"} | options
+            given = {"listen": [endpoint], "instance": "test", "grace_s": 0.2, "store": "none", "profile": "nuscenes"}
+            given |= options
             settings = load(None, given).settings
             service = Service(settings, Profiles.read(settings.profile, settings.profiles), arm, tracker, share)
             stack.callback(service.stop)

@@ -32,7 +32,6 @@ PASSED_ON: Final = {"allow_extra_args": True, "ignore_unknown_options": True}
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
-    help="Track objects in detections that come in over Zenoh. Without a command: run.",
 )
 
 
@@ -108,6 +107,29 @@ def run_command(**given: Unpack[Options]) -> None:
     leave(_run_one(settings) if settings.workers == 1 else _run_many(settings))
 
 
+def _version(value: bool) -> None:  # noqa: FBT001 - the parser calls it so
+    if value:
+        typer.echo(f"optipmb-service {__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+@_taking(Options)
+def without_command(
+    *,
+    context: typer.Context,
+    _show: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+    **given: Unpack[Options],
+) -> None:
+    """Track objects in detections that come in over Zenoh. Without a command: run, with these options."""
+    if context.invoked_subcommand is None:
+        run_command(**given)
+    elif any(value is not None for value in given.values()):
+        _wrong(f"options of a command stand behind it: optipmb-service {context.invoked_subcommand} [OPTIONS]")
+
+
 @app.command("config")
 @_taking(Options)
 def config_command(
@@ -115,7 +137,7 @@ def config_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with where each value came from.")] = False,
     **given: Unpack[Options],
 ) -> None:
-    """Print the settings in force as TOML, each with where it came from, and do nothing else."""
+    """Print the settings in force as TOML. Each comes with its origin; nothing is started."""
     loaded = _load(given)
     values = loaded.settings.model_dump(mode="json")
     values |= {"router": loaded.settings.is_router, "listen": list(loaded.settings.endpoints)}
@@ -136,14 +158,14 @@ def config_command(
 @app.command("router")
 @_taking(RouterOptions)
 def router_command(**given: Unpack[RouterOptions]) -> None:
-    """Run a Zenoh router alone, without tracking, until SIGINT or SIGTERM."""
+    """Run a Zenoh router alone, without tracking. SIGINT and SIGTERM end it."""
     leave(asyncio.run(router.run(_begin(_load({**given, "router": True})))))
 
 
 @app.command("grpc")
 @_taking(GatewayOptions)
 def grpc_command(**given: Unpack[GatewayOptions]) -> None:
-    """Run a gRPC gateway alone, a client of routers, until SIGINT or SIGTERM. Prints one line, `ready …`."""
+    """Run a gRPC gateway alone, a client of routers. Prints one line, `ready …`; SIGINT and SIGTERM end it."""
     settings = _begin(_load(given, grpc=DEFAULT_GRPC, connect=[DEFAULT_LISTEN]))
     run = _needed("optipmb_service.app.gateway", "grpc").run
     leave(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
@@ -152,7 +174,7 @@ def grpc_command(**given: Unpack[GatewayOptions]) -> None:
 @app.command("ros2")
 @_taking(RouterOptions)
 def ros2_command(**given: Unpack[RouterOptions]) -> None:
-    """Run a bridge to ROS 2 (rmw_zenoh) alone, a client of routers, until SIGINT or SIGTERM. See docs/ros2.md."""
+    """Run a bridge to ROS 2 (rmw_zenoh) alone, a client of routers. SIGINT and SIGTERM end it. See docs/ros2.md."""
     settings = _begin(_load(given, connect=[DEFAULT_LISTEN]))
     if not settings.ros2.streams:
         _wrong("setting ros2.streams: expected a table of streams and their topics in --settings, received none")
@@ -162,18 +184,13 @@ def ros2_command(**given: Unpack[RouterOptions]) -> None:
 
 @app.command("health", add_help_option=False, context_settings=PASSED_ON)
 def health(context: typer.Context) -> None:
-    """Ask a running service how it is; status 0 when well, else 1. See `health --help`."""
+    """Ask a running service for its health: status 0 or 1. See `health --help`."""
     raise typer.Exit(health_command.main(context.args))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if given == ["--version"]:
-        typer.echo(f"optipmb-service {__version__}")
-        return
-    if given[:1] != ["--help"] and (not given or given[0].startswith("-")):
-        given = ["run", *given]
     try:
         status = get_command(app).main(given, prog_name="optipmb-service", standalone_mode=False)
     except Exception as error:
