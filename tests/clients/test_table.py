@@ -234,6 +234,17 @@ def test_processes_give_the_bytes_of_one(tmp_path: Path, capsys: pytest.CaptureF
         assert (tmp_path / "1" / path).read_bytes() == (tmp_path / "2" / path).read_bytes(), path
 
 
+def test_processes_evaluate_as_one_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`evaluate --jobs 2` prints what one process prints, for the classes of a scene and the tracks of two trackers."""
+    data = ("--dataset", "scene", "--option", "frames=10", "--option", "clouds=0")
+    for profile in ("scene", "kitti"):
+        assert run_here(capsys, "track", *data, "--profile", profile, "--out", tmp_path / profile).returncode == 0
+    tracks = ("--tracks", tmp_path / "scene", "--tracks", tmp_path / "kitti")
+    one, two = (run_here(capsys, "evaluate", *data, *tracks, "--json", "--jobs", jobs) for jobs in "12")
+    assert result_of(one)["trackers"]
+    assert one.stdout == two.stdout
+
+
 def test_other_datasets_are_written_as_tables_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A generated scene tracked into one table evaluates as its result files do, to their rounding."""
     data = ("--dataset", "scene", "--option", "frames=30", "--option", "clouds=0")

@@ -17,6 +17,7 @@ from optipmb_client.commands.options import (
     Source,
     Truth,
     asked_for,
+    jobs_for,
     open_sequences,
     print_json,
     print_table,
@@ -60,6 +61,10 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     ] = None,
     cutoff: Annotated[float, typer.Option(min=0.01, help="Cut-off distance of GOSPA and OSPA, in metres.")] = 2.0,
     order: Annotated[float, typer.Option(min=1.0, help="Order of GOSPA and OSPA.")] = 2.0,
+    jobs: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes that evaluate; default: one for each processor.", show_default=False),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare result files with the truth, per class.
@@ -77,7 +82,7 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     asked = asked_for(data, dataset, root, detections, option, truth)
     _, chosen = open_sequences(asked, sequences)
     names = tuple(classes or labels_of(chosen))
-    how = _How(iou, distance, cutoff, order)
+    how = _How(iou, distance, cutoff, order, jobs_for(jobs, chosen))
     reports = {str(one): _judge(asked, chosen, one, names, how) for one in tracks}
     report = {"command": "evaluate", "dataset": asked.name, "sequences": [sequence.name for sequence in chosen]}
     (first, *others) = reports.values()
@@ -99,6 +104,7 @@ class _How:
     distance: float | None
     cutoff: float
     order: float
+    jobs: int
 
 
 @dataclass(frozen=True)
@@ -124,6 +130,7 @@ def _judge(
         evaluate_figures,
         load_recordings,
     )
+    from optipmb_client.evaluation.jobs import FiguresJob, run_jobs  # noqa: PLC0415  as above
     from optipmb_client.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
 
     head: list[RenderableType] = []
@@ -143,7 +150,12 @@ def _judge(
         best = {} if asked.name == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
         if asked.name != "kitti" or how.distance is not None:  # AB3DMOT's protocol gives them at its own threshold
             head = [clear_table(results, metres=how.iou is None)]
-    figures = evaluate_figures(asked.name, load_recordings(asked.name, chosen, tracks), names, settings, best)
+    if how.jobs > 1 and len(names) > 1:
+        recordings = tuple(sequence.name for sequence in chosen)
+        work = [FiguresJob(asked, recordings, tracks, name, settings, best.get(name)) for name in names]
+        figures = [one for found in run_jobs(work, how.jobs) for one in found]
+    else:
+        figures = evaluate_figures(asked.name, load_recordings(asked.name, chosen, tracks), names, settings, best)
     if not figures:
         raise UsageError(f"{tracks}: neither the truth nor the tracks have objects of these classes")
     by_class = {one.name: {**parts.get(one.name, {}), **one.summary()} for one in figures}

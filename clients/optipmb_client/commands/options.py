@@ -5,9 +5,9 @@ import dataclasses
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from rich.console import Console, Group, RenderableType
@@ -41,6 +41,7 @@ __all__ = [
     "Wait",
     "Window",
     "asked_for",
+    "jobs_for",
     "mcap_needed",
     "open_sequences",
     "print_json",
@@ -48,6 +49,9 @@ __all__ = [
     "say",
     "warn",
 ]
+
+WORTH_PROCESSES: Final = 3000
+"""Frames from which further processes are faster than this one alone."""
 
 WIDE = 200
 MANY = ("--sequences", "--classes", "--class", "--streams")  # options that take several values after one flag
@@ -162,6 +166,13 @@ def open_sequences(asked: DatasetArguments, sequences: list[str] | None) -> tupl
     for note in (note for one in (opened, *chosen) for note in getattr(one, "notes", ())):
         warn(note)
     return opened, chosen
+
+
+def jobs_for(asked: int | None, sequences: Sequence[DataSequence]) -> int:
+    """Return how many processes share the work: by default one for each processor, and for little data just one."""
+    if asked is not None:
+        return asked
+    return len(os.sched_getaffinity(0)) if sum(map(len, sequences)) > WORTH_PROCESSES else 1
 
 
 def warn(text: str) -> None:

@@ -1,9 +1,8 @@
 """`optipmb track`: a dataset through the tracker, in this process; or what a service saved when tracking failed."""
 
-import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -20,6 +19,7 @@ from optipmb_client.commands.options import (
     Sequences,
     Source,
     asked_for,
+    jobs_for,
     open_sequences,
     print_json,
     say,
@@ -33,9 +33,6 @@ if TYPE_CHECKING:
 
     from optipmb_client.datasets import DataSequence
     from optipmb_client.offline import TrackedSequence
-
-WORTH_PROCESSES: Final = 3000
-"""Frames from which further processes are faster than this one alone."""
 
 
 def track(  # noqa: PLR0913  these are the command's options
@@ -104,7 +101,7 @@ def track(  # noqa: PLR0913  these are the command's options
             classes=classes or (),
             full=full,
             smooth=smooth,
-            jobs=_jobs(jobs, chosen),
+            jobs=min(jobs_for(jobs, chosen), len(chosen)),
             on_frame=progress.advance,
         ):
             results.append(result)
@@ -129,13 +126,6 @@ def _complain(results: "list[TrackedSequence]", profile: str) -> None:
     if detections and not any(one.tracks for one in results):
         warn(f"no tracks came of {detections} detections: do their scores and rate fit profile {profile}?")
         raise typer.Exit(1)
-
-
-def _jobs(asked: int | None, sequences: "Many[DataSequence]") -> int:
-    """Return how many processes track: by default one for each processor, and for little data just this one."""
-    if asked is None:
-        asked = len(os.sched_getaffinity(0)) if sum(map(len, sequences)) > WORTH_PROCESSES else 1
-    return min(asked, len(sequences))
 
 
 def _check_out(out: Path, dataset: str, chosen: "Many[DataSequence]") -> None:
