@@ -123,7 +123,7 @@ def test_a_port_in_use_is_one_clear_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("profile", "says"), [("unheard-of", "profile: expected one of kitti, "), ("/no/such/file.toml",) * 2]
+    ("profile", "says"), [("unheard-of", "profile: expected one of generic, "), ("/no/such/file.toml",) * 2]
 )
 def test_a_profile_that_there_is_not_starts_nothing(
     profile: str, says: str, capsys: pytest.CaptureFixture[str]
