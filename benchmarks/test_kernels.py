@@ -45,7 +45,7 @@ def test_suppression(benchmark: BenchmarkFixture, apart: float) -> None:
     rng = np.random.default_rng(0)
     boxes = rng.uniform([-16, -16, 3, 1.5, -3], [16, 16, 5, 2, 3], (1000, 5))
     boxes[:, :2] *= apart
-    keep = benchmark(non_maximum_suppression, boxes, np.zeros(1000, np.int64), np.array([0.1]))
+    keep = benchmark(non_maximum_suppression, boxes, np.zeros(1000, np.int64), np.array([0.1]), np.zeros(1, np.int64))
     assert 0 < keep.sum() < 1000
 
 

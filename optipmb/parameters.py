@@ -223,6 +223,11 @@ class ClassParameters(_Table):
     confirm_until: Probability = Field(
         default=0.0, description="existence below which a confirmed track is so no longer, at most confirm_from"
     )
+    group: ClassName | None = Field(
+        default=None,
+        description="eta_iou holds between detections of all classes with the same group too; none, the paper: within "
+        "the class alone",
+    )
     calibration: Calibration | None = Field(
         default=None, description="what tracks say of themselves; without it existence is r and the covariance is P"
     )

@@ -55,7 +55,9 @@ class Measurements:
 
 
 def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[Measurements, int, int]:
-    """Remove detections scored below eta_sf, then those that overlap a better one of their class by more than eta_iou.
+    """Remove detections scored below eta_sf, then those that overlap a better one by more than eta_iou.
+
+    They are compared with detections of their class, and with those of the other classes of its group, if it has one.
 
     Returns:
         The measurements, the number below the score filter and the number suppressed.
@@ -74,6 +76,7 @@ def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[
         frame.source,
         table.score_filter,
         table.nms_iou,
+        table.group,
         chosen,
         most,
     )
@@ -118,6 +121,7 @@ def select(
     source: Index,
     score_filter: Array,
     nms_iou: Array,
+    group: Index,
     chosen: Index,
     most: int = UNLIMITED,
 ) -> tuple[int, int]:
@@ -141,7 +145,7 @@ def select(
         boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = center[m, 0], center[m, 1], size[m, 0], size[m, 1]
         boxes[k, 4] = yaw[m]
         ordered_label[k] = label[m]
-    keep = non_maximum_suppression(boxes, ordered_label, nms_iou, most)
+    keep = non_maximum_suppression(boxes, ordered_label, nms_iou, group, most)
     if keep.shape[0] < above:
         return above, -1
     kept = 0
@@ -192,13 +196,16 @@ def sort_canonically(order: Index, score: Array, center: Array, size: Array, yaw
 
 
 @kernel
-def non_maximum_suppression(boxes: Array, label: Index, threshold: Array, most: int = UNLIMITED) -> NDArray[np.bool_]:
-    """Keep each box unless a kept box of its class before it overlaps it by more than the threshold of the class.
+def non_maximum_suppression(
+    boxes: Array, label: Index, threshold: Array, group: Index, most: int = UNLIMITED
+) -> NDArray[np.bool_]:
+    """Keep each box unless a kept box of its group before it overlaps it by more than the threshold of its class.
 
     Args:
         boxes: (M, 5) bird's-eye boxes, best first.
         label: (M,) class of each.
         threshold: (C,) eta_iou of each class.
+        group: (C,) group of each class.
         most: pairs of boxes whose overlap is computed before it gives up.
 
     Returns:
@@ -210,17 +217,19 @@ def non_maximum_suppression(boxes: Array, label: Index, threshold: Array, most: 
     widest = np.zeros(threshold.shape[0])
     for m in range(count):
         radius[m] = 0.5 * math.hypot(boxes[m, 2], boxes[m, 3])
-        widest[label[m]] = max(widest[label[m]], radius[m])
-    # Only kept boxes stand in the torus; the cells of a class are as wide as two of its boxes reach.
+        g = group[label[m]]
+        widest[g] = max(widest[g], radius[m])
+    # Only kept boxes stand in the torus; the cells of a group are as wide as two of its boxes reach.
     head, following, side = empty_torus(count)
     for m in range(count):
-        cell_size = 2.0 * widest[label[m]]
-        first_x, last_x, first_y, last_y = block(boxes[m, 0], boxes[m, 1], radius[m] + widest[label[m]], cell_size)
+        g = group[label[m]]
+        cell_size = 2.0 * widest[g]
+        first_x, last_x, first_y, last_y = block(boxes[m, 0], boxes[m, 1], radius[m] + widest[g], cell_size)
         for i in range(first_x, last_x + 1):
             for j in range(first_y, last_y + 1):
                 k = head[(i & (side - 1)) * side + (j & (side - 1))]
                 while k != NOBODY and keep[m]:
-                    if label[k] == label[m]:
+                    if group[label[k]] == g:
                         dx, dy, reach = boxes[k, 0] - boxes[m, 0], boxes[k, 1] - boxes[m, 1], radius[k] + radius[m]
                         if dx * dx + dy * dy < reach * reach:
                             left -= 1

@@ -23,6 +23,7 @@ class ClassTable:
     """Columns over the classes; names as in `optipmb.parameters.ClassParameters`, where they are described.
 
     Attributes:
+        group: (C,) the first class of the group of each, itself without one.
         clutter_intensity: lambda_c = mu_c / A, 1/m^2.
         birth_intensity: mu_b0 / A, 1/m^2.
         process_noise: (C, 6) standard deviations in state order, per square root of a second.
@@ -52,6 +53,7 @@ class ClassTable:
     detection_over_time: bool
     score_filter: Array
     nms_iou: Array
+    group: NDArray[np.int64]
     survival: Array
     gate: Array
     detection: Array
@@ -135,6 +137,7 @@ class ClassTable:
                     values[row, : knots[row]] = value(one)
             return values
 
+        groups = [(p.group,) if p.group is not None else row for row, p in enumerate(rows)]
         noise = [p.process_noise for p in rows]
         signs = [p.heading_sign for p in rows]
         return cls(
@@ -142,6 +145,7 @@ class ClassTable:
             detection_over_time=parameters.detection_over_time,
             score_filter=column(lambda p: p.score_filter),
             nms_iou=column(lambda p: p.nms_iou),
+            group=np.array([groups.index(group) for group in groups], dtype=np.int64),
             survival=column(lambda p: p.survival),
             gate=column(lambda p: p.gate),
             detection=column(lambda p: p.detection),

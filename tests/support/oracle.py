@@ -163,7 +163,7 @@ class Oracle:
                 component.weight *= survival
 
     def _preprocess(self, frame: Any) -> list[Measurement]:
-        """Score filter (eta_sf) and non-maximum suppression per class (eta_iou), in the canonical order."""
+        """Score filter (eta_sf) and non-maximum suppression per group of classes (eta_iou), in the canonical order."""
         rows = []
         for i in range(len(frame.score)):
             x, y, z = (float(value) for value in frame.center[i])
@@ -177,7 +177,11 @@ class Oracle:
             box = np.array([x, y, length, width, yaw])
             if -minus_score < self.classes[label].score_filter:
                 continue
-            rivals = [other for other, known in zip(boxes, kept, strict=True) if known.label == label]
+            rivals = [
+                other
+                for other, known in zip(boxes, kept, strict=True)
+                if known.label == label or self.classes[known.label].group == self.classes[label].group is not None
+            ]
             if any(iou(box, other) > self.classes[label].nms_iou for other in rivals):
                 continue
             velocity = None if np.isnan(frame.velocity[i]).any() else np.array(frame.velocity[i])

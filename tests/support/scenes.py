@@ -280,6 +280,9 @@ def random_parameters(
         }  # fmt: skip
 
     classes = {label: one_class() for label in labels}
+    if seed % 3 == 1:
+        for values in classes.values():
+            values["group"] = "road users"
     if calibrated:
         for values in classes.values():
             values["calibration"] = _calibration(rng)

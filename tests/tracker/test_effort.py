@@ -68,5 +68,5 @@ def test_suppression_gives_up_at_its_bound() -> None:
     angles = np.linspace(0, 3, 30)
     star = np.c_[np.zeros((30, 2)), np.full(30, 20.0), np.full(30, 0.05), angles]
     label, threshold = np.zeros(30, np.int64), np.array([0.5])
-    assert non_maximum_suppression(star, label, threshold, 30 * 29 // 2).all()
-    assert non_maximum_suppression(star, label, threshold, 30 * 29 // 2 - 1).shape == (0,)
+    assert non_maximum_suppression(star, label, threshold, label[:1], 30 * 29 // 2).all()
+    assert non_maximum_suppression(star, label, threshold, label[:1], 30 * 29 // 2 - 1).shape == (0,)

@@ -90,10 +90,11 @@ def test_iou_is_a_table_of_all_pairs() -> None:
     assert optipmb.bev_iou(np.zeros((0, 5)), b).shape == (0, 4)
 
 
+@pytest.mark.parametrize("group", [[0, 1, 2], [0, 1, 0]])
 @pytest.mark.parametrize("mixed", [False, True])
 @pytest.mark.parametrize("seed", range(6))
-def test_suppression_is_the_greedy_one_per_class(seed: int, *, mixed: bool) -> None:
-    """A box goes when a better KEPT one of its class overlaps it by more than the threshold of the class."""
+def test_suppression_is_the_greedy_one_per_group(seed: int, *, mixed: bool, group: list[int]) -> None:
+    """A box goes when a better KEPT one of its group overlaps it by more than the threshold of its class."""
     rng = np.random.default_rng(seed)
     boxes = rng.uniform([0, 0, 1, 1, -3], [12, 12, 5, 2, 3], (60, 5))
     if mixed:  # specks beside giants, many at the same x
@@ -103,10 +104,11 @@ def test_suppression_is_the_greedy_one_per_class(seed: int, *, mixed: bool) -> N
     thresholds = np.array([0.0, 0.1, 0.5])
     wanted: list[int] = []
     for i in range(60):
-        rivals = [k for k in wanted if label[k] == label[i]]
+        rivals = [k for k in wanted if group[label[k]] == group[label[i]]]
         if all(textbook.iou(boxes[i], boxes[k]) <= thresholds[label[i]] for k in rivals):
             wanted.append(i)
-    np.testing.assert_array_equal(np.flatnonzero(non_maximum_suppression(boxes, label, thresholds)), wanted)
+    found = non_maximum_suppression(boxes, label, thresholds, np.array(group))
+    np.testing.assert_array_equal(np.flatnonzero(found), wanted)
     assert 0 < len(wanted) < 60
 
 
@@ -114,14 +116,14 @@ def test_nothing_to_suppress() -> None:
     """No boxes, no result; one box stays."""
     one = np.array([[0.0, 0, 4, 2, 0]])
     label, thresholds = np.zeros(1, np.int64), np.array([0.1])
-    assert non_maximum_suppression(one[:0], label[:0], thresholds).shape == (0,)
-    np.testing.assert_array_equal(non_maximum_suppression(one, label, thresholds), [True])
+    assert non_maximum_suppression(one[:0], label[:0], thresholds, label).shape == (0,)
+    np.testing.assert_array_equal(non_maximum_suppression(one, label, thresholds, label), [True])
 
 
 def test_what_was_suppressed_suppresses_nothing() -> None:
     """A chain of boxes, each overlapping the next: the first and the third stay."""
     boxes = np.array([[0.0, 0, 4, 2, 0], [2.5, 0, 4, 2, 0], [5.0, 0, 4, 2, 0]])
-    keep = non_maximum_suppression(boxes, np.zeros(3, np.int64), np.array([0.1]))
+    keep = non_maximum_suppression(boxes, np.zeros(3, np.int64), np.array([0.1]), np.zeros(1, np.int64))
     np.testing.assert_array_equal(keep, [True, False, True])
 
 

@@ -73,7 +73,16 @@ def test_only_scores_from_the_filter_on_are_chosen(seed: int) -> None:
     chosen = np.full(40, -1)
     thresholds = np.array([0.3, 0.5])
     above, kept = select(
-        center, np.ones((40, 3)), np.zeros(40), score, label, np.arange(40), thresholds, np.array([0.1, 0.1]), chosen
+        center,
+        np.ones((40, 3)),
+        np.zeros(40),
+        score,
+        label,
+        np.arange(40),
+        thresholds,
+        np.array([0.1, 0.1]),
+        np.arange(2),
+        chosen,
     )
     wanted = np.flatnonzero(score >= thresholds[label])
     assert above == kept == wanted.size

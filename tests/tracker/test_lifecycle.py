@@ -208,6 +208,28 @@ def test_classes_do_not_mix() -> None:
     np.testing.assert_array_equal(result.tracks.label, [0, 1])
 
 
+@pytest.mark.parametrize(("groups", "tracked"), [((None, None), 2), (("motor", "motor"), 1), (("motor", "other"), 2)])
+def test_classes_of_one_group_make_one_object(groups: tuple[str | None, str | None], tracked: int) -> None:
+    """A car and a truck detected at one place are two tracks, or the better scored alone where they share a group."""
+    document = random_parameters(0, ("Car", "Truck"))
+    for values, group in zip(document["classes"].values(), groups, strict=True):
+        values.update(SIMPLE, group=group)
+    parameters = parse_parameters(document)
+    frame, _ = optipmb.make_frame(
+        parameters,
+        stamp_ns=0,
+        labels=["Car", "Truck"],
+        label=[0, 1],
+        center=[[5.0, 2.0, 0.0], [5.2, 2.1, 0.0]],
+        size=[[4.0, 1.8, 1.5], [4.5, 1.9, 1.7]],
+        yaw=[0.1, 0.1],
+        score=[0.7, 0.8],
+    )
+    (result,) = run(parameters, [frame])
+    assert result.tracks.label.tolist() == [0, 1][-tracked:]
+    assert result.diagnostics.suppressed == 2 - tracked
+
+
 def test_diagnostics_count_what_happened() -> None:
     """Below the score filter, suppressed, associated and born objects are counted."""
     parameters = car()

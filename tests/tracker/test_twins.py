@@ -73,7 +73,7 @@ TWINS = {
     "points.count_points": "test_geometry.test_points_in_boxes_counts_every_point",
     "predict.predict_components": "test_kernels.test_components_within_their_limit_are_predicted",
     "preprocess.gather": "test_twins.test_measurements_are_the_chosen_rows",
-    "preprocess.non_maximum_suppression": "test_geometry.test_suppression_is_the_greedy_one_per_class",
+    "preprocess.non_maximum_suppression": "test_geometry.test_suppression_is_the_greedy_one_per_group",
     "preprocess.precedes": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
     "preprocess.select": "test_kernels.test_only_scores_from_the_filter_on_are_chosen",
     "preprocess.sort_canonically": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
