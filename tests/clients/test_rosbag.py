@@ -19,6 +19,7 @@ from optipmb_client.offline import read_profile, track
 from optipmb_client.results.full import FullTable, full_path, read_full
 from real_data import kitti_root
 
+DETECTIONS = "/detector/boxes/tracks/detections"
 CLASSES = {"class.car": "Car", "class.bicycle": "Cyclist", "class.pedestrian": "Pedestrian"}
 
 
@@ -296,8 +297,8 @@ def test_a_bag_without_detections_is_told(scene: DataSequence, tmp_path: Path) -
         open_dataset("rosbag", path)
 
 
-def test_classes_that_no_profile_has_are_told(scene: DataSequence, tmp_path: Path) -> None:
-    """Without a profile that fits, the error names the classes of the bag and the option that renames them."""
+def test_classes_of_any_name_are_tracked(scene: DataSequence, tmp_path: Path) -> None:
+    """Without a profile one is made for the bag; with one, classes are renamed to those that it has."""
     numbers = {"Car": "0", "Pedestrian": "1", "Cyclist": "2"}
 
     def change(one: bags.Sent) -> bags.Sent:
@@ -309,7 +310,9 @@ def test_classes_that_no_profile_has_are_told(scene: DataSequence, tmp_path: Pat
         return one._replace(message=json.loads(text))
 
     path = changed(scene, tmp_path / "numbers.mcap", change)
-    with pytest.raises(DatasetError, match=r"class.NAME=OTHER"):
-        _ = open_dataset("rosbag", path).profile
+    found = result_of(optipmb("track", path, "--out", tmp_path / "auto.mcap", "--json"))
+    assert (found["profile"], found["sequences"][0]["frames"]) == ("auto", 20)
+    detected = [one for _, message in decoded(tmp_path / "auto.mcap")[DETECTIONS] for one in message.detections]
+    assert {one.results[0].hypothesis.class_id for one in detected} == {"0", "1", "2"}
     options: Any = {f"class.{number}": name for name, number in numbers.items()}
-    assert open_dataset("rosbag", path, **options).profile == "kitti"
+    assert len(tracks_of("rosbag", path, tmp_path / "renamed", **options)) > 40

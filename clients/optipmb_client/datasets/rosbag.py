@@ -25,10 +25,6 @@ try:
 except ImportError as error:
     raise ClientError("bags need rosbags, which is not installed: pip install 'optipmb[ros2]'") from error
 
-_PROFILES = (
-    ("kitti", frozenset({"Car", "Pedestrian", "Cyclist"})),
-    ("nuscenes", frozenset({"bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck"})),
-)
 _CLASS = "class."
 
 
@@ -139,6 +135,7 @@ class RosbagDataset:
     """
 
     name = "rosbag"
+    profile = "auto"
 
     def __init__(self, path: Path, options: Mapping[str, float | str]) -> None:
         texts = {name: str(value) for name, value in options.items()}
@@ -152,17 +149,6 @@ class RosbagDataset:
         self._bag = Bag(path)
         self._choice = Choice(**texts)
         self._topics = {topic.strip("/").replace("/", "."): topic for topic in detection_topics(self._bag)}
-
-    @property
-    def profile(self) -> str:
-        """The profile whose classes the detections have."""
-        labels = dict.fromkeys(name for sequence in self.sequences(["all"]) for name in sequence.labels)
-        for profile, classes in _PROFILES:
-            if classes & set(labels):
-                return profile
-        known = "; ".join(f"{name} ({', '.join(sorted(classes))})" for name, classes in _PROFILES)
-        expected = f"--profile, or names of classes by --option class.NAME=OTHER that fit one of {known}"
-        raise DatasetError(self._bag.path, expected, f"the classes {', '.join(labels) or 'none'}")
 
     @cached_property
     def _sequences(self) -> dict[str, RosbagSequence]:
