@@ -1,6 +1,7 @@
 """Recordings: what is in the file, what is left of it after a cut, and what is played of it."""
 
 import concurrent.futures
+import importlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from optipmb_client.datasets import DatasetError, open_dataset
+from optipmb_client.foxglove_messages import FoxgloveMessages
 from optipmb_client.foxglove_server import FoxgloveServer
 from optipmb_client.mcap_files.plan import plan, renamed, steps
 from optipmb_client.mcap_files.reading import Recorded, RecordingFile
@@ -149,6 +151,28 @@ def test_foxglove_finds_boxes_plots_and_logs_beside_our_messages(tmp_path: Path)
     assert found["tracks/figures"]["tracks"] == 2
     assert (found["problems/log"].message, found["problems/log"].name) == ("it jumped", "pose")
     assert [one.topic for one in RecordingFile(tmp_path / "a.mcap")] == ["detections", "tracks", "problems"]
+
+
+def test_foxglove_reads_every_message_by_its_own_schemas() -> None:
+    """The schemas that Foxglove publishes read whatever is drawn, and leave nothing over; figures are as announced."""
+    problem = Problem(stream=STREAM, instance="one", code="pose", message="it jumped", stamp_ns=5)
+    pose = Pose(translation=np.array([0.0, 0.0, 1.0]), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
+    seen = detections(0).model_copy(update={"frame": "sensor", "pose": pose})
+    made = FoxgloveMessages()
+    messages = (seen, points(0, 700), tracks(0, [3, 4]), tracks(1, [4]), problem)
+    read = []
+    for one in (shown for message in messages for shown in made.of(message)):
+        if one.encoding == "json":
+            assert set(json.loads(one.payload)) <= set(json.loads(one.schema.data)["properties"])
+        else:
+            short = one.schema.name.removeprefix("foxglove.")
+            schema = getattr(importlib.import_module(f"foxglove_schemas_protobuf.{short}_pb2"), short)
+            content = schema.FromString(one.payload)
+            content.DiscardUnknownFields()
+            assert content.ByteSize() == len(one.payload)
+        read.append(one.schema.name.rpartition(".")[2])
+    tracked = ["SceneUpdate", "Figures"]
+    assert read == ["SceneUpdate", "FrameTransform", "PointCloud", *tracked, *tracked, "Log"]
 
 
 def test_foxglove_is_served_live(tmp_path: Path) -> None:
