@@ -12,7 +12,7 @@ import structlog
 
 from optipmb_service import __version__
 from optipmb_service.app.edges import monitoring
-from optipmb_service.app.loops import StopRequest, beat, unless
+from optipmb_service.app.loops import StopRequest, beat, settle, unless
 from optipmb_service.grpc.server import GRACE_S, Server
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime.ports import EdgeError, TransportError
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 
     from optipmb_service.app.edges import AddFigures
     from optipmb_service.settings import Settings
-
-SWITCH_S: Final = 0.0005
-"""By default a thread that waits for the interpreter waits ten times as long."""
 
 log = structlog.get_logger("optipmb_service")
 
@@ -55,7 +52,6 @@ async def run(settings: Settings) -> int:
         The exit status: 0, or 1 when the network or an address cannot be used.
     """
     asked = StopRequest()
-    sys.setswitchinterval(SWITCH_S)
     log.info("starting", instance=settings.instance, version=__version__)
     health = ProcessHealth(settings.instance)
     beating = asyncio.create_task(beat(health))
@@ -70,6 +66,7 @@ async def run(settings: Settings) -> int:
                 health.metrics.add(server.metrics.figures)
                 await server.start()
                 health.report(_Gateway(client))
+                settle()
                 print(f"ready grpc={server.address} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
                 log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)
                 await asked.wait()

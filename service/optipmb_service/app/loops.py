@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import os
 import signal
 import sys
 import threading
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 import structlog
 
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.settings import Settings
+
+SWITCH_S: Final = 0.0005
+"""By default it is ten times as long, and a frame that meets two other threads waits 10 ms."""
 
 log = structlog.get_logger("optipmb_service")
 
@@ -75,6 +79,18 @@ def leave(status: int) -> None:
     sys.exit(status)
 
 
+def settle() -> None:
+    """Take what the start has made out of the garbage collector's sight, and let threads take turns more often.
+
+    What libraries and kernels have made, 150,000 objects in a service, lives for ever. A full collection walks them
+    all, and for as long no frame moves: 50 ms on an idle machine. Without them it takes microseconds.
+    A thread that has been waited for gives the interpreter's lock away after `SWITCH_S`.
+    """
+    gc.collect()
+    gc.freeze()
+    sys.setswitchinterval(SWITCH_S)
+
+
 async def beat(health: Heartbeat) -> None:
     """Say that the loop turns, for ever."""
     while True:
@@ -87,7 +103,7 @@ async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
     loop = asyncio.get_running_loop()
     done: asyncio.Future[_T] = loop.create_future()
 
-    def settle(value: _T | None, error: BaseException | None) -> None:
+    def finish(value: _T | None, error: BaseException | None) -> None:
         if done.cancelled():
             return
         if error is not None:
@@ -103,7 +119,7 @@ async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
         except BaseException as raised:  # noqa: BLE001 - handed to whoever awaits it
             error = raised
         with contextlib.suppress(RuntimeError):  # the loop has ended: the work was abandoned
-            loop.call_soon_threadsafe(settle, value, error)
+            loop.call_soon_threadsafe(finish, value, error)
 
     # A daemon: neither compiling nor waiting for a router can be interrupted, and neither may keep the process.
     threading.Thread(target=call, name="start", daemon=True).start()

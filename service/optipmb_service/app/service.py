@@ -12,7 +12,6 @@ close.
 from __future__ import annotations
 
 import asyncio
-import gc
 import sys
 import time
 from functools import partial
@@ -25,7 +24,7 @@ import optipmb
 from optipmb_service import __version__
 from optipmb_service.app.edges import grpc_edge, monitoring
 from optipmb_service.app.kernels import warm_up
-from optipmb_service.app.loops import StopRequest, beat, say_ready, unless
+from optipmb_service.app.loops import StopRequest, beat, say_ready, settle, unless
 from optipmb_service.cluster.assignment import Assignment
 from optipmb_service.cluster.coordinator import Coordinator
 from optipmb_service.observability import collectors
@@ -50,9 +49,6 @@ if TYPE_CHECKING:
     from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
-
-SWITCH_S: Final = 0.0005
-"""By default it is ten times as long, and a frame that meets two other threads waits 10 ms."""
 
 HOUSEKEEPING_S: Final = 0.5
 DRAIN_POLL_S: Final = 0.01
@@ -363,18 +359,6 @@ async def _serve(
     ended = await asyncio.to_thread(service.stop)
     log.info("stopped", drained=ended)
     return 0
-
-
-def settle() -> None:
-    """Take what the start has made out of the garbage collector's sight, and let threads take turns more often.
-
-    150,000 objects of libraries and kernels live for ever. A full collection walks them all, and for as long no frame
-    moves: 50 ms on an idle machine. Without them it takes microseconds.
-    A thread that has been waited for gives the interpreter's lock away after `SWITCH_S`.
-    """
-    gc.collect()
-    gc.freeze()
-    sys.setswitchinterval(SWITCH_S)
 
 
 def _log_problem(problem: schemas.Problem, count: int) -> None:
