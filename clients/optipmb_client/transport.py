@@ -15,7 +15,7 @@ import json
 import threading
 import time
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -24,6 +24,7 @@ from typing import Protocol, Self, TypeVar, cast
 import zenoh
 import zenoh.ext
 from optipmb_schemas import Detections, Keys, Message, Points, Topic, decode, encode, encoding_of
+from optipmb_schemas.late_join import ANSWER_S, LateJoin
 
 from optipmb_client.errors import ConnectionFailed
 
@@ -176,11 +177,19 @@ class Sender:
 
 
 class Subscription:
-    """A key expression whose samples a thread of its own moves into an inbox."""
+    """A key expression whose samples a thread of its own moves into an inbox.
 
-    def __init__(self, subscriber: _ZenohSubscriber, inbox: Inbox) -> None:
+    Args:
+        subscriber: Where samples come from.
+        inbox: Where they go.
+        session: For the caches of publishers that were there before the subscription.
+    """
+
+    def __init__(self, subscriber: _ZenohSubscriber, inbox: Inbox, session: zenoh.Session) -> None:
         self._subscriber = subscriber
         self._inbox = inbox
+        self._session = session
+        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._receive, self._ask)
         self._thread = threading.Thread(target=self._drain, name=f"drain {subscriber.key_expr}", daemon=True)
         self._thread.start()
 
@@ -188,9 +197,25 @@ class Subscription:
         with contextlib.suppress(zenoh.ZError):  # the channel ends with an error when its session goes first
             for sample in self._subscriber:
                 if sample.kind == zenoh.SampleKind.PUT:
-                    arrived = time.monotonic_ns()
-                    payload = sample.payload.to_bytes()
-                    self._inbox.put(Arrival(str(sample.key_expr), payload, str(sample.encoding), arrived))
+                    self._late_join.take(sample)
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        arrived = time.monotonic_ns()
+        payload = sample.payload.to_bytes()
+        self._inbox.put(Arrival(str(sample.key_expr), payload, str(sample.encoding), arrived))
+
+    def _ask(self, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[], None]) -> None:
+        def take(answer: zenoh.Reply) -> None:
+            if (sample := answer.ok) is not None:
+                reply(sample)
+
+        self._session.get(
+            selector,
+            zenoh.handlers.Callback(take, end),
+            accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=ANSWER_S,
+        )
 
     @property
     def alive(self) -> bool:
@@ -202,6 +227,7 @@ class Subscription:
         with contextlib.suppress(zenoh.ZError):
             self._subscriber.undeclare()
         self._thread.join(timeout=5.0)
+        self._late_join.close()
 
 
 class Subscriptions:
@@ -329,7 +355,7 @@ class Connection:
                 history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
                 recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
             )
-        return self._keep(Subscription(subscriber, inbox))
+        return self._keep(Subscription(subscriber, inbox, self._session))
 
     def senders(self, stream: str, *, prefix: str, cache: int, cache_clouds: int) -> tuple[Sender, Sender]:
         """Open what sends the detections and the clouds of a stream, each keeping the newest for recovery."""

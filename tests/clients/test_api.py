@@ -12,7 +12,7 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_client import Connection, ConnectionFailed, Publisher, Subscriber
-from optipmb_client.transport import Inbox, Subscription
+from optipmb_client.transport import Inbox
 from optipmb_schemas import Detections, Message, MessageError, Points, Problem, Tracks, decode, encode, encoding_of
 from routers import free_endpoint, open_client
 
@@ -34,14 +34,9 @@ def link(endpoint: str) -> Iterator[Connection]:
 
 
 def listen(connection: Connection, topic: str) -> Inbox:
-    """Everything that is published on a topic from now on.
-
-    By a plain subscriber: an advanced one that was just opened still asks for what was published before, and what comes
-    in that millisecond is sometimes lost.
-    """
+    """Everything that is published on a topic."""
     inbox = Inbox(10_000)
-    session = connection._session
-    Subscription(session.declare_subscriber(f"optipmb/v1/*/*/*/{topic}", zenoh.handlers.FifoChannel(10_000)), inbox)
+    connection.subscribe(f"optipmb/v1/*/*/*/{topic}", inbox)
     return inbox
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 import pytest
 import zenoh
 from optipmb_client.errors import ConnectionFailed
-from optipmb_client.transport import DEFAULT_ENDPOINT, Arrival, Connection, Inbox
+from optipmb_client.transport import DEFAULT_ENDPOINT, Arrival, Connection, Inbox, Subscription
 from routers import free_endpoint, open_client, open_router
 
 
@@ -83,6 +83,25 @@ def test_a_late_subscriber_gets_the_history_of_the_cache(endpoint: str) -> None:
         arrivals = [inbox.get(60.0) for _ in range(3)]
     assert [arrival.payload for arrival in arrivals if arrival] == [b"2", b"3", b"4"]
     assert {arrival.encoding for arrival in arrivals if arrival} == {"application/msgpack;optipmb.Detections.v1"}
+
+
+def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(endpoint: str) -> None:
+    """A subscription that gets nothing but what is sent from now on brings the publisher's earlier messages first."""
+    inbox = Inbox(10_000)
+    with Connection(endpoint) as sender, Connection(endpoint) as receiver:
+        small = sender.cached_sender("a/small", "zenoh/bytes", cache=1000)
+        for number in range(5):
+            small.put(b"%d" % number)
+        plain = receiver._session.declare_subscriber("a/*", zenoh.handlers.FifoChannel(1000))  # asks no cache itself
+        subscription = Subscription(plain, inbox, receiver._session)
+        sent, deadline = 5, time.monotonic() + 60.0
+        while not inbox.pending and time.monotonic() < deadline:
+            small.put(b"%d" % sent)
+            sent += 1
+            time.sleep(0.01)  # the subscription is on its way to the publisher; there is no event for it
+        received = [inbox.get(60.0) for _ in range(sent)]
+        subscription.close()
+    assert [arrival.payload for arrival in received if arrival] == [b"%d" % number for number in range(sent)]
 
 
 def test_an_unread_inbox_neither_blocks_the_publisher_nor_the_closing(endpoint: str) -> None:

@@ -25,6 +25,7 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
+from optipmb_service.zenoh.subscription import Subscription
 from routers import open_client
 
 SESSION = "0123456789abcdef0123456789abcdef"
@@ -64,18 +65,11 @@ class FakeService:
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._lock = threading.Lock()
         self._opened: list[object] = []
-        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-        for topic, take in (("detections", self._on_detections), ("points", self._on_points)):
-            channel = zenoh.handlers.FifoChannel(1000)
-            subscriber = (
-                zenoh.ext.declare_advanced_subscriber(
-                    session, KEYS.all(topic), channel, history=history, recovery=recovery
-                )
-                if topic == "detections"
-                else session.declare_subscriber(KEYS.all(topic), channel)
-            )
-            self._work(subscriber, take)
+        self._opened.append(
+            Subscription(session, KEYS.all("detections"), self._on_detections, channel=1000, history=history)
+        )
+        self._work(session.declare_subscriber(KEYS.all("points"), zenoh.handlers.FifoChannel(1000)), self._on_points)
         for what, answer in (("parameters", self._on_parameters), ("reset", self._on_reset)):
             self._work(session.declare_queryable(KEYS.all_queries(what), zenoh.handlers.FifoChannel(100)), answer)
         self._work(

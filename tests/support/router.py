@@ -26,6 +26,7 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
+from optipmb_service.zenoh.subscription import Subscription
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -121,7 +122,7 @@ class Node:
         self.keys = keys or Keys()
         self.session = zenoh.open(_configuration(endpoint))
         self._publishers: dict[str, Any] = {}
-        self._subscriptions: list[Any] = []
+        self._closing: list[Callable[[], object]] = []
         self.tracks_seen = self._collect(self.keys.all("tracks"))
         self.problems_seen = self._collect(self.keys.all("problems"))
 
@@ -135,8 +136,8 @@ class Node:
 
     def close(self) -> None:
         """Leave the network in order."""
-        for subscription in self._subscriptions:
-            subscription.undeclare()
+        for close in self._closing:
+            close()
         for publisher in self._publishers.values():
             publisher.undeclare()
         self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
@@ -251,20 +252,15 @@ class Node:
 
     def _collect(self, pattern: str) -> Collected:
         collected = Collected()
-        subscriber = zenoh.ext.declare_advanced_subscriber(
-            self.session,
-            pattern,
-            zenoh.handlers.FifoChannel(10_000),
-            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
-        )
-        self._drain(
-            subscriber,
-            lambda sample: collected.add(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)),
-        )
+
+        def take(sample: zenoh.Sample) -> None:
+            collected.add(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
+
+        self._closing.append(Subscription(self.session, pattern, take, channel=10_000).close)
         return collected
 
     def _drain(self, subscriber: Any, take: Callable[[Any], None]) -> None:
-        self._subscriptions.append(subscriber)
+        self._closing.append(subscriber.undeclare)
         handler = subscriber.handler
 
         def loop() -> None:

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.settings import Settings
-    from optipmb_service.zenoh.client import Message, Outgoing, Subscription
+    from optipmb_service.zenoh.client import Message, Outgoing
+    from optipmb_service.zenoh.subscription import Subscription
 
 QUEUE: Final = 2048
 QUEUE_BYTES: Final = 2**28

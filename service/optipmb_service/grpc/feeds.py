@@ -20,7 +20,8 @@ from optipmb_service.grpc.selection import Selection
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from optipmb_service.zenoh.client import Client, Message, Subscription
+    from optipmb_service.zenoh.client import Client, Message
+    from optipmb_service.zenoh.subscription import Subscription
 
 HISTORY_S: Final = 2.0
 """Longest wait for the caches of the services."""

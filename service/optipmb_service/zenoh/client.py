@@ -7,7 +7,7 @@ two apart. Everything here may be called by any thread; `ask` and `recent` wait 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol, Self, cast
+from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
 import optipmb_schemas as schemas
 import zenoh
@@ -15,17 +15,13 @@ import zenoh.ext
 
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import close, line, opened
-from optipmb_service.zenoh.handles import Putting, Readers, cached_publisher, publish_problem, undeclare
+from optipmb_service.zenoh.handles import Putting, cached_publisher, publish_problem, undeclare
+from optipmb_service.zenoh.subscription import Subscription
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.settings import Settings
-
-CHANNEL: Final = 1024
-"""Messages between Zenoh and a draining thread; more than any publisher's history."""
-
-JOIN_S: Final = 5.0
 
 
 class _Matching(Protocol):
@@ -121,41 +117,6 @@ class Outgoing:
             raise TransportError(line(error)) from error
 
 
-class Subscription:
-    """A key expression whose messages a thread hands over; what was lost is recovered from the publishers' caches.
-
-    Args:
-        session: to subscribe on.
-        key: the key expression.
-        receive: called for each message, one after the other.
-
-    Raises:
-        TransportError: the session is closed.
-    """
-
-    def __init__(self, session: zenoh.Session, key: str, receive: Callable[[Message], None]) -> None:
-        try:
-            subscriber: Any = zenoh.ext.declare_advanced_subscriber(
-                session,
-                key,
-                zenoh.handlers.FifoChannel(CHANNEL),
-                recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
-            )
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
-
-        def take(sample: zenoh.Sample) -> None:
-            if sample.kind == zenoh.SampleKind.PUT:
-                receive(_message(sample))
-
-        self._readers = Readers()
-        self._readers.add(key, subscriber, subscriber.handler, take)
-
-    def close(self) -> None:
-        """End it; nothing is handed over afterwards."""
-        self._readers.stop(JOIN_S)
-
-
 class Client:
     """A session as edges use it.
 
@@ -196,8 +157,8 @@ class Client:
         publish_problem(self._session, self.keys, problem)
 
     def subscribe(self, key: str, receive: Callable[[Message], None]) -> Subscription:
-        """Hand over what is published from now on under a key expression, on a thread of its own."""
-        return Subscription(self._session, key, receive)
+        """Hand over what is published under a key expression, and what caches hold, on a thread of its own."""
+        return Subscription(self._session, key, lambda sample: receive(_message(sample)))
 
     def recent(self, key: str, timeout: float) -> list[Message]:
         """Return what the caches of advanced publishers hold under a key expression, those of a publisher in order.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import optipmb_schemas as schemas
 import structlog
@@ -24,6 +24,7 @@ from optipmb_service.zenoh.handles import (
     publish_problem,
     undeclare,
 )
+from optipmb_service.zenoh.subscription import Subscription
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -71,6 +72,7 @@ class Transport:
         self._is_router = settings.is_router
         self._session = opened(settings)
         self._readers = Readers()
+        self._subscriptions: list[Subscription] = []
         self._claims: set[Publisher] = set()
         self._lock = threading.Lock()
         self._alive: Undeclared | None = None
@@ -81,22 +83,14 @@ class Transport:
         self, on_frame: Callable[[Packet], None], on_cloud: Callable[[Packet], None], wanted: Callable[[str], bool]
     ) -> None:
         """Hand over the detections and point clouds on all keys that are wanted, each on a thread of its own."""
-        detections = self._subscriber("detections", CHANNEL)
-        self._readers.add(
-            "detections", detections, detections.handler, lambda sample: self._receive(sample, on_frame, wanted)
-        )
-        points = self._subscriber("points", CHANNEL // 16)
-        self._readers.add("points", points, points.handler, lambda sample: self._receive(sample, on_cloud, wanted))
+        self._subscribe("detections", CHANNEL, lambda sample: self._receive(sample, on_frame, wanted))
+        self._subscribe("points", CHANNEL // 16, lambda sample: self._receive(sample, on_cloud, wanted))
 
-    def _subscriber(self, topic: schemas.Topic, channel: int) -> zenoh.ext.AdvancedSubscriber[Any]:
+    def _subscribe(self, topic: schemas.Topic, channel: int, receive: Callable[[zenoh.Sample], None]) -> None:
         """Subscribe to a topic of all streams, with what the publishers' caches hold: also of clouds, if they do."""
-        return zenoh.ext.declare_advanced_subscriber(
-            self._session,
-            self._keys.all(topic),
-            zenoh.handlers.FifoChannel(channel),
-            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_age=HISTORY_S),
-            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
-        )
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_age=HISTORY_S)
+        key = self._keys.all(topic)
+        self._subscriptions.append(Subscription(self._session, key, receive, channel=channel, history=history))
 
     def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""
@@ -165,7 +159,7 @@ class Transport:
 
     def _receive(self, sample: zenoh.Sample, receive: Callable[[Packet], None], wanted: Callable[[str], bool]) -> None:
         key = str(sample.key_expr)
-        if sample.kind != zenoh.SampleKind.PUT or not wanted(key):
+        if not wanted(key):
             return
         wall_ns, now_ns = time.time_ns(), time.monotonic_ns()
         size = len(sample.payload)
@@ -254,6 +248,9 @@ class Transport:
         if self._alive is not None:
             undeclare(self._alive)
             self._alive = None
+        for subscription in self._subscriptions:
+            subscription.close(timeout)
+        self._subscriptions.clear()
         self._readers.stop(timeout)
 
     def close(self) -> None:

@@ -1,0 +1,93 @@
+"""A subscription whose samples a thread of its own hands over: nothing that a publisher still caches is missing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import structlog
+import zenoh
+import zenoh.ext
+from optipmb_schemas.late_join import ANSWER_S, LateJoin
+
+from optipmb_service.runtime.ports import TransportError
+from optipmb_service.zenoh.connection import line
+from optipmb_service.zenoh.handles import Readers
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+log = structlog.get_logger("optipmb_service")
+
+CHANNEL: Final = 1024
+"""Messages between Zenoh and a draining thread; more than any publisher's history."""
+
+CLOSE_S: Final = 5.0
+
+
+class Subscription:
+    """A key expression whose samples are handed over; what was lost is recovered from the publishers' caches.
+
+    Args:
+        session: to subscribe on.
+        key: the key expression.
+        receive: called for each sample, one after the other.
+        channel: messages that may wait for the thread.
+        history: what to fetch of publishers that send nothing; by default what their heartbeats say that they hold.
+
+    Raises:
+        TransportError: the session is closed.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        receive: Callable[[zenoh.Sample], None],
+        *,
+        channel: int = CHANNEL,
+        history: zenoh.ext.HistoryConfig | None = None,
+    ) -> None:
+        self._session = session
+        self._key = key
+        self._receive = receive
+        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._hand_over, self._ask)
+        try:
+            subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+                session,
+                key,
+                zenoh.handlers.FifoChannel(channel),
+                history=history,
+                recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+            )
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
+        self._readers = Readers()
+        self._readers.add(key, subscriber, subscriber.handler, self._take)
+
+    def close(self, timeout: float = CLOSE_S) -> None:
+        """End it; what came before is handed over within `timeout` seconds, and nothing afterwards."""
+        self._readers.stop(timeout)
+        self._late_join.close()
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._late_join.take(sample)
+
+    def _hand_over(self, sample: zenoh.Sample) -> None:
+        try:
+            self._receive(sample)
+        except Exception:
+            log.exception("internal_error", reader=self._key)  # one message must not end the reading
+
+    def _ask(self, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[], None]) -> None:
+        def take(answer: zenoh.Reply) -> None:
+            if (sample := answer.ok) is not None:
+                reply(sample)
+
+        self._session.get(
+            selector,
+            zenoh.handlers.Callback(take, end),
+            accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=ANSWER_S,
+        )

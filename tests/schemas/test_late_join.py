@@ -1,0 +1,117 @@
+"""Which samples of a publisher a subscription hands over, and in which order."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import optipmb_schemas.late_join
+import pytest
+from optipmb_schemas.late_join import LateJoin
+
+
+@dataclass(frozen=True)
+class Entity:
+    """Who publishes."""
+
+    zid: str = "abc"
+    eid: int = 7
+
+
+@dataclass(frozen=True)
+class Info:
+    """The publisher of a sample, and its number there."""
+
+    source_id: Entity
+    source_sn: int
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What is read of Zenoh's samples."""
+
+    source_info: Info | None
+    key_expr: str = "a/b"
+
+
+@dataclass
+class Joined:
+    """A subscription with its caches: what was handed over, and the queries that wait to be answered."""
+
+    received: list[object] = field(default_factory=list)
+    asked: list[tuple[str, Callable[[Sample], None], Callable[[], None]]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.join: LateJoin[Sample] = LateJoin(
+            lambda sample: self.received.append(sample.source_info and sample.source_info.source_sn),
+            lambda *query: self.asked.append(query),
+        )
+
+    def take(self, *numbers: int, source: Entity = Entity()) -> None:
+        """Samples that come live."""
+        for number in numbers:
+            self.join.take(sample(number, source))
+
+    def answer(self, *numbers: int) -> None:
+        """The cache's answer to the oldest query."""
+        _, reply, end = self.asked.pop(0)
+        for number in numbers:
+            reply(sample(number))
+        end()
+
+
+def sample(number: int, source: Entity = Entity()) -> Sample:
+    """A sample of a publisher."""
+    return Sample(Info(source, number))
+
+
+def test_a_publisher_that_begins_is_handed_over_at_once() -> None:
+    """From number 0 on nothing is asked and nothing waits; the same for publishers without a cache."""
+    one = Joined()
+    one.join.take(Sample(None))
+    one.take(0, 1, 2)
+    assert (one.received, one.asked) == ([None, 0, 1, 2], [])
+
+
+def test_what_came_before_the_first_sample_comes_first() -> None:
+    """A first sample with another number waits, and what follows, for those before it; later ones do not."""
+    one = Joined()
+    one.take(3, 4)
+    assert (one.received, [selector for selector, _, _ in one.asked]) == ([], ["a/b/@adv/pub/abc/7/**?_sn=..2"])
+    one.answer(2, 1)
+    one.take(5)
+    assert (one.received, one.asked) == ([1, 2, 3, 4, 5], [])
+
+
+def test_one_publisher_does_not_wait_for_another() -> None:
+    """While the cache of one is asked, what comes of the others is handed over."""
+    one = Joined()
+    one.take(3)
+    one.take(0, 1, source=Entity("def"))
+    assert one.received == [0, 1]
+    one.answer()
+    assert one.received == [0, 1, 3]
+
+
+def test_closing_hands_over_what_waits_and_nothing_afterwards() -> None:
+    """What has come is not lost when the subscription ends; answers and samples that come later are."""
+    one = Joined()
+    one.take(3, 4)
+    one.join.close()
+    one.answer(1, 2)
+    one.take(5)
+    assert one.received == [3, 4]
+
+
+def test_what_waits_and_who_is_known_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Too many samples do not wait any longer for the cache; the publisher known longest is asked again."""
+    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_WAITING", 3)
+    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_SOURCES", 2)
+    one = Joined()
+    one.take(3, 4, 5, 6)
+    assert one.received == [3, 4, 5, 6]
+    one.answer(2)
+    assert one.received == [3, 4, 5, 6, 2]
+    for name in ("second", "third"):
+        one.take(0, source=Entity(name))
+    assert one.asked == []
+    one.take(7)
+    assert [selector for selector, _, _ in one.asked] == ["a/b/@adv/pub/abc/7/**?_sn=..6"]
