@@ -73,12 +73,14 @@ class ServiceProcess:
         return line
 
     def wait_log(self, event: str, deadline_s: float = 120.0) -> None:
-        """Wait for a log event."""
+        """Wait for a log event; fails at once when the process has ended without it."""
         ends = time.monotonic() + deadline_s
-        pause = threading.Event()
+        reader = self._threads[1]
         while event not in self.errors:
             assert time.monotonic() < ends, f"no {event} in {self.errors}"
-            pause.wait(0.01)
+            if not reader.is_alive():  # it has read everything
+                assert event in self.errors, f"ended without {event}: {self.errors}"
+            reader.join(0.01)
 
     def end(self, *numbers: signal.Signals, deadline_s: float = 60.0) -> tuple[int, float]:
         """Send signals (SIGTERM unless named); return the exit status and the seconds until the end."""
