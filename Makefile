@@ -12,11 +12,13 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
-.PHONY: help kernels docs release demo test bounds bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests-together tests-alone check lowest paths pythons repeat schemas wheel clean tune ablate
+.PHONY: help kernels docs release demo test accuracy alone bounds bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    lint, types, schemas, tests, wheel"
 	@echo "make check   lint, types, and the tests nearest to what changed since SINCE=main, in less than a minute"
+	@echo "make accuracy  hold the figures of accuracy on KITTI and nuScenes, where their data are"
+	@echo "make alone   run the tests that measure memory and latency, one after the other"
 	@echo "make bounds  call the tracker with every kernel compiled with bounds checks, which takes a minute"
 	@echo "make lowest  test the wheel with the oldest packages that it may be installed with"
 	@echo "make pythons test the wheel with every Python newer than 3.11 that this machine has"
@@ -58,11 +60,8 @@ containers: install
 	$(BIN)/python docker/containers.py $(OPTIONAL)
 
 # The demonstration is among the tests (tests/e2e/test_demo.py); CI also runs the command, which installs less.
-# Types take as long as the kernels; then tests that wait for conditions share the machine with what waits for nobody; tests
-# that measure come last.
 test: install
-	$(MAKE) --jobs 5 types kernels lint schemas wheel tests-together
-	$(MAKE) tests-alone
+	$(MAKE) --jobs 5 types kernels lint schemas wheel tests
 
 # For figures, nothing else should run on the machine. SERVICE holds options of the service, SECONDS how long a run takes.
 load: install
@@ -79,13 +78,17 @@ types: install
 kernels: install
 	$(BIN)/optipmb warm-up
 
-# With more JOBS than processors it takes about as long, and answers come late. Tests that measure memory and times run
-# after the others, one by one.
+# With more JOBS than processors it takes about as long, and answers come late.
 JOBS ?= 2
-tests-together: kernels
-	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not alone and not bounds"
+tests: kernels
+	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not accuracy and not alone and not bounds"
 
-tests-alone: install
+# The figures of accuracy that docs/tuning.md and docs/ablation.md give, on the KITTI and nuScenes data.
+accuracy: kernels
+	$(BIN)/pytest -n $(JOBS) tests/clients -m accuracy
+
+# What measures memory and latency, one test after the other.
+alone: kernels
 	$(BIN)/pytest tests/e2e -m alone
 
 # Compiling all kernels a second time takes a minute; what is compiled is kept in .pytest_cache.

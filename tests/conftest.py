@@ -1,4 +1,4 @@
-"""What all tests share: interrupts as in a terminal, and which tests have the machine for themselves."""
+"""What all tests share: interrupts as in a terminal, and which tests run by a command of their own."""
 
 from __future__ import annotations
 
@@ -16,8 +16,11 @@ HERE = Path(__file__).parent
 # What a shell starts in the background ignores it, and hands that on to what it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-ALONE = ("e2e/test_load.py", "e2e/test_soak.py")
-"""Files whose tests measure memory and times (`-m alone`); all others wait for conditions and run side by side."""
+OTHERS = {
+    "alone": ("e2e/test_load.py", "e2e/test_soak.py"),
+    "accuracy": ("clients/test_accuracy_kitti.py", "clients/test_accuracy_nuscenes.py"),
+}
+"""Files whose tests `make test` leaves to `make alone` and `make accuracy`, by their marker."""
 
 # The same examples in every run; `--hypothesis-profile default` looks at others.
 hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None)
@@ -25,8 +28,8 @@ hypothesis.settings.load_profile("same")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that run alone."""
-    alone = [HERE / name for name in ALONE]
+    """Mark the tests that run by a command of their own."""
+    marker_of = {HERE / name: marker for marker, names in OTHERS.items() for name in names}
     for item in items:
-        if any(item.path.is_relative_to(one) for one in alone):
-            item.add_marker("alone")
+        if item.path in marker_of:
+            item.add_marker(marker_of[item.path])
