@@ -82,9 +82,9 @@ class Environment:
             )
 
     def import_ms(self, module: str) -> float:
-        """Time the import of a module, without the start of the interpreter: median of five, after a first one."""
+        """Processor time of an import, without the start of the interpreter: median of five, after a first one."""
         self.run("python", "-c", f"import {module}")
-        code = f"import time; b = time.perf_counter(); import {module}; print(time.perf_counter() - b)"
+        code = f"import time; b = time.process_time(); import {module}; print(time.process_time() - b)"
         return 1e3 * statistics.median(float(self.run("python", "-c", code)) for _ in range(5))
 
 
@@ -149,7 +149,7 @@ def csv_in_and_out(base: Path, wheel: Path, _node: Path) -> None:
 def python(base: Path, wheel: Path, _node: Path) -> None:
     """The library alone, with the lines of the README."""
     place = Environment(base, "library", wheel)
-    said(f"  import optipmb: {place.import_ms('optipmb'):.0f} ms")
+    said(f"  import optipmb: {place.import_ms('optipmb'):.0f} ms of processor time")
     (place.work / "mine.py").write_text(blocks(README, "python", "OnlineTracker"))
     for what in ("the first tracks, with compilation", "again"):
         printed = timed(what, lambda: place.run("python", "mine.py"))
@@ -160,7 +160,7 @@ def node(base: Path, wheel: Path, node_wheel: Path) -> None:
     """A service, and a publisher and a subscriber in an environment without the tracker; a publisher without numpy."""
     place = Environment(base, "service", f"{wheel}[service]")
     nodes = Environment(base, "node", node_wheel)
-    said(f"  import optipmb_client: {nodes.import_ms('optipmb_client'):.0f} ms")
+    said(f"  import optipmb_client: {nodes.import_ms('optipmb_client'):.0f} ms of processor time")
     plain = Environment(base, "zenoh", "eclipse-zenoh")
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
