@@ -280,8 +280,9 @@ class Connection:
                 timeout=timeout,
             ) from error
         self._opened: weakref.WeakSet[Sender | Subscription] = weakref.WeakSet()
-        # For programs that forget to close: messages that still stand in a batch would be lost at their end.
-        self._finalizer = weakref.finalize(self, _close_session, self._session)
+        # For programs that forget to close: messages that still stand in a batch would be lost at their end, and a
+        # draining thread that wakes after the interpreter has ended would abort the process.
+        self._finalizer = weakref.finalize(self, _close_all, self._opened, self._session)
 
     def __enter__(self) -> Self:
         return self
@@ -293,8 +294,6 @@ class Connection:
 
     def close(self) -> None:
         """Close everything opened on this connection, then the session. May be called twice."""
-        for opened in tuple(self._opened):
-            opened.close()
         self._finalizer()
 
     @property
@@ -443,6 +442,8 @@ def _usable() -> Iterator[None]:
         raise ConnectionFailed(f"the connection cannot be used: {reason}") from error
 
 
-def _close_session(session: _ZenohSession) -> None:
+def _close_all(opened: weakref.WeakSet[Sender | Subscription], session: _ZenohSession) -> None:
+    for one in tuple(opened):
+        one.close()
     with contextlib.suppress(zenoh.ZError):
         session.close()
