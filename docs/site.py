@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 ROOT: Final = Path(__file__).parent.parent
 PAGES: Final = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+FIRST: Final = ("OnlineTracker", "OnlineTracks", "generic_parameters", "predict_tracks")
+"""What most programs need of the library; the rest follows by name."""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -43,11 +45,11 @@ def _profiles() -> str:
     lines = [
         "# Profiles",
         "",
-        "A profile is a TOML file. `optipmb profiles` lists those that come along, shows and copies them.",
+        "A profile is a TOML file. `optipmb profiles` lists the shipped profiles, shows and copies them.",
         "",
     ]
     lines += _fields(optipmb.Parameters, "Profile")
-    lines += ["## Profiles that come along", ""]
+    lines += ["## Shipped profiles", ""]
     for name in optipmb.profiles():
         one = optipmb.load_profile(name)
         lines += [f"**{name}**: {1.0 / one.nominal_period:g} Hz; {', '.join(one.labels)}", ""]
@@ -75,7 +77,7 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 def _api() -> str:
     """Return the reference of the public names of the library and of the node API."""
     lines = ["# Python", "", "## The library", ""]
-    lines += [f"::: optipmb.{name}\n" for name in optipmb.__all__]
+    lines += [f"::: optipmb.{name}\n" for name in (*FIRST, *(name for name in optipmb.__all__ if name not in FIRST))]
     lines += ["## Nodes", ""]
     lines += [f"::: optipmb_client.{name}\n" for name in optipmb_client.__all__ if not re.fullmatch("[A-Z_]+", name)]
     return "\n".join(lines)

@@ -233,9 +233,7 @@ class _Table:
     def _poses(self) -> Floats | None:
         """Return the poses (R, 7) that the table has."""
         if not all(role in self._found for role in _POSE[:2]):
-            self._reading.note(
-                "no columns for the pose of the sensor: boxes are taken to be in a frame that stands still"
-            )
+            self._reading.note("no columns for the pose of the sensor: boxes are assumed to be in the world frame")
             return None
         translation = np.column_stack([self._numbers("pose_x"), self._numbers("pose_y"), self._numbers("pose_z", 0.0)])
         roles = [f"pose_q{part}" for part in _TURNS]
