@@ -101,6 +101,8 @@ def test_filters(stub: Any, stream: str) -> None:
 
 def test_an_unlikely_object_is_not_confirmed(stub: Any, stream: str) -> None:
     """A track that the tracker does not confirm is left out of confirmed ones, as long as it does not."""
+    # The generic profile confirms at the second detection, that of nuScenes weighs scores.
+    stub.SetParameters(pb.SetParametersRequest(stream=stream, parameters=pb.SessionParameters(profile="nuscenes")))
     call = subscribed(stub, pattern=stream, filter=pb.TrackFilter(confirmed_only=True))
     unlikely = [frame(seq, stream, score=np.array([0.9, 0.25 + 0.1 * seq])) for seq in range(5)]
     likely = [frame(seq, stream) for seq in range(5, 10)]
