@@ -21,6 +21,9 @@ ANSWER_S: Final = 5.0
 MAX_WAITING: Final = 1024
 """Most messages of one publisher that wait for the answer of its cache."""
 
+MAX_WAITING_BYTES: Final = 1 << 25
+"""Most bytes of one subscription that wait; with more, nothing of the publisher concerned waits any longer."""
+
 MAX_SOURCES: Final = 16_384
 """Most publishers that are known; the cache of one that is forgotten is asked once more."""
 
@@ -39,9 +42,15 @@ class _Info(Protocol):
     def source_sn(self) -> int: ...
 
 
+class _Bytes(Protocol):
+    def __len__(self) -> int: ...
+
+
 class _Sample(Protocol):
     @property
     def key_expr(self) -> object: ...
+    @property
+    def payload(self) -> _Bytes: ...
     @property
     def source_info(self) -> _Info | None: ...
 
@@ -65,6 +74,7 @@ class LateJoin(Generic[_S]):
         self._receive = receive
         self._ask = ask
         self._sources: dict[_Source, list[_S] | None] = {}  # what waits for the answer of a cache; None: nothing does
+        self._waiting_bytes = 0
         self._lock = threading.Lock()
         self._closed = False
 
@@ -88,7 +98,8 @@ class LateJoin(Generic[_S]):
                 self._receive(sample)
                 return
             waiting.append(sample)
-            if len(waiting) >= MAX_WAITING:
+            self._waiting_bytes += len(sample.payload)
+            if len(waiting) >= MAX_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
                 self._release(source)
         if first:
             self._ask_before(sample.key_expr, source, info.source_sn)
@@ -131,4 +142,5 @@ class LateJoin(Generic[_S]):
     def _release(self, source: _Source) -> None:
         waiting, self._sources[source] = self._sources.get(source), None
         for sample in waiting or ():
+            self._waiting_bytes -= len(sample.payload)
             self._receive(sample)

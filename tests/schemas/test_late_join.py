@@ -30,6 +30,7 @@ class Sample:
 
     source_info: Info | None
     key_expr: str = "a/b"
+    payload: bytes = bytes(10)
 
 
 @dataclass
@@ -115,3 +116,18 @@ def test_what_waits_and_who_is_known_are_bounded(monkeypatch: pytest.MonkeyPatch
     assert one.asked == []
     one.take(7)
     assert [selector for selector, _, _ in one.asked] == ["a/b/@adv/pub/abc/7/**?_sn=..6"]
+
+
+def test_bytes_that_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With more bytes than may wait the publisher concerned waits no longer; what then waits is counted from there."""
+    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_WAITING_BYTES", 30)
+    one, other = Joined(), Entity("def")
+    one.take(3, 4)
+    one.take(8, source=other)
+    assert one.received == []
+    one.take(5)
+    assert one.received == [3, 4, 5]
+    one.take(9, 10, source=other)
+    assert one.received == [3, 4, 5]
+    one.take(11, source=other)
+    assert one.received == [3, 4, 5, 8, 9, 10, 11]
