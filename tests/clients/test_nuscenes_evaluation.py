@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nuscenes_cases import COLUMNS, Rows, disturbed_tracks, greedy_tracks, truth_tracks, write
 from nuscenes_tables import Scene, Thing, crowd, write_detections, write_root
+from optipmb_client.cli import run
 from optipmb_client.datasets import DatasetError
 from optipmb_client.datasets.nuscenes import NuScenesDataset, NuScenesSequence
 from optipmb_client.evaluation.nuscenes import NuScenesScores, evaluate_nuscenes, evaluate_scenes
@@ -520,6 +521,17 @@ def test_shuffled_ids_are_switches_in_whole_scenes(root: Path, tmp_path: Path) -
     )
     assert good.overall["ids"] == 0 < bad.overall["ids"]
     assert bad.overall["amota"] < 0.7 < good.overall["amota"]
+
+
+def test_results_are_drawn(root: Path, tmp_path: Path) -> None:
+    """`plot` draws a scene of the folder that `track` writes, and of a result file, with the same picture."""
+    dataset = NuScenesDataset(root)
+    for sequence in dataset.sequences(["all"]):
+        path = write(dataset, sequence, truth_tracks(sequence), tmp_path)
+    data = ["--dataset", "nuscenes", "--root", str(root), "--sequences", "scene-0103"]
+    for picture, tracks in (("a.png", path.parent), ("b.png", path)):
+        assert run(["plot", *data, "--tracks", str(tracks), "--out", str(tmp_path / picture)]) == 0
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 def test_results_without_any_box_are_no_error(root: Path, tmp_path: Path) -> None:

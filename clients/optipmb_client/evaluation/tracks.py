@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from optipmb_client.datasets import DataSequence, DatasetError
+from optipmb_client.datasets.nuscenes import NuScenesSequence
 from optipmb_client.datasets.table.dataset import match_stamps
 from optipmb_client.datasets.table.rows import Boxes, read_boxes
 from optipmb_client.datasets.table.values import Reading
 from optipmb_client.results import ResultTable, read_kitti_results
 from optipmb_client.results.full import FullTable, full_path, read_full
+from optipmb_client.results.nuscenes import NUSCENES_FILE, read_nuscenes_results, result_table
 from optipmb_client.table_files import SUFFIXES, is_table
 
 __all__ = ["read_full_tracks", "read_tracks"]
@@ -19,12 +21,16 @@ def read_tracks(results: Path, sequence: DataSequence) -> ResultTable:
     """Return the tracks of a sequence in the sensor frame of each frame, where KITTI's result files have them.
 
     Args:
-        results: a table of tracks of one or more sequences, or a folder with `NAME.txt` (KITTI) or a table `NAME.*`.
+        results: a table of tracks of one or more sequences, or a folder with `NAME.txt` (KITTI) or a table `NAME.*`;
+            for nuScenes also a result file of its benchmark, or its folder.
         sequence: what was tracked.
 
     Raises:
         DatasetError: there is no such file, or it is wrong, or has frames that the sequence lacks.
     """
+    if isinstance(sequence, NuScenesSequence) and (results.suffix == ".json" or (results / NUSCENES_FILE).is_file()):
+        scene = result_table(read_nuscenes_results(results), sequence.name, sequence.samples)
+        return scene.to_sensor(sequence.poses)
     path = _file(results, sequence.name)
     if is_table(path):
         return _from_table(path, sequence).to_sensor(sequence.poses)
