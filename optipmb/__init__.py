@@ -24,6 +24,7 @@ from optipmb.columns import columns_of, density_of
 from optipmb.density import Bernoullis, Density, Poissons
 from optipmb.errors import DensityError, EffortError, FrameError, OptipmbError, ParameterError
 from optipmb.extract import Tracks
+from optipmb.field_of_view import FieldOfView
 from optipmb.frame import Frame, PointCloud, Pose, make_frame
 from optipmb.generic import generic_parameters
 from optipmb.geometry import bev_iou
@@ -54,6 +55,7 @@ __all__ = [
     "DensityError",
     "Diagnostics",
     "EffortError",
+    "FieldOfView",
     "Frame",
     "FrameError",
     "HeadingSign",

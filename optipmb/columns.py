@@ -11,7 +11,7 @@ import numpy as np
 from numba.core.errors import NumbaError
 
 from optipmb.compiled import kernel
-from optipmb.density import NO_FRAME, STATE, Bernoullis, Density, Poissons
+from optipmb.density import NO_FRAME, STATE, Bernoullis, Density, Misses, Poissons
 from optipmb.errors import DensityError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_Rows = TypeVar("_Rows", Bernoullis, Poissons)
+_Rows = TypeVar("_Rows", Bernoullis, Misses, Poissons)
 
 
 def fitting(density: Density, classes: int) -> bool:
@@ -27,7 +27,7 @@ def fitting(density: Density, classes: int) -> bool:
 
     What `density_of` and the tracker make does; somebody else's arrays may not.
     """
-    b, p = density.bernoulli, density.poisson
+    b, p, misses = density.bernoulli, density.poisson, density.misses
     try:
         return bool(
             rows_fit(b.mean, b.covariance, b.label, b.auxiliary, classes)
@@ -40,6 +40,7 @@ def fitting(density: Density, classes: int) -> bool:
             == b.confirmed.shape
             == b.label.shape
             and p.weight.shape == p.born_ns.shape == p.label.shape
+            and (misses is None or misses.missed_from_ns.shape == misses.looked_ns.shape == b.label.shape)
         )
     except (AttributeError, TypeError, NumbaError):
         return False
@@ -77,7 +78,10 @@ def check_fitting(density: Density, labels: tuple[str, ...]) -> None:
 
 def columns_of(density: Density) -> dict[str, NDArray[Any]]:
     """Return the arrays of a density by name, always in the same order."""
+    parts: tuple[tuple[str, Bernoullis | Misses | Poissons], ...]
     parts = (("bernoulli", density.bernoulli), ("poisson", density.poisson))
+    if density.misses is not None:
+        parts = (*parts, ("misses", density.misses))
     return {f"{part}.{name}": column for part, rows in parts for name, column in rows.columns()}
 
 
@@ -125,7 +129,17 @@ def density_of(
         raise DensityError(f"bernoulli.id[{row}]", f"an id above the one before it, {ids[row - 1]}", str(ids[row]))
     if not 0 <= int(ids.max(initial=0)) < next_id < 2**63:
         raise DensityError("next_id", f"an id above {ids.max(initial=0)}", str(next_id))
-    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels))
+    misses = _rows("misses", Misses, columns, earlier=False) if "misses.looked_ns" in columns else None
+    if misses is not None:
+        for name, since in (("missed_from_ns", misses.missed_from_ns), ("looked_ns", misses.looked_ns)):
+            if since.shape != bernoulli.seen_ns.shape:
+                raise DensityError(f"misses.{name}", f"{len(bernoulli)} rows", _shown(since))
+            wrong = (since < bernoulli.seen_ns) | (since > stamp_ns)
+            if wrong.any():
+                row = int(wrong.argmax())
+                text = f"a stamp from seen_ns, {bernoulli.seen_ns[row]}, to {stamp_ns}"
+                raise DensityError(f"misses.{name}[{row}]", text, str(since[row]))
+    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses)
 
 
 def _rows(part: str, kind: type[_Rows], columns: Mapping[str, Any], *, earlier: bool) -> _Rows:

@@ -110,6 +110,27 @@ class Bernoullis(_Rows):
 
 
 @record
+class Misses(_Rows):
+    """From when the misses of each detected object count, where sensors have fields of view; a row for each.
+
+    Attributes:
+        missed_from_ns: (N,) int64 stamp of the last detection, later by the time in which no sensor looked at it.
+        looked_ns: (N,) int64 stamp of the last frame with the object in view.
+    """
+
+    missed_from_ns: NDArray[np.int64]
+    looked_ns: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.looked_ns)
+
+    @classmethod
+    def empty(cls) -> Misses:
+        """Those of no objects."""
+        return cls(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+@record
 class Poissons(_Rows):
     """The Gaussian components of the Poisson intensity of undetected objects (eq. PPP Posterior).
 
@@ -119,7 +140,7 @@ class Poissons(_Rows):
         weight: (N,) mu^u, expected number of objects.
         label: (N,) int64 class.
         auxiliary: (N, 4) box of the detection that made the component.
-        born_ns: (N,) int64 stamp of that detection.
+        born_ns: (N,) int64 stamp of that detection, later by the time in which no sensor looked at the component.
     """
 
     mean: NDArray[np.float64]
@@ -161,6 +182,7 @@ class Density:
         bernoulli: detected potential objects.
         poisson: undetected potential objects.
         labels: names of the classes that the labels point into, those of the parameters.
+        misses: of the detected objects; None while no frame has had a field of view: every frame looks at all of them.
     """
 
     stamp_ns: int
@@ -168,6 +190,12 @@ class Density:
     bernoulli: Bernoullis
     poisson: Poissons
     labels: tuple[str, ...]
+    misses: Misses | None = None
+
+    @property
+    def missed_from_ns(self) -> NDArray[np.int64]:
+        """Stamps (N,) from which the misses of the objects count; x_cnt is their distance to now."""
+        return self.bernoulli.seen_ns if self.misses is None else self.misses.missed_from_ns
 
     @classmethod
     def empty(cls, labels: tuple[str, ...], next_id: int = 1) -> Density:

@@ -54,15 +54,23 @@ def detection_probability(
     return scaled
 
 
-def over_time(p_d: Array, share: float) -> Array:
+def over_time(p_d: Array, share: float | Array) -> Array:
     """Return the probability of a detection within a share of the nominal period, ``1 - (1 - p_d)^share``.
 
     A detector that looks twice as often does not see twice as much: what hides an object hides it in the next look as
     well. So p_d holds per nominal period, and a miss weighs by the time that it lasts. Looks farther apart than a
     period are independent: the share is at most one. It is at least `LEAST_SHARE`, so that frames of equal stamps can
     be associated.
+
+    Args:
+        p_d: (N,) probabilities.
+        share: of the nominal period, one for all or (N,).
     """
-    if share >= 1.0:
-        return p_d
-    kept: Array = 1.0 - (1.0 - p_d) ** max(share, LEAST_SHARE)
+    kept: Array
+    if isinstance(share, np.ndarray):
+        kept = np.where(share >= 1.0, p_d, 1.0 - (1.0 - p_d) ** np.maximum(share, LEAST_SHARE))
+    elif share >= 1.0:
+        kept = p_d
+    else:
+        kept = 1.0 - (1.0 - p_d) ** max(share, LEAST_SHARE)
     return kept

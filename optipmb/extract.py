@@ -74,6 +74,7 @@ class Tracks:
 
 def extract(
     bernoulli: Bernoullis,
+    missed_from_ns: Index,
     measurement: Index,
     measurements: Measurements,
     stamp_ns: int,
@@ -88,6 +89,7 @@ def extract(
 
     Args:
         bernoulli: the posterior, not yet given away.
+        missed_from_ns: (N,) stamps from which misses count.
         measurement: (N,) measurement of each object, negative where missed.
         measurements: Z_k.
         stamp_ns: stamp of the frame.
@@ -97,7 +99,7 @@ def extract(
     rows = np.empty(len(bernoulli), INDEX)
     count = select_tracks(
         bernoulli.existence,
-        bernoulli.seen_ns,
+        missed_from_ns,
         bernoulli.label,
         stamp_ns,
         table.period,
@@ -207,7 +209,7 @@ def confirm(
 @kernel
 def select_tracks(
     existence: Array,
-    seen_ns: Index,
+    missed_from_ns: Index,
     label: Index,
     stamp_ns: int,
     period: float,
@@ -223,7 +225,8 @@ def select_tracks(
     for n in range(existence.shape[0]):
         c = label[n]
         if extracted[n] and two_thresholds:
-            now = existence[n] >= extract_known[c] and whole_periods(seen_ns[n], stamp_ns, period) < extract_misses[c]
+            misses = whole_periods(missed_from_ns[n], stamp_ns, period)
+            now = existence[n] >= extract_known[c] and misses < extract_misses[c]
         else:
             now = existence[n] >= extract_new[c]
         if now:

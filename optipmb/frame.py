@@ -8,7 +8,7 @@ coordinates to the world.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.errors import FrameError
+from optipmb.field_of_view import FieldOfView, check_view
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -128,6 +129,7 @@ class Frame:
         source: (M,) int64, index of the object in the arrays that the caller gave.
         labels: names of the classes that `label` points into, those of the parameters.
         cloud: the scan of the same stamp, or None.
+        field_of_view: of the sensor, with its pose; None: it sees everything.
 
     The arrays are copied and cannot be written to, so that what was checked stays as it was.
 
@@ -145,6 +147,7 @@ class Frame:
     source: NDArray[np.int64]
     labels: tuple[str, ...]
     cloud: PointCloud | None = None
+    field_of_view: FieldOfView | None = None
 
     def __post_init__(self) -> None:
         count = np.shape(self.score)[0] if np.ndim(self.score) == 1 else 0
@@ -158,6 +161,7 @@ class Frame:
             object.__setattr__(self, name, _sealed(index))
         if not 0 <= self.stamp_ns < 2**63:
             raise FrameError("stamp_ns", "whole nanoseconds in [0, 2^63)", repr(self.stamp_ns))
+        check_view(self.field_of_view)
         given = self.label, len(self.labels), self.center, self.size, self.yaw, self.score, self.velocity
         if not allowed(*given):
             _refuse(*given)
@@ -185,6 +189,7 @@ def make_frame(
     velocity: ArrayLike | None = None,
     pose: Pose | None = None,
     cloud: PointCloud | None = None,
+    field_of_view: FieldOfView | None = None,
 ) -> tuple[Frame, int]:
     """Check the detections of one stamp and bring them to the world frame and to the classes of the parameters.
 
@@ -201,6 +206,8 @@ def make_frame(
         pose: world from sensor, or None when the arrays are in the world frame already. The identity is the same as
             None, to the last bit: a heading does not go through sine and cosine.
         cloud: the scan of the same stamp.
+        field_of_view: where the sensor detects objects, in the frame of its own `pose`, else of `pose`. Outside it
+            objects are neither detected nor missed. None: it sees everything.
 
     Returns:
         The frame, and how many objects were left out: their class is not in the parameters, or their score is 0.
@@ -210,6 +217,7 @@ def make_frame(
     """
     if not isinstance(stamp_ns, (int, np.integer)) or not 0 <= stamp_ns < 2**63:
         raise FrameError("stamp_ns", "whole nanoseconds in [0, 2^63)", repr(stamp_ns))
+    check_view(field_of_view)
     which = _integers("label", label)
     m = which.shape[0]
     center, size = _shaped("center", center, (m, 3)), _shaped("size", size, (m, 3))
@@ -236,14 +244,21 @@ def make_frame(
         center, size, yaw, velocity = center[source], size[source], yaw[source], velocity[source]
         score, known = score[source], known[source]
     columns = center, size, yaw, velocity, score, known, source
+    view = field_of_view
+    if view is not None and view.pose is None and pose is not None:
+        view = replace(view, pose=pose)
     if pose is not None and not allowed(known, len(parameters.labels), center, size, yaw, score, velocity):
         # What is too far only in the world: the constructor names it.
-        return Frame(int(stamp_ns), *columns, parameters.labels, cloud), m - source.shape[0]
-    return _checked(int(stamp_ns), columns, parameters.labels, cloud), m - source.shape[0]
+        return Frame(int(stamp_ns), *columns, parameters.labels, cloud, view), m - source.shape[0]
+    return _checked(int(stamp_ns), columns, parameters.labels, cloud, view), m - source.shape[0]
 
 
 def _checked(
-    stamp_ns: int, columns: tuple[NDArray[Any], ...], labels: tuple[str, ...], cloud: PointCloud | None
+    stamp_ns: int,
+    columns: tuple[NDArray[Any], ...],
+    labels: tuple[str, ...],
+    cloud: PointCloud | None,
+    view: FieldOfView | None,
 ) -> Frame:
     """Return the frame of arrays that nobody else has and that were checked, from `center` to `source`."""
     frame = object.__new__(Frame)
@@ -252,7 +267,7 @@ def _checked(
     for name, column in zip(_ARRAYS, columns, strict=True):
         values[name] = _sealed(np.ascontiguousarray(column))
     values["labels"] = labels
-    values["cloud"] = cloud
+    values["cloud"], values["field_of_view"] = cloud, view
     return frame
 
 

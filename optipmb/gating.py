@@ -79,7 +79,7 @@ def gate(
         mean: (N, 6) predicted means.
         covariance: (N, 6, 6) predicted covariances.
         label: (N,) classes.
-        radius: (N,) gating distances, m.
+        radius: (N,) gating distances, m; nothing lies in a negative one.
         position: (M, 2) z_xy.
         measured_label: (M,) z_c.
         noise_position: (C,) standard deviation of z_x and z_y; R_xy = sigma^2 I.
@@ -163,6 +163,8 @@ def pairs_of_many(
     count = 0
     for n in range(mean.shape[0]):
         eta = radius[n]
+        if eta < 0.0:
+            continue
         begin = count
         first_x, last_x, first_y, last_y = block(mean[n, 0], mean[n, 1], eta, 2.0 * widest[label[n]])
         for i in range(first_x, last_x + 1):

@@ -154,6 +154,8 @@ def local_hypotheses(
     """Enumerate the local hypotheses: return the columns of `Hypotheses` over pairs, write those over measurements."""
     radius = gate_radii(covariance, label, dt, period, distance, growth, deviations)
     radius_poisson = gate_radii(covariance_poisson, label_poisson, dt, period, distance, growth, deviations)
+    close_gates(p_d, radius)
+    close_gates(p_d_poisson, radius_poisson)
     row, measurement, log_likelihood = gate(mean, covariance, label, radius, position, measured_label, noise_position)
     detection_cost = detection_costs(row, measurement, log_likelihood, existence, p_d, association)
     component, announced, log_e = gate(
@@ -177,6 +179,19 @@ def local_hypotheses(
         first_existence,
     )
     return row, measurement, detection_cost, component, announced, log_e
+
+
+@kernel
+def close_gates(p_d: Array, radius: Array) -> None:
+    """Write a negative radius, in which nothing lies, for what cannot be detected: no cost is that of p_d = 0.
+
+    Args:
+        p_d: (N,) detection probabilities.
+        radius: (N,) gating distances, m; some are replaced.
+    """
+    for n in range(p_d.shape[0]):
+        if p_d[n] == 0.0:
+            radius[n] = -1.0
 
 
 @kernel

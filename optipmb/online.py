@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from optipmb.density import Density
     from optipmb.extract import Tracks
+    from optipmb.field_of_view import FieldOfView
     from optipmb.frame import PointCloud, Pose
     from optipmb.tracker import Modules
 
@@ -156,6 +157,7 @@ class OnlineTracker:
         stamp_ns: int | None = None,
         pose: Pose | None = None,
         cloud: PointCloud | None = None,
+        field_of_view: FieldOfView | None = None,
         **arrays: ArrayLike,
     ) -> OnlineTracks:
         """Take the detections of the next frame and return the tracks.
@@ -169,6 +171,7 @@ class OnlineTracker:
             stamp_ns: nanoseconds.
             pose: world from sensor, or None when the boxes are in the world frame.
             cloud: the scan of the same stamp.
+            field_of_view: where the sensor detects objects; outside it they are neither detected nor missed.
             arrays: the same columns as arguments.
 
         Raises:
@@ -190,6 +193,7 @@ class OnlineTracker:
             label=label,
             pose=pose,
             cloud=cloud,
+            field_of_view=field_of_view,
             **columns,
         )
         result = self._tracker.step(self.density, frame)

@@ -42,19 +42,28 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     Returns:
         The predicted density and how many covariances had to be repaired.
     """
-    bernoulli, poisson = density.bernoulli, density.poisson
+    bernoulli, poisson, misses = density.bernoulli, density.poisson, density.misses
     dt = 0.0 if density.stamp_ns == NO_FRAME else (stamp_ns - density.stamp_ns) * 1e-9
     if dt == 0.0:
-        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels), 0
+        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, density.misses), 0
     survival = table.survival ** (dt / table.period)
 
     before_ns = density.stamp_ns
     seen_from_ns = before_ns if dt <= LONGEST_STEP_S else stamp_ns
     kept, mean, covariance, existence, repaired_mb = _carry(
-        bernoulli, bernoulli.existence, bernoulli.seen_ns, table.max_misses, survival, dt, seen_from_ns, stamp_ns, table
+        bernoulli,
+        bernoulli.existence,
+        density.missed_from_ns,
+        table.max_misses,
+        survival,
+        dt,
+        seen_from_ns,
+        stamp_ns,
+        table,
     )
     if kept.shape[0] < len(bernoulli):
         bernoulli = bernoulli.take(kept)
+        misses = None if misses is None else misses.take(kept)
     bernoulli = Bernoullis(
         mean,
         covariance,
@@ -71,14 +80,14 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
         bernoulli.confirmed,
     )
     if not len(poisson):
-        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels), repaired_mb
+        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses), repaired_mb
     kept, mean, covariance, weight, repaired_ppp = _carry(
         poisson, poisson.weight, poisson.born_ns, table.poisson_steps, survival, dt, before_ns, stamp_ns, table
     )
     if kept.shape[0] < len(poisson):
         poisson = poisson.take(kept)
     poisson = Poissons(mean, covariance, weight, poisson.label, poisson.auxiliary, poisson.born_ns)
-    return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels), repaired_mb + repaired_ppp
+    return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses), repaired_mb + repaired_ppp
 
 
 def _carry(

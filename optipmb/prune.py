@@ -60,6 +60,7 @@ def surviving_objects(
     assigned: Index,
     hypotheses: Hypotheses,
     measurements: Measurements,
+    missed_from_ns: Index,
     stamp_ns: int,
     table: ClassTable,
 ) -> Survivors:
@@ -73,6 +74,7 @@ def surviving_objects(
         assigned: (N,) the measurement of each, `UNASSIGNED` for the missed ones.
         hypotheses: of this frame.
         measurements: Z_k.
+        missed_from_ns: (N,) stamps from which misses count.
         stamp_ns: stamp of the frame.
         table: parameters as columns.
     """
@@ -80,7 +82,7 @@ def surviving_objects(
     row, measurement, existence = np.empty(capacity, INDEX), np.empty(capacity, INDEX), np.empty(capacity)
     count, known, detected = select_objects(
         bernoulli.existence,
-        bernoulli.seen_ns,
+        missed_from_ns,
         bernoulli.label,
         p_d,
         assigned,
@@ -101,7 +103,7 @@ def surviving_objects(
 @kernel
 def select_objects(
     existence: Array,
-    seen_ns: Index,
+    missed_from_ns: Index,
     label: Index,
     p_d: Array,
     assigned: Index,
@@ -134,7 +136,8 @@ def select_objects(
             detected += 1
         else:
             r = r * (1.0 - p_d[n]) / (1.0 - r + r * (1.0 - p_d[n]))
-            if not r >= min_existence[label[n]] or whole_periods(seen_ns[n], stamp_ns, period) > max_misses[label[n]]:
+            misses = whole_periods(missed_from_ns[n], stamp_ns, period)
+            if not r >= min_existence[label[n]] or misses > max_misses[label[n]]:
                 continue
         row[count], measurement[count], existence_out[count] = n, m, r
         count += 1

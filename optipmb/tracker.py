@@ -16,6 +16,7 @@ from optipmb.detection_probability import detection_probability, over_time
 from optipmb.effort import UNLIMITED, check_effort
 from optipmb.errors import FrameError
 from optipmb.extract import extract
+from optipmb.field_of_view import detection_probability_in_view, follow_looks, look
 from optipmb.hypotheses import enumerate_hypotheses
 from optipmb.lightweight import light_weight_filter
 from optipmb.predict import predict
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
     from optipmb.density import Bernoullis
     from optipmb.extract import Tracks
+    from optipmb.field_of_view import Looks
     from optipmb.frame import Frame, PointCloud
     from optipmb.hypotheses import Hypotheses
     from optipmb.parameters import Parameters
@@ -189,14 +191,16 @@ class Tracker:
             poisson = with_measurement_births(poisson, measurements, now, table)
         times.append(clock())
         cloud = frame.cloud if modules.adp else None
-        p_d, p_d_poisson = self._detection_probabilities(bernoulli, poisson, cloud, dt)
+        looks, poisson = look(frame.field_of_view, predicted, poisson, density.stamp_ns, table)
+        p_d, p_d_poisson = self._detection_probabilities(bernoulli, poisson, cloud, looks, dt)
         times.append(clock())
         hypotheses = enumerate_hypotheses(bernoulli, p_d, poisson, p_d_poisson, measurements, dt, table)
         times.append(clock())
 
         # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
+        missed_from_ns = predicted.missed_from_ns if looks is None else looks.misses.missed_from_ns
         assigned = associate(hypotheses, len(bernoulli))
-        survivors = surviving_objects(bernoulli, p_d, assigned, hypotheses, measurements, now, table)
+        survivors = surviving_objects(bernoulli, p_d, assigned, hypotheses, measurements, missed_from_ns, now, table)
         times.append(clock())
 
         # Detected, missed and new objects: motion states, then the light-weight filter
@@ -217,11 +221,15 @@ class Tracker:
         times.append(clock())
 
         # Track extraction
-        tracks = extract(objects, survivors.measurement, measurements, now, table, two_thresholds=modules.ote)
+        misses = None
+        if looks is not None:
+            misses = follow_looks(looks, survivors, bernoulli, objects, measurements, now, table)
+        born = len(survivors) - survivors.known
+        posterior = Density(now, predicted.next_id + born, objects, undetected, density.labels, misses)
+        since_ns = posterior.missed_from_ns
+        tracks = extract(objects, since_ns, survivors.measurement, measurements, now, table, two_thresholds=modules.ote)
         times.append(clock())
 
-        born = len(survivors) - survivors.known
-        posterior = Density(now, predicted.next_id + born, objects, undetected, density.labels)
         diagnostics = Diagnostics(
             cloud is not None,
             frame.score.shape[0],
@@ -243,11 +251,11 @@ class Tracker:
         check_fitting(density, labels)
 
     def _detection_probabilities(
-        self, bernoulli: Bernoullis, poisson: Poissons, cloud: PointCloud | None, dt: float
+        self, bernoulli: Bernoullis, poisson: Poissons, cloud: PointCloud | None, looks: Looks | None, dt: float
     ) -> tuple[Array, Array]:
         """Compute p_d(x_+) of objects and of Poisson components, in one pass over the cloud if there is one."""
         share = dt / self._table.period if self._table.detection_over_time else 1.0
-        if cloud is None:
+        if cloud is None and looks is None:
             p_d0 = over_time(self._table.detection, share)
             return p_d0[bernoulli.label], p_d0[poisson.label]
         p_d = detection_probability(
@@ -257,7 +265,7 @@ class Tracker:
             cloud,
             self._table,
         )
-        p_d = over_time(p_d, share)
+        p_d = over_time(p_d, share) if looks is None else detection_probability_in_view(p_d, looks, share, self._table)
         return p_d[: len(bernoulli)], p_d[len(bernoulli) :]
 
     def _update_states(

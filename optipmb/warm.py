@@ -10,6 +10,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from optipmb.errors import EffortError
+from optipmb.field_of_view import FieldOfView
 from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
 from optipmb.parameters import load_profile, parse_parameters
@@ -77,6 +78,7 @@ def _run() -> None:
             score=[score] * 3,
             velocity=[[1.0, 0.0], [0.0, 0.0], [np.nan, np.nan]],
             cloud=cloud,
+            field_of_view=FieldOfView() if k else None,
         )
         result = tracker.step(posterior, given)
         posterior = result.density

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Tracks, decode_dump
+from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Pose, Tracks, decode_dump
 
 import optipmb
 from optipmb_client.errors import UsageError
@@ -105,6 +105,9 @@ def _step(
         score=message.score,
         velocity=message.velocity,
         pose=None if message.frame == "world" else _pose(message),
+        field_of_view=optipmb.FieldOfView.of(
+            message.field_of_view, None if message.pose is None else _place(message.pose)
+        ),
         cloud=None if given.points is None else optipmb.PointCloud(given.points.xyz, _pose(given.points)),
     )
     found = steps.step(density, frame)
@@ -127,4 +130,8 @@ def _pose(message: Detections | Points) -> optipmb.Pose:
     """Return the pose of the sensor; arrays in the world frame have the identity."""
     if message.frame == "world" or message.pose is None:
         return optipmb.Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))  # type: ignore[arg-type]  # it makes arrays of them
-    return optipmb.Pose(message.pose.translation, message.pose.quaternion)
+    return _place(message.pose)
+
+
+def _place(pose: Pose) -> optipmb.Pose:
+    return optipmb.Pose(pose.translation, pose.quaternion)

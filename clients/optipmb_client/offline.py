@@ -14,6 +14,7 @@ from statistics import median
 from typing import Any, Final
 
 from optipmb import (
+    FieldOfView,
     Modules,
     OptipmbError,
     Parameters,
@@ -326,6 +327,7 @@ def _steps(
                 velocity=given.velocity,
                 pose=Pose(given.pose.translation, given.pose.quaternion),
                 cloud=None if cloud is None else PointCloud(cloud.xyz, Pose(cloud.translation, cloud.quaternion)),
+                field_of_view=FieldOfView.of(given.field_of_view, None),
             )
         except OptipmbError as error:
             raise UsageError(f"sequence {sequence.name}, frame {given.index}: {error}") from error

@@ -19,7 +19,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from optipmb_schemas import PREFIX, Detections, Keys, MessageError, Points, Pose
+from optipmb_schemas import PREFIX, Detections, FieldOfView, Keys, MessageError, Points, Pose
 
 from optipmb_client.links import Link, linked
 
@@ -117,6 +117,7 @@ class Publisher:
         points: ArrayLike | None = None,
         points_pose: PoseLike | None = None,
         has_points: bool | None = None,
+        field_of_view: FieldOfView | None = None,
     ) -> int:
         """Publish the detections of one sensor frame, and its point cloud where there is one.
 
@@ -137,6 +138,8 @@ class Publisher:
             has_points: Whether the service shall wait for a cloud of this stamp. Default: True when `points` are sent,
                 False when this publisher has sent clouds before, otherwise the service judges. True with `points` sends
                 them in any case.
+            field_of_view: Where the sensor detects objects, in the axes of `pose`; objects outside are neither detected
+                nor missed. None: it sees everything.
 
         Returns:
             The sequence number of the frame.
@@ -167,6 +170,7 @@ class Publisher:
                 velocity=None if velocity is None else _array(velocity, 2),
                 score=_array(score),
                 has_points=has_points,
+                field_of_view=field_of_view,
             )
             payload = self._detections.pack(message)
             if cloud is not None:

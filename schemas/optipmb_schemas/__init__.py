@@ -21,7 +21,7 @@ from optipmb_schemas.dump import STORED, Dump, DumpedFrame, decode_dump, encode_
 from optipmb_schemas.errors import CODES, Code, MessageError
 from optipmb_schemas.keys import PREFIX, Keys, Query, Topic
 from optipmb_schemas.limits import DEFAULT, Limits
-from optipmb_schemas.messages import Delivery, Density, Detections, Points, Pose, Tracks
+from optipmb_schemas.messages import Delivery, Density, Detections, FieldOfView, Points, Pose, Tracks
 from optipmb_schemas.model import Message
 
 __all__ = [
@@ -37,6 +37,7 @@ __all__ = [
     "Detections",
     "Dump",
     "DumpedFrame",
+    "FieldOfView",
     "Keys",
     "Limits",
     "Message",

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from math import prod
 from struct import unpack
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import msgpack
 import numpy as np
@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from optipmb_schemas.arrays import unit_quaternion
 from optipmb_schemas.fields import check_labels, check_stream
 from optipmb_schemas.limits import Limits
-from optipmb_schemas.messages import INT64, Detections, Pose
+from optipmb_schemas.messages import INT64, Detections, FieldOfView, Pose
+from optipmb_schemas.model import Message
 
 MOST: Final = 2**16
 """Bytes of a payload that is read in this way; of a longer one the walk is a small part."""
@@ -45,8 +46,12 @@ _LOWEST: Final = np.array([np.nextafter(one.low, np.inf) if one.above else one.l
 _HIGHEST: Final = np.array([one.high for one in _RANGES], np.float64)
 _FRAMES: Final = frozenset({"world", "sensor"})
 _VELOCITY: Final = len(_COLUMNS) - 1
-_POSE: Final = tuple((name, int(one.shape[0]), one.low, one.high) for name, one in Pose.arrays.items())
+_NUMBERS: Final[dict[type[Message], tuple[tuple[str, int, float, float], ...]]] = {
+    kind: tuple((name, int(one.shape[0]), one.low, one.high) for name, one in kind.arrays.items())
+    for kind in (Pose, FieldOfView)
+}
 
+T = TypeVar("T", Pose, FieldOfView)
 _msgpack: Any = msgpack  # its type information is partial
 
 
@@ -65,7 +70,9 @@ def read_detections(payload: bytes, limits: Limits) -> Detections | None:
         )
         fields = _once(pairs)
         if fields.get("pose") is not None:
-            fields["pose"] = _pose(fields["pose"])
+            fields["pose"] = _part(fields["pose"], Pose)
+        if fields.get("field_of_view") is not None:
+            fields["field_of_view"] = _part(fields["field_of_view"], FieldOfView)
         return checked(fields, dict(fields["label"])["shape"][0], _data, limits)
     except (ValueError, TypeError, LookupError):
         return None
@@ -77,7 +84,7 @@ def checked(
     """Return the message of its fields, whose columns are still in the form in which they came.
 
     Args:
-        fields: the values by name, the pose as a model.
+        fields: the values by name, pose and field of view as models.
         count: number of detections.
         data: returns the bytes of a column that has a number type and a shape; ValueError if it has others.
         limits: what is accepted at most.
@@ -103,19 +110,22 @@ def checked(
     return Detections.trusted(**fields)
 
 
-def checked_pose(data: Callable[[str, int], bytes]) -> Pose:
-    """Return the pose whose numbers `data` returns, given the name and the length of each of its arrays.
+def checked_part(kind: type[T], data: Callable[[str, int], bytes]) -> T:
+    """Return the message inside whose numbers `data` returns, given the name and the length of each of its arrays.
 
     Raises:
         ValueError, TypeError, LookupError: it is for the models.
     """
     arrays = {}
-    for name, length, low, high in _POSE:
+    for name, length, low, high in _NUMBERS[kind]:
         numbers = data(name, length)
         _need(all(low <= value <= high for value in unpack(f"<{length}d", numbers)))
         arrays[name] = np.frombuffer(numbers, np.float64)
-    unit_quaternion(arrays["quaternion"])
-    return Pose.trusted(**arrays)
+    if kind is Pose:
+        unit_quaternion(arrays["quaternion"])
+    part = kind.trusted(**arrays)
+    part.check()
+    return part
 
 
 def _read_columns(fields: dict[str, Any], count: int, data: Callable[[Any, str, list[int]], bytes]) -> None:
@@ -147,10 +157,10 @@ def _bounds(count: int) -> tuple[NDArray[np.intp], list[int]]:
     return np.concatenate([[0], ends[:-1]]).astype(np.intp), ends.tolist()
 
 
-def _pose(pairs: Any) -> Pose:
+def _part(pairs: Any, kind: type[T]) -> T:
     blocks = _once(pairs)
-    _need(len(blocks) == len(_POSE))
-    return checked_pose(lambda name, length: _data(blocks[name], "f8", [length]))
+    _need(len(blocks) == len(_NUMBERS[kind]))
+    return checked_part(kind, lambda name, length: _data(blocks[name], "f8", [length]))
 
 
 def _data(pairs: Any, dtype: str, shape: list[int]) -> bytes:

@@ -5,6 +5,7 @@ is its geometric centre; its size is length, width, height. Stamps are nanosecon
 described here and nowhere else: the JSON Schemas and the tables of the documentation are made from these descriptions.
 """
 
+import math
 from typing import Annotated, Literal
 
 import numpy as np
@@ -19,6 +20,12 @@ from optipmb_schemas.model import Message
 FAR = 1e8
 """Largest coordinate in metres: beyond every map projection, small enough that no square overflows."""
 INT64 = 2**63 - 1
+FULL = 2.0 * math.pi
+TURN = FULL + 1e-6
+QUARTER = 0.25 * FULL + 1e-6
+"""Limits of angles; float32 rounds them up."""
+NARROWEST = 1e-3
+"""Least width of a field of view, rad."""
 
 
 class Pose(Message):
@@ -32,6 +39,31 @@ class Pose(Message):
             description="Rotation from the sensor frame to the world frame: w, x, y, z; its norm within 0.001 of one."
         )
     )
+
+
+class FieldOfView(Message):
+    """Where the sensor detects objects, in its own axes (x forward, y left, z up); each field is an interval."""
+
+    azimuth: Annotated[NDArray[np.float64], Array("f8", (2,), -TURN, TURN)] = Field(
+        description="The sector counter-clockwise from the first angle to the second, radians from x; [-pi, pi] is the "
+        "full circle, [2.5, -2.5] looks backwards."
+    )
+    elevation: Annotated[NDArray[np.float64], Array("f8", (2,), -QUARTER, QUARTER)] = Field(
+        description="Radians above the xy plane; [-pi/2, pi/2]: no limit."
+    )
+    range: Annotated[NDArray[np.float64], Array("f8", (2,), 0, 1e9)] = Field(
+        description="Distance from the sensor in metres."
+    )
+
+    def check(self) -> None:
+        """No interval is empty, and none is wider than a turn."""
+        begin, end = self.azimuth.tolist()
+        if not NARROWEST <= (end - begin if end >= begin else end - begin + FULL) <= FULL + NARROWEST:
+            raise invalid("azimuth", f"a sector of {NARROWEST:g} rad to a full turn", self.azimuth.tolist())
+        for name, least in (("elevation", NARROWEST), ("range", 0.0)):
+            begin, end = getattr(self, name).tolist()
+            if not (end - begin >= least and end > begin):
+                raise invalid(name, "an end above the beginning", [begin, end])
 
 
 class Header(Message):
@@ -94,6 +126,11 @@ class Detections(SensorMessage):
         default=None,
         description="True: a `Points` message of the same stamp was or will be published. False: none comes. "
         "Absent: the service judges from what the stream has sent so far.",
+    )
+    field_of_view: FieldOfView | None = Field(
+        default=None,
+        description="Where the sensor detects objects, in the axes of `pose` (without a pose those of the world). "
+        "Objects outside are neither detected nor missed. Absent: the sensor sees everything.",
     )
 
     def check(self) -> None:

@@ -15,12 +15,12 @@ from optipmb_schemas.codec import MESSAGES
 from optipmb_schemas.control import SessionSummary
 from optipmb_schemas.errors import CODES
 from optipmb_schemas.limits import DEFAULT
-from optipmb_schemas.messages import Delivery, Pose
+from optipmb_schemas.messages import Delivery, FieldOfView, Pose
 from optipmb_schemas.model import Message
 
 _TABLE: Final = re.compile(r"(<!-- table: ([A-Za-z]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
-_KINDS: Final[tuple[type[Message], ...]] = (*MESSAGES, Pose, Delivery, SessionSummary)
+_KINDS: Final[tuple[type[Message], ...]] = (*MESSAGES, Pose, FieldOfView, Delivery, SessionSummary)
 _KIND: Final = {kind.__name__: kind for kind in _KINDS}
 
 

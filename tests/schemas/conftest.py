@@ -8,6 +8,7 @@ from optipmb_schemas import (
     Delivery,
     Density,
     Detections,
+    FieldOfView,
     Message,
     MoveRequest,
     Points,
@@ -23,6 +24,7 @@ from optipmb_schemas import (
 
 EPOCH = bytes(range(16))
 POSE = Pose(translation=np.array([10.0, 20.0, 1.5]), quaternion=np.array([0.6, 0.0, 0.0, 0.8]))
+VIEW = FieldOfView(azimuth=np.array([2.5, -2.5]), elevation=np.array([-0.4, 0.2]), range=np.array([0.5, 80]))
 HEADER = {"stream": "site-1/node.2/lidar_3", "epoch": EPOCH, "seq": 7, "stamp_ns": 1_700_000_000_123_456_789}
 
 
@@ -39,6 +41,7 @@ def _examples() -> list[Message]:
         score=np.array([1.0, 0.3, 1e-9]),
         velocity=np.array([[1.0, -0.0], [np.nan, np.nan], [0.0, 5.5]]),
         has_points=True,
+        field_of_view=VIEW,
     )
     points = Points(**HEADER, frame="sensor", pose=POSE, xyz=np.arange(30, dtype="f4").reshape(10, 3))
     tracks = Tracks(
@@ -148,7 +151,7 @@ def example_of(examples: dict[str, Message]) -> Callable[[type[Message]], Messag
     assert isinstance(tracks, Tracks)
     assert isinstance(status, ServiceStatus)
     assert tracks.delivery is not None
-    held = {"Pose": POSE, "Delivery": tracks.delivery, "SessionSummary": status.sessions[0]}
+    held = {"Pose": POSE, "FieldOfView": VIEW, "Delivery": tracks.delivery, "SessionSummary": status.sessions[0]}
     return lambda kind: {**examples, **held}[kind.__name__]
 
 

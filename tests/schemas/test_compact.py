@@ -151,6 +151,7 @@ def written_with(example: Message, data: st.DataObject) -> bytes:
     tree = msgpack.unpackb(encode(example))
     blocks = [tree[name] for name in ("center", "size", "yaw", "score", "velocity")]
     blocks += [tree["pose"]["translation"], tree["pose"]["quaternion"]]
+    blocks += [tree["field_of_view"][name] for name in ("azimuth", "elevation", "range")]
     for _ in range(data.draw(st.integers(1, 3))):
         block = data.draw(st.sampled_from(blocks))
         numbers = np.frombuffer(block["data"]).copy()

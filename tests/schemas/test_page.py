@@ -65,7 +65,14 @@ def test_a_stale_page_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_every_message_has_its_table() -> None:
     """No message type, and neither the limits nor the codes, are missing on the page."""
     named = set(re.findall(r"<!-- table: (\w+) -->", PAGE))
-    assert named >= {kind.__name__ for kind in MESSAGES} | {"Pose", "Delivery", "SessionSummary", "limits", "codes"}
+    assert named >= {kind.__name__ for kind in MESSAGES} | {
+        "Pose",
+        "FieldOfView",
+        "Delivery",
+        "SessionSummary",
+        "limits",
+        "codes",
+    }
 
 
 def test_the_example_is_what_encode_produces() -> None:

@@ -55,6 +55,21 @@ RULES: list[tuple[str, str, Any, str]] = [
     ("Detections", "pose", {"translation": [0, 0, 0], "quaternion": [1, 0, 0, 0.1]}, "pose.quaternion"),
     ("Detections", "pose", {"translation": [0, 0, 0], "quaternion": [0, 0, 0, 0]}, "pose.quaternion"),
     ("Detections", "pose", {"translation": [0, 0, 0], "quaternion": [1, 0, 0]}, "pose.quaternion"),
+    ("Detections", "field_of_view", [-1, 1], "field_of_view"),
+    ("Detections", "field_of_view", {"azimuth": [-1, 1]}, "field_of_view.elevation"),
+    *(
+        ("Detections", "field_of_view", {"azimuth": [-1, 1], "elevation": [-1, 1], "range": [0, 9]} | wrong, path)
+        for wrong, path in (
+            ({"azimuth": [1, 1]}, "field_of_view.azimuth"),
+            ({"azimuth": [-4, 4]}, "field_of_view.azimuth"),
+            ({"azimuth": [-4, 7]}, "field_of_view.azimuth[1]"),
+            ({"azimuth": [0, 1, 2]}, "field_of_view.azimuth"),
+            ({"elevation": [0.1, 0]}, "field_of_view.elevation"),
+            ({"elevation": [-2, 0]}, "field_of_view.elevation[0]"),
+            ({"range": [5, 5]}, "field_of_view.range"),
+            ({"range": [-1, 5]}, "field_of_view.range[0]"),
+        )
+    ),
     ("Points", "pose", {"translation": [0, "x", 0], "quaternion": [1, 0, 0, 0]}, "pose.translation[1]"),
     # labels
     ("Detections", "labels", "car", "labels"),

@@ -320,6 +320,8 @@ def boxes(  # noqa: PLR0913 - a detection has this many columns
     size: Any = (4.0, 1.8, 1.5),
     label: str = "Car",
     cloud: Any = None,
+    pose: Any = None,
+    field_of_view: Any = None,
 ) -> Frame:
     """A frame of boxes of one class at (x, y) and z = 0; scalars and single rows stand for all of them."""
     import optipmb  # noqa: PLC0415 - scenes can be generated without the tracker
@@ -337,5 +339,7 @@ def boxes(  # noqa: PLR0913 - a detection has this many columns
         score=np.broadcast_to(np.asarray(score, dtype=np.float64), (count,)),
         velocity=None if velocity is None else np.broadcast_to(np.asarray(velocity, dtype=np.float64), (count, 2)),
         cloud=cloud,
+        pose=pose,
+        field_of_view=field_of_view,
     )
     return frame

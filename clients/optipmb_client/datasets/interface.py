@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from optipmb_schemas import FieldOfView
 
 from optipmb_client.geometry import Bools, Floats, Ints, Pose, stack_poses, to_sensor
 from optipmb_client.results import ResultWriter
@@ -66,6 +67,8 @@ class DetectionFrame:
     velocity: Floats | None = None
     """(M, 2) over ground along the axes of the sensor; None where the detector gives none."""
     cloud: Cloud | None = None
+    field_of_view: FieldOfView | None = None
+    """Where the sensor detects objects, in the axes of `pose`; None: everywhere."""
 
     def __len__(self) -> int:
         return len(self.label)

@@ -17,7 +17,7 @@ from optipmb_client.camera import synthetic_camera
 from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFrame, Truth
 from optipmb_client.errors import ClientError
 from optipmb_client.files import DatasetError
-from optipmb_client.geometry import Pose
+from optipmb_client.geometry import Floats, Pose, rotation_of, to_sensor
 from optipmb_client.results import KittiResultWriter, ResultWriter
 
 try:
@@ -54,7 +54,7 @@ class RecordedSequence:
     @cached_property
     def poses(self) -> Sequence[Pose]:
         """World from sensor of each frame; the identity where boxes are in the world frame."""
-        return [_pose(message) for message, _ in self._messages(clouds=False)]
+        return [_placed(message)[0] for message, _ in self._messages(clouds=False)]
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
@@ -65,18 +65,20 @@ class RecordedSequence:
         """Yield every frame in order."""
         for index, (message, cloud) in enumerate(self._messages(clouds=True)):
             row_of = np.array([self.labels.index(name) for name in message.labels], dtype=np.int64)
+            pose, center, yaw, velocity = _placed(message)
             yield DetectionFrame(
                 index=index,
                 stamp_ns=message.stamp_ns,
-                pose=_pose(message),
+                pose=pose,
                 labels=self.labels,
                 label=row_of[message.label],
-                center=message.center,
+                center=center,
                 size=message.size,
-                yaw=message.yaw,
+                yaw=yaw,
                 score=message.score,
-                velocity=message.velocity,
+                velocity=velocity,
                 cloud=None if cloud is None else _cloud(cloud),
+                field_of_view=message.field_of_view,
             )
 
     def truth(self) -> Truth | None:
@@ -138,6 +140,17 @@ def _pose(message: Detections | Points) -> Pose:
     if message.frame == "world" or message.pose is None:
         return _HERE
     return Pose(message.pose.translation, message.pose.quaternion)
+
+
+def _placed(message: Detections) -> tuple[Pose, Floats, Floats, Floats | None]:
+    """Return pose, centres, yaws and velocities; those of the world are carried to a sensor with a field of view."""
+    center, yaw, velocity = message.center, message.yaw, message.velocity
+    if message.frame == "sensor" or message.pose is None or message.field_of_view is None:
+        return _pose(message), center, yaw, velocity
+    pose = Pose(message.pose.translation, message.pose.quaternion)
+    rotation = rotation_of(pose.quaternion)
+    center, yaw = to_sensor(rotation, pose.translation, center, yaw)
+    return pose, center, yaw, None if velocity is None else velocity @ rotation[:2, :2]
 
 
 def _cloud(recorded: Recorded) -> Cloud:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from optipmb import Frame, Modules, OptipmbError, Parameters, PointCloud, Pose, Tracker, Tracks, make_frame
+from optipmb import FieldOfView, Frame, Modules, OptipmbError, Parameters, PointCloud, Pose, Tracker, Tracks, make_frame
 from optipmb_client.camera import Camera
 from optipmb_client.datasets import DataSequence, DatasetError, DetectionFrame, Truth
 from optipmb_client.errors import UsageError
@@ -100,6 +100,7 @@ def prepare_frames(name: str, given: Sequence[DetectionFrame], parameters: Param
                 velocity=frame.velocity,
                 pose=Pose(frame.pose.translation, frame.pose.quaternion),
                 cloud=None if cloud is None else PointCloud(cloud.xyz, Pose(cloud.translation, cloud.quaternion)),
+                field_of_view=FieldOfView.of(frame.field_of_view, None),
             )
         except OptipmbError as error:
             raise UsageError(f"sequence {name}, frame {frame.index}: {error}") from error

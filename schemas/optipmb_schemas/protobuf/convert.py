@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from optipmb_schemas.blocks import DTYPES
 from optipmb_schemas.codec import build
-from optipmb_schemas.compact import checked, checked_pose
+from optipmb_schemas.compact import checked, checked_part
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import DEFAULT, Limits
-from optipmb_schemas.messages import Detections
+from optipmb_schemas.messages import Detections, FieldOfView, Pose
 from optipmb_schemas.model import Message
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
@@ -98,7 +98,12 @@ def _usual_detections(proto: Any, limits: Limits) -> Detections | None:
         fields = {field.name: value for field, value in proto.ListFields()}
         fields["labels"], fields["frame"] = list(proto.labels), _FRAMES[proto.frame]
         if "pose" in fields:
-            fields["pose"] = checked_pose(lambda name, length: _doubles(getattr(proto.pose, name), length))
+            fields["pose"] = checked_part(Pose, lambda name, length: _doubles(getattr(proto.pose, name), length))
+        if "field_of_view" in fields:
+            view = proto.field_of_view
+            fields["field_of_view"] = checked_part(
+                FieldOfView, lambda name, length: _doubles(getattr(view, name), length)
+            )
         return checked(fields, proto.label.shape[0], _usual_data, limits)
     except (ValueError, TypeError, LookupError):
         return None

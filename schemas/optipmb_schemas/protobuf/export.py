@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Final
 
 from optipmb_schemas.control import Problem, SessionParameters, SessionState, SessionSummary
-from optipmb_schemas.messages import Delivery, Detections, Points, Pose, Tracks
+from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Points, Pose, Tracks
 from optipmb_schemas.model import Message
 
 SOURCE: Final = "optipmb/v1/tracking.proto"
 MODELS: Final[tuple[type[Message], ...]] = (
     Pose,
+    FieldOfView,
     Detections,
     Points,
     Delivery,

@@ -34,6 +34,19 @@ def pose_of(message: schemas.Detections | schemas.Points) -> optipmb.Pose | None
     return optipmb.Pose(translation=message.pose.translation, quaternion=message.pose.quaternion)
 
 
+def view_of(message: schemas.Detections) -> optipmb.FieldOfView | None:
+    """Return the field of view of a frame in the axes of its sensor, None when the sensor sees everything.
+
+    Raises:
+        optipmb.FrameError: an interval is none.
+    """
+    if message.field_of_view is None:
+        return None
+    pose = message.pose
+    place = None if pose is None else optipmb.Pose(translation=pose.translation, quaternion=pose.quaternion)
+    return optipmb.FieldOfView.of(message.field_of_view, place)
+
+
 def cloud_of(message: schemas.Points) -> optipmb.PointCloud:
     """Return the cloud as the tracker reads it.
 
@@ -60,6 +73,7 @@ def frame_of(parameters: optipmb.Parameters, message: schemas.Detections) -> tup
         score=message.score,
         velocity=message.velocity,
         pose=pose_of(message),
+        field_of_view=view_of(message),
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import msgpack
 import numpy as np
+import optipmb_schemas as schemas
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -83,6 +84,21 @@ def test_a_restored_session_goes_on_as_if_nothing_had_happened(cut: int, order: 
     again.take(two.recovered(0), two.run)
     assert state_bytes(one.snapshot()) == state_bytes(two.snapshot())
     assert merged.plain() == again.plain()
+
+
+def test_fields_of_view_outlive_a_restore() -> None:
+    """What no sensor looked at is kept with the density, and the frames of the window bring their views along."""
+    behind = schemas.FieldOfView(azimuth=[2.5, -2.5], elevation=[-1, 1], range=[0, 100])
+    one, other = Session(SENSOR.stream, NUSCENES), Session(SENSOR.stream, NUSCENES)
+    for session in (one, other):
+        feed(session, range(3), SENSOR)
+    for seq in range(3, 9):
+        one.on_detections(SENSOR.detections(seq, field_of_view=behind), 0)
+        other.on_detections(SENSOR.detections(seq, field_of_view=behind), 0)
+        other = Session.restore(decode_checkpoint(encode_checkpoint(other.snapshot())), 0)
+        other.recovered(0)
+    assert one.density.misses is not None
+    assert state_bytes(one.snapshot()) == state_bytes(other.snapshot())
 
 
 def test_rewind_goes_back_over_a_restore() -> None:

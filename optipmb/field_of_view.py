@@ -1,0 +1,385 @@
+"""The field of view of a sensor: outside it nothing can be detected, and nothing is missed.
+
+The detection probability of an object is ``p_d E[view]``: the share of the object that lies in the field of view, in
+the mean over its uncertain position. Outside it is zero, so the object keeps its existence probability (but for
+survival), its counters stand still, and another sensor may find it again. Several sensors can so feed one density by
+turns. A frame without a field of view looks at everything.
+
+Azimuth is counter-clockwise from x in the xy plane of the sensor (x forward, y left, z up), elevation is from that
+plane upwards, range is the distance from the sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Protocol, Self
+
+import numpy as np
+
+from optipmb.calibration import log_odds
+from optipmb.compiled import kernel
+from optipmb.density import PHI, Misses, Poissons, X, Y
+from optipmb.detection_probability import over_time
+from optipmb.errors import FrameError
+from optipmb.records import INDEX, record
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from optipmb.density import Bernoullis, Density
+    from optipmb.frame import Pose
+    from optipmb.preprocess import Measurements
+    from optipmb.prune import Survivors
+    from optipmb.table import ClassTable
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+NARROWEST: Final = 1e-3
+"""Least width of an interval of angles, rad."""
+
+FARTHEST: Final = 1e9
+"""Largest range, m: more than any two coordinates are apart."""
+
+ROUNDING: Final = 1e-9
+"""By how much an interval may be wider than the full turn, rad."""
+
+_NO_LIMIT: Final = 2.0
+"""No sine and no cosine is larger."""
+
+
+class Intervals(Protocol):
+    """A field of view in another form, as messages have it."""
+
+    @property
+    def azimuth(self) -> Array:
+        """(2,) rad."""
+
+    @property
+    def elevation(self) -> Array:
+        """(2,) rad."""
+
+    @property
+    def range(self) -> Array:
+        """(2,) m."""
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """Where a sensor detects objects; `azimuth`, `elevation` and `range` are intervals, each a pair.
+
+    Attributes:
+        azimuth: from, to, rad in [-2 pi, 2 pi]: the sector counter-clockwise from the one to the other, so that
+            (2.5, -2.5) looks backwards. (-pi, pi), the default, is the full circle.
+        elevation: from, to, rad in [-pi/2, pi/2].
+        range: from, to, m in [0, 1e9].
+        pose: world from sensor; None: that of the boxes that `make_frame` gets it with, else the axes of the world.
+
+    Raises:
+        FrameError: an interval is none, not finite, beyond its bounds, or narrower than a milliradian.
+    """
+
+    azimuth: tuple[float, float] = (-math.pi, math.pi)
+    elevation: tuple[float, float] = (-0.5 * math.pi, 0.5 * math.pi)
+    range: tuple[float, float] = (0.0, FARTHEST)
+    pose: Pose | None = None
+
+    def __post_init__(self) -> None:
+        bounds = (
+            ("azimuth", -2.0 * math.pi, 2.0 * math.pi),
+            ("elevation", -0.5 * math.pi, 0.5 * math.pi),
+            ("range", 0.0, FARTHEST),
+        )
+        for name, low, high in bounds:
+            object.__setattr__(self, name, _interval(name, getattr(self, name), low, high))
+        if not self.elevation[1] - self.elevation[0] >= NARROWEST:
+            raise FrameError(
+                "field_of_view.elevation", f"an end at least {NARROWEST:g} above the beginning", str(self.elevation)
+            )
+        if not self.range[1] > self.range[0]:
+            raise FrameError("field_of_view.range", "an end beyond the beginning", str(self.range))
+        if not NARROWEST <= self.width <= 2.0 * math.pi + ROUNDING:
+            raise FrameError(
+                "field_of_view.azimuth", f"a sector of {NARROWEST:g} rad to a full turn", str(self.azimuth)
+            )
+
+    @classmethod
+    def of(cls, view: Intervals | None, pose: Pose | None) -> Self | None:
+        """Return one of the same intervals, None where there is none.
+
+        Raises:
+            FrameError: an interval is none.
+        """
+        if view is None:
+            return None
+        azimuth, elevation, distance = ((one[0], one[1]) for one in (view.azimuth, view.elevation, view.range))
+        return cls(azimuth, elevation, distance, pose)
+
+    @property
+    def width(self) -> float:
+        """Width of the sector of azimuth, rad."""
+        begin, end = self.azimuth
+        return end - begin if end >= begin else end - begin + 2.0 * math.pi
+
+    @property
+    def limits(self) -> Array:
+        """The intervals as `shares_in_view` compares them, (7,).
+
+        The direction (2,) of the middle of the sector, the cosine of half its width; the sines of the elevations; the
+        ranges. An interval that holds all angles has limits that no rounding reaches.
+        """
+        middle = self.azimuth[0] + 0.5 * self.width
+        full = self.width >= 2.0 * math.pi - ROUNDING
+        low, high = self.elevation
+        return np.array(
+            [
+                math.cos(middle),
+                math.sin(middle),
+                -_NO_LIMIT if full else math.cos(0.5 * self.width),
+                -_NO_LIMIT if low <= -0.5 * math.pi + ROUNDING else math.sin(low),
+                _NO_LIMIT if high >= 0.5 * math.pi - ROUNDING else math.sin(high),
+                *self.range,
+            ]
+        )
+
+
+def check_view(view: object) -> None:
+    """Refuse what is no field of view.
+
+    Raises:
+        FrameError: it is neither that nor None.
+    """
+    if view is not None and not isinstance(view, FieldOfView):
+        raise FrameError("field_of_view", "a FieldOfView or None", type(view).__name__)
+
+
+def _interval(name: str, values: object, low: float, high: float) -> tuple[float, float]:
+    path, expected = f"field_of_view.{name}", f"two numbers from {low:g} to {high:g}"
+    try:
+        given = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise FrameError(path, expected, repr(values)[:80]) from error
+    # A float32 of the limit may be a little beyond it.
+    if given.shape != (2,) or not ((given >= low - 1e-6) & (given <= high + 1e-6)).all():
+        raise FrameError(path, expected, repr(values)[:80])
+    begin, end = np.clip(given, low, high).tolist()
+    return begin, end
+
+
+@record
+class Looks:
+    """What a frame looks at.
+
+    Attributes:
+        in_view: (N,) share of each object that is in view, in [0, 1].
+        poisson_in_view: (J,) that of each Poisson component.
+        time: (N,) s since each object was last looked at.
+        misses: of the objects, if this frame misses them.
+    """
+
+    in_view: Array
+    poisson_in_view: Array
+    time: Array
+    misses: Misses
+
+
+def look(
+    view: FieldOfView | None, density: Density, poisson: Poissons, before_ns: int, table: ClassTable
+) -> tuple[Looks | None, Poissons]:
+    """Find out what of the predicted density is in view, and let the counters of the rest stand still.
+
+    A look covers the time since the last frame that looked at the object, but where other frames came in between at
+    most a nominal period (or the time since the last frame): an object that nobody could see for long has not been
+    missed for long. A Poisson component that is out of view ages no further.
+
+    Args:
+        view: of the frame, with its pose; None: it looks at everything.
+        density: the prediction.
+        poisson: its Poisson components, and those of the measurements without HABM.
+        before_ns: stamp of the frame before.
+        table: parameters as columns.
+
+    Returns:
+        What the frame looks at, None while no frame has had a field of view; and the Poisson components with the
+        stamps that their age counts from.
+    """
+    bernoulli, now_ns, misses = density.bernoulli, density.stamp_ns, density.misses
+    if view is None and misses is None:
+        return None, poisson
+    view = view or FieldOfView()
+    if misses is None:
+        misses = Misses(bernoulli.seen_ns, np.full(len(bernoulli), before_ns, np.int64))
+    axes = (np.eye(3), np.zeros(3)) if view.pose is None else (view.pose.rotation, view.pose.translation)
+    where = *axes, view.limits
+    in_view, poisson_in_view = np.empty(len(bernoulli)), np.empty(len(poisson))
+    shares_in_view(bernoulli.mean, bernoulli.covariance, bernoulli.auxiliary, *where, in_view)
+    shares_in_view(poisson.mean, poisson.covariance, poisson.auxiliary, *where, poisson_in_view)
+    time, missed_from_ns = np.empty(len(bernoulli)), np.empty(len(bernoulli), INDEX)
+    stamps = before_ns, now_ns, table.period
+    count_looks(in_view, misses.looked_ns, misses.missed_from_ns, *stamps, time, missed_from_ns)
+    if len(poisson):
+        hidden_ns = np.rint((1.0 - poisson_in_view) * max(0, now_ns - before_ns)).astype(np.int64)
+        poisson = Poissons(
+            poisson.mean,
+            poisson.covariance,
+            poisson.weight,
+            poisson.label,
+            poisson.auxiliary,
+            np.minimum(poisson.born_ns + hidden_ns, now_ns),
+        )
+    looked_ns = np.where(in_view > 0.0, now_ns, misses.looked_ns)
+    return Looks(in_view, poisson_in_view, time, Misses(missed_from_ns, looked_ns)), poisson
+
+
+def detection_probability_in_view(p_d: Array, looks: Looks, share: float, table: ClassTable) -> Array:
+    """Return p_d of objects and, behind them, of Poisson components for what is in view, over the time of each look.
+
+    Args:
+        p_d: (N + J,) as if all were in view.
+        looks: what is.
+        share: of the nominal period, for the components.
+        table: parameters as columns.
+    """
+    count = len(looks.misses)
+    shares = np.full(len(p_d), share)
+    shares[:count] = looks.time / table.period if table.detection_over_time else 1.0
+    return over_time(p_d * np.concatenate((looks.in_view, looks.poisson_in_view)), shares)
+
+
+def follow_looks(
+    looks: Looks,
+    survivors: Survivors,
+    before: Bernoullis,
+    objects: Bernoullis,
+    measurements: Measurements,
+    stamp_ns: int,
+    table: ClassTable,
+) -> Misses:
+    """Correct score and evidence of the posterior by what the frame looked at, and return its misses.
+
+    What is out of view keeps its score and its evidence; what is partly in view is missed for that part of the time
+    since it was last looked at.
+
+    Args:
+        looks: of the frame.
+        survivors: which objects the posterior has.
+        before: the predicted objects.
+        objects: the posterior, not yet given away; its scores and evidence are written.
+        measurements: Z_k.
+        stamp_ns: stamp of the frame.
+        table: parameters as columns.
+    """
+    count, known = len(survivors), survivors.known
+    row, hit = survivors.row[:known], survivors.measurement[:known] >= 0
+    missed_from_ns, looked_ns = np.full(count, stamp_ns, np.int64), np.full(count, stamp_ns, np.int64)
+    missed_from_ns[:known] = np.where(hit, stamp_ns, looks.misses.missed_from_ns[row])
+    looked_ns[:known] = np.where(hit, stamp_ns, looks.misses.looked_ns[row])
+    share = looks.in_view[row]
+    hidden = ~hit & (share == 0.0)
+    objects.score[:known][hidden] = before.score[row][hidden]
+    label = objects.label[:known]
+    latest = -table.missed_evidence[label]
+    latest[hit] = [log_odds(score) for score in measurements.score[survivors.measurement[:known][hit]].tolist()]
+    kept = table.memory[label] ** (np.where(hit, 1.0, share) * looks.time[row] / table.period)
+    kept[objects.born_ns[:known] == stamp_ns] = 1.0
+    objects.evidence[:known] = kept * before.evidence[row] + (1.0 - kept) * latest
+    return Misses(missed_from_ns, looked_ns)
+
+
+@kernel
+def shares_in_view(
+    mean: Array,
+    covariance: Array,
+    auxiliary: Array,
+    rotation: Array,
+    translation: Array,
+    limits: Array,
+    share: Array,
+) -> None:
+    """Compute how much of each object is in view, in the mean over its position.
+
+    The footprint of a box is that of points spread evenly over length and width; with the position of the object they
+    have covariance ``C = diag(l^2, w^2) / 12 + R' P_xy R`` in the axes R of the box. It is replaced by the 3 x 3 points
+    of the Gauss-Hermite rule, ``L (i, j) sqrt(3)`` with ``L L' = C``, weights 2/3 and 1/6; where the position is
+    known these are the centre, the corners and the middles of the edges. Along the height: bottom, centre and top, with
+    the same weights (Simpson's rule).
+
+    Args:
+        mean: (N, 6) predicted means.
+        covariance: (N, 6, 6) predicted covariances.
+        auxiliary: (N, 4) boxes.
+        rotation: (3, 3) world from sensor.
+        translation: (3,) of the sensor in the world.
+        limits: (7,) of `FieldOfView.limits`.
+        share: (N,) receives the shares, in [0, 1]; 0 and 1 are exact.
+    """
+    for n in range(mean.shape[0]):
+        cos_phi, sin_phi = math.cos(mean[n, PHI]), math.sin(mean[n, PHI])
+        p_xx, p_xy, p_yy = covariance[n, X, X], covariance[n, X, Y], covariance[n, Y, Y]
+        length, width, height = auxiliary[n, 0], auxiliary[n, 1], auxiliary[n, 2]
+        c_ll = length * length / 12.0 + cos_phi * cos_phi * p_xx + 2.0 * cos_phi * sin_phi * p_xy
+        c_ll += sin_phi * sin_phi * p_yy
+        c_ww = width * width / 12.0 + sin_phi * sin_phi * p_xx - 2.0 * cos_phi * sin_phi * p_xy
+        c_ww += cos_phi * cos_phi * p_yy
+        c_lw = cos_phi * sin_phi * (p_yy - p_xx) + (cos_phi * cos_phi - sin_phi * sin_phi) * p_xy
+        along = math.sqrt(3.0 * c_ll)
+        skew = 3.0 * c_lw / along
+        across = math.sqrt(max(3.0 * c_ww - skew * skew, 0.0))
+        weight = 0
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                ahead, aside = i * along, i * skew + j * across
+                dx = mean[n, X] + cos_phi * ahead - sin_phi * aside - translation[0]
+                dy = mean[n, Y] + sin_phi * ahead + cos_phi * aside - translation[1]
+                for k in range(-1, 2):
+                    dz = auxiliary[n, 3] + 0.5 * k * height - translation[2]
+                    if in_view(dx, dy, dz, rotation, limits):
+                        weight += (4 if i == 0 else 1) * (4 if j == 0 else 1) * (4 if k == 0 else 1)
+        share[n] = weight / 216.0
+
+
+@kernel
+def in_view(dx: float, dy: float, dz: float, rotation: Array, limits: Array) -> bool:
+    """Tell whether a point, given from the sensor along the axes of the world, is in view."""
+    x = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
+    y = rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz
+    z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
+    away = math.sqrt(x * x + y * y + z * z)
+    return bool(
+        (x * limits[0] + y * limits[1] >= limits[2] * math.sqrt(x * x + y * y))
+        & (limits[3] * away <= z <= limits[4] * away)
+        & (limits[5] <= away <= limits[6])
+    )
+
+
+@kernel
+def count_looks(
+    in_view: Array,
+    looked_ns: Index,
+    missed_from_ns: Index,
+    before_ns: int,
+    now_ns: int,
+    period: float,
+    time: Array,
+    missed_from_out: Index,
+) -> None:
+    """Compute the time that the look at each object covers, and from when its misses count if it is missed.
+
+    Args:
+        in_view: (N,) shares.
+        looked_ns: (N,) stamp of the last look.
+        missed_from_ns: (N,) stamp from which misses count.
+        before_ns: stamp of the frame before.
+        now_ns: stamp of the frame.
+        period: nominal period, s.
+        time: (N,) receives seconds since the last look, at most a period where frames in between did not look.
+        missed_from_out: (N,) receives the stamp from which misses count then: later by what was not looked at.
+    """
+    step_ns = now_ns - before_ns
+    most_ns = max(step_ns, math.floor(period * 1e9))
+    for n in range(in_view.shape[0]):
+        covered_ns = min(now_ns - looked_ns[n], most_ns)
+        time[n] = covered_ns * 1e-9
+        counted_ns = math.floor(in_view[n] * covered_ns + 0.5)
+        missed_from_out[n] = missed_from_ns[n] + step_ns - counted_ns
