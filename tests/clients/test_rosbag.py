@@ -166,6 +166,8 @@ def test_the_input_is_kept_beside_the_tracks_if_asked(bag: Path, tmp_path: Path)
     assert [(name, stamp) for name, stamp, _ in everything if name.endswith("/tracks")] == [
         (f"{name}/tracks", stamp) for name, stamp, _ in before if name == "/detector/boxes"
     ]
+    pair = ["/detector/boxes", "/detector/boxes/tracks"]  # received at the same time, and in this order
+    assert [name for name, *_ in everything if name in pair] == pair * 20
     assert raw(outs[1]) == everything
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == []
 

@@ -170,6 +170,39 @@ def test_clouds_of_any_layout_are_read() -> None:
     assert points_of(cloud(height=0, width=0, data=np.empty(0, np.uint8))).shape == (0, 3)
 
 
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("floats", [("f4", "f4", "f4"), ("f8", "f8", "f8"), ("f4", "f8", "f4")])
+@pytest.mark.parametrize(("height", "gap", "rest"), [(1, 0, 0), (1, 4, 0), (3, 1, 7)])
+def test_every_layout_of_floats_gives_the_same_points(
+    order: str, floats: tuple[str, ...], height: int, gap: int, rest: int
+) -> None:
+    """Byte order, 32 and 64 bits, gaps between fields, padded and organised rows."""
+    xyz = np.random.default_rng(1).normal(scale=50, size=(12, 3)).astype(np.float32)
+    sizes = [int(kind[1]) + gap for kind in floats]
+    offsets = [gap + sum(sizes[:column]) for column in range(3)]
+    point = np.dtype(
+        {
+            "names": list("xyz"),
+            "formats": [order + kind for kind in floats],
+            "offsets": offsets,
+            "itemsize": gap + sum(sizes),
+        }
+    )
+    values = np.zeros((height, 12 // height), point)
+    for column, name in enumerate("xyz"):
+        values[name] = xyz[:, column].reshape(values.shape)
+    row = values.shape[1] * point.itemsize + rest
+    data = np.full((height, row), 0x7F, np.uint8)
+    data[:, : row - rest] = values.view(np.uint8).reshape(height, -1)
+    fields = [
+        SimpleNamespace(name=name, offset=offset, datatype={"f4": 7, "f8": 8}[kind], count=1)
+        for name, offset, kind in zip("xyz", offsets, floats, strict=True)
+    ]
+    about = {"fields": fields, "is_bigendian": order == ">", "point_step": point.itemsize, "row_step": row}
+    message = cloud(height=height, width=12 // height, data=data.ravel(), **about)
+    assert np.array_equal(points_of(message), xyz)
+
+
 def test_clouds_that_contradict_themselves_are_refused() -> None:
     """No read goes beyond the data, whatever the sizes say."""
     fields = cloud().fields
