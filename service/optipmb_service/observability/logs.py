@@ -28,6 +28,7 @@ EVENTS: Final = {
     "grpc_certificates": "Renewed gRPC certificates cannot be read; the previous ones stay in use.",
     "unknown_environment": "Variables that start with `OPTIPMB_` but are not settings, usually misspelt.",
     "peer_connected": "A node, router or service has connected to this process.",
+    "tracker_message": "A `text` of the tracker: that it compiles, once after an installation, for up to a minute.",
     "peer_lost": "That connection is lost. A client reconnects and recovers what the caches still hold.",
     "session_opened": "A stream sent its first valid message, or parameters were set for it.",
     "session_restored": "A session continues from its checkpoint; missed frames are requested from publishers.",
@@ -146,11 +147,11 @@ def configure(form: Literal["console", "json"], level: str, worker: int | None =
 
 
 class _Library(logging.Handler):
-    """Passes on what the tracker logs, which knows nothing of this form."""
+    """Logs the warnings of the tracker, which uses Python's own logging."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log a record of the tracker."""
-        structlog.get_logger("optipmb_service").log(record.levelno, record.getMessage())
+        """Log one of them."""
+        structlog.get_logger("optipmb_service").warning("tracker_message", text=record.getMessage())
 
 
 def unknown_environment(names: tuple[str, ...]) -> None:
