@@ -249,7 +249,7 @@ class MemoryStore:
 
     def streams(self) -> tuple[str, ...]:
         """Return the streams that have a checkpoint."""
-        return tuple(sorted(stream for stream, kept in self._kept.items() if kept))
+        return tuple(sorted(stream for stream, kept in self._kept.copy().items() if kept))
 
     def expire(self, age_s: float) -> int:
         """Keep all: it does not outlive its process."""
