@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -62,20 +63,24 @@ def test_a_scene_with_clouds(
 
 
 def test_kitti_through_three_gateways_at_once(
-    gateways: list[GatewayProcess], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    service: ServiceProcess, gateways: list[GatewayProcess], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Recorded sequences, each sent by a process of its own to a gateway of its own, give the offline files."""
+    """Recorded sequences with clouds, each by a process and gateway of its own: the files of Zenoh and offline."""
     data = ("--dataset", "kitti", "--root", kitti_root(), "--detections", "pointrcnn")
     names = ["0000", "0003", "0017"]
     run_here(capsys, "track", *data, "--sequences", *names, "--out", tmp_path / "track")
-    options = ("--out", str(tmp_path / "grpc"), *map(str, data))
+    zenoh = ("--connect", service.endpoint, "--out", tmp_path / "zenoh")
+    run_here(capsys, "replay", *data, "--sequences", *names, *zenoh)
+    options = ("--json", "--out", str(tmp_path / "grpc"), *map(str, data))
     commands = [
         [sys.executable, "-m", "optipmb_client", "replay", *options, "--sequences", name, *connect(gateway)]
         for name, gateway in zip(names, gateways, strict=True)
     ]
-    running = [subprocess.Popen(command, stdout=subprocess.DEVNULL) for command in commands]
-    assert [process.wait(240) for process in running] == [0, 0, 0]
-    compare(tmp_path, ("track", "grpc"), names)
+    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for command in commands]
+    printed = [process.communicate(timeout=240)[0] for process in running]
+    assert [process.returncode for process in running] == [0, 0, 0]
+    assert json.loads(printed[0])["sequences"][0]["clouds"] > 0
+    compare(tmp_path, ("track", "zenoh", "grpc"), names)
 
 
 def test_a_gateway_that_is_killed_loses_nothing(
