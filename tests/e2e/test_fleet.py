@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from fleet import Fleet, freeze, thaw
+from fleet import PROFILE, Fleet, freeze, thaw
 from optipmb_client import Publisher
 from optipmb_schemas import Keys, ServiceStatus, SessionState, Tracks
 from optipmb_service.session.checkpoint import digest_of
@@ -32,7 +32,7 @@ def _compiled() -> None:
 
 def expected(frames: int) -> tuple[list[bytes], str]:
     """Tracks and the digest of the state of a session that nothing happens to."""
-    session = Session(SENSOR.stream, optipmb.load_profile("nuscenes"))
+    session = Session(SENSOR.stream, optipmb.load_profile(PROFILE))
     outputs = [output for seq in range(frames) for output in session.on_detections(SENSOR.detections(seq), 0)]
     return [plain(one.tracks) for one in outputs if isinstance(one, Tracked)], digest_of(session.snapshot())
 

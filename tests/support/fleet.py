@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 START_S = 60.0
 
+PROFILE = "nuscenes"
+"""What all services of a fleet track with."""
+
 _ROUTER = """
 import sys, threading
 sys.path.insert(0, sys.argv[1])
@@ -81,6 +84,7 @@ class Fleet:
         self._context = contextlib.ExitStack()
         self._environment = {
             "OPTIPMB_STORE": str(folder),
+            "OPTIPMB_PROFILE": PROFILE,
             "OPTIPMB_LOG_LEVEL": "info",
             "OPTIPMB_LEASE_S": "2.0",
             "OPTIPMB_CHECKPOINT_S": "0.5",
