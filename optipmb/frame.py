@@ -17,6 +17,7 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.errors import FrameError
 from optipmb.field_of_view import FieldOfView, check_view
+from optipmb.score_calibration import calibrate_scores
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -124,7 +125,7 @@ class Frame:
         size: (M, 3) length, width, height, m.
         yaw: (M,) rad.
         velocity: (M, 2) over ground, m/s; a row of NaN where the detector gives none.
-        score: (M,) in (0, 1].
+        score: (M,) in (0, 1]; what the thresholds of the class mean by it (`optipmb.score_calibration`).
         label: (M,) int64, index into the classes of the parameters.
         source: (M,) int64, index of the object in the arrays that the caller gave.
         labels: names of the classes that `label` points into, those of the parameters.
@@ -201,7 +202,8 @@ def make_frame(
         center: (M, 3) geometric centres, m, in the world frame, or in the sensor frame when `pose` is given.
         size: (M, 3) length, width, height, m, all positive.
         yaw: (M,) rad, in the same frame.
-        score: (M,) in [0, 1]; an object of score 0 is left out, for its detector says that there is none.
+        score: (M,) in [0, 1], as the detector gives it; an object of score 0 is left out, for its detector says that
+            there is none. The frame has the calibrated scores where a class has a `score_calibration`.
         velocity: (M, 2) over ground along the axes of the same frame, m/s; None, or rows of NaN, where unknown.
         pose: world from sensor, or None when the arrays are in the world frame already. The identity is the same as
             None, to the last bit: a heading does not go through sine and cosine.
@@ -239,6 +241,7 @@ def make_frame(
 
     index = {name: i for i, name in enumerate(parameters.classes)}
     known = np.array([index.get(name, -1) for name in labels], dtype=np.int64)[which] if m else which
+    calibrate_scores(parameters, known, score)
     source = ((known >= 0) & (score > 0.0)).nonzero()[0]
     if source.shape[0] < m:
         center, size, yaw, velocity = center[source], size[source], yaw[source], velocity[source]

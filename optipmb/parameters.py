@@ -1,8 +1,8 @@
 """The parameters of the tracker: one table per class, as the paper's (Section V.A) has one column per class.
 
 A profile is a TOML file: ``name``, ``nominal_period`` and a table ``[classes.NAME]`` per class; the order of the
-tables is the order of the class indices. Two profiles come with the package, ``nuscenes`` and ``kitti``; own files
-load the same way (`load_profile`).
+tables is the order of the class indices. `profiles` names those that come with the package; own files load the same
+way (`load_profile`).
 
 Beyond the paper's table there are the quantities that the paper uses and does not give (Q, R, P0, A) and two that a
 filter with survival probability one needs to forget objects (`max_misses`, `min_existence`).
@@ -13,6 +13,7 @@ from __future__ import annotations
 import tomllib
 from difflib import get_close_matches
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -127,10 +128,34 @@ class Calibration(_Table):
         for name in ("existence", "along", "across"):
             if (count := len(getattr(self, name))) != rows:
                 raise ValueError(f"as many values of {name} as of evidence, {rows}, received {count}")
-        if any(later <= before for before, later in zip(self.evidence, self.evidence[1:], strict=False)):
+        if any(later <= before for before, later in pairwise(self.evidence)):
             raise ValueError(f"ascending evidence, received {list(self.evidence)}")
-        if any(later < before for before, later in zip(self.existence, self.existence[1:], strict=False)):
+        if any(later < before for before, later in pairwise(self.existence)):
             raise ValueError(f"existence that does not descend, received {list(self.existence)}")
+        return self
+
+
+Knots = Annotated[tuple[OpenProbability, ...], Field(min_length=2, max_length=32)]
+
+
+class ScoreCalibration(_Table):
+    """What the scores of a detector mean to the thresholds of the class (`optipmb.score_calibration`).
+
+    The fields are columns of one table, a row for each knot; the curve is straight from knot to knot, from (0, 0) to
+    the first and from the last to (1, 1).
+    """
+
+    detector: Knots = Field(description="scores of the detector, ascending")
+    calibrated: Knots = Field(description="the scores that the thresholds mean by them, ascending")
+
+    @model_validator(mode="after")
+    def _columns(self) -> ScoreCalibration:
+        if (count := len(self.calibrated)) != len(self.detector):
+            raise ValueError(f"as many values of calibrated as of detector, {len(self.detector)}, received {count}")
+        for name in ("detector", "calibrated"):
+            knots = getattr(self, name)
+            if any(later <= before for before, later in pairwise(knots)):
+                raise ValueError(f"ascending {name}, received {list(knots)}")
         return self
 
 
@@ -227,6 +252,10 @@ class ClassParameters(_Table):
         default=None,
         description="eta_iou holds between detections of all classes with the same group too; none, the paper: within "
         "the class alone",
+    )
+    score_calibration: ScoreCalibration | None = Field(
+        default=None,
+        description="curve that brings the detector's scores to those that the thresholds mean; none: they stay",
     )
     calibration: Calibration | None = Field(
         default=None, description="what tracks say of themselves; without it existence is r and the covariance is P"

@@ -14,8 +14,9 @@ import optipmb
 FOLDER = Path(optipmb.__file__).parent
 MODULES = {path.stem: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(FOLDER.glob("*.py"))}
 ALLOWED = {
-    "__future__", "collections", "contextlib", "dataclasses", "difflib", "functools", "hashlib", "importlib", "math",
-    "numba", "numpy", "operator", "optipmb", "pathlib", "pydantic", "pydantic_core", "re", "sys", "tomllib", "typing",
+    "__future__", "collections", "contextlib", "dataclasses", "difflib", "functools", "hashlib", "importlib",
+    "itertools", "math", "numba", "numpy", "operator", "optipmb", "pathlib", "pydantic", "pydantic_core", "re", "sys",
+    "tomllib", "typing",
 }  # fmt: skip
 EXCEPTIONS = {
     "compiled": {"logging"},  # to say why a first frame takes a minute

@@ -76,7 +76,15 @@ def toml(document: dict[str, Any]) -> str:
 
 def test_the_profiles_that_ship_are_listed_and_load() -> None:
     """Every listed profile loads under its name, with its origin."""
-    assert set(optipmb.profiles()) == {"generic", "kitti", "kitti-paper", "nuscenes", "nuscenes-paper", "scene"}
+    assert set(optipmb.profiles()) == {
+        "generic",
+        "kitti",
+        "kitti-paper",
+        "nuscenes",
+        "nuscenes-megvii",
+        "nuscenes-paper",
+        "scene",
+    }
     for name in optipmb.profiles():
         parameters = optipmb.load_profile(name)
         assert parameters.name == name

@@ -32,7 +32,7 @@ from optipmb_client.extras import needed
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from optipmb_client.tuning import Estimate, Figures, Refined
+    from optipmb_client.tuning import Curves, Estimate, Figures, Refined
 
 SHOWN = ("sAMOTA", "AMOTA", "MOTA", "MOTP", "HOTA", "IDS", "FP", "FN", "GT")
 LEAST_SHOWN = 100
@@ -56,6 +56,14 @@ def tune(  # noqa: PLR0913  these are the command's options
     estimate_only: Annotated[
         bool, typer.Option("--estimate-only", help="Only what the data say by themselves.")
     ] = False,
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            help="With --estimate-only: the detector that the thresholds of the profile were chosen with; its scores on"
+            " the same data are what those of --detections are brought to.",
+            show_default=False,
+        ),
+    ] = None,
     metric: Annotated[str, typer.Option(help=f"What is maximised: {', '.join(METRICS)}.")] = "combination",
     trials: Annotated[int, typer.Option(min=1, help="Trials of the search on all sequences.")] = 120,
     folds: Annotated[int, typer.Option(min=0, help="Groups of sequences that are left out in turn; 0: none.")] = 3,
@@ -79,19 +87,21 @@ def tune(  # noqa: PLR0913  these are the command's options
         needed("optipmb tune", "tune", "optuna")
     if metric not in METRICS:
         raise UsageError(f"--metric: one of {', '.join(METRICS)}, received {metric!r}")
+    if reference is not None and not estimate_only:
+        raise UsageError("--reference: with --estimate-only, which writes a profile that --profile then tunes")
     asked = asked_for(data, dataset, root, detections, option, truth)
     opened, chosen = open_sequences(asked, sequences)
     parameters = profile_for(profile or opened.profile, chosen)
+    curves: tuning.Curves = {}
+    if reference is not None:
+        parameters, curves = tuning.calibrate_scores(asked, reference, chosen, parameters, classes, out, name)
     source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, classes)
     estimates = tuning.estimate_all(source, parameters, out)
     if not as_json:
         for one in estimates.values():
             print_table(_estimate(one, {path: tuning.value_of(parameters, one.name, path) for path in one.values}))
     if estimate_only:
-        if as_json:
-            print_json({"command": "tune", "out": out, "estimates": {k: e.to_json() for k, e in estimates.items()}})
-        else:
-            say(f"estimates in {out}/estimate.json, as a profile in {out}/estimated.toml")
+        _say_estimates(estimates, curves, reference, out, as_json=as_json)
         return
     plan = tuning.Plan(
         metric=metric,
@@ -112,6 +122,23 @@ def tune(  # noqa: PLR0913  these are the command's options
     for refined in tuned.classes.values():
         print_table(_report(refined))
     say(f"profile in {tuned.profile}")
+
+
+def _say_estimates(
+    estimates: "Mapping[str, Estimate]", curves: "Curves", reference: str | None, out: Path, *, as_json: bool
+) -> None:
+    if as_json:
+        found = {"estimates": {name: one.to_json() for name, one in estimates.items()}}
+        shown = {"score_calibration": {name: one and one.model_dump() for name, one in curves.items()}}
+        print_json({"command": "tune", "out": out, **found, **(shown if reference else {})})
+        return
+    for name, curve in curves.items():
+        knots = zip(curve.detector, curve.calibrated, strict=True) if curve else ()
+        shown_knots = "  ".join(f"{score:g} -> {meant:g}" for score, meant in knots)
+        say(f"{name}: score -> score of {reference}: {shown_knots or 'too few detections on labels'}")
+    if reference:
+        say(f"the profile with the scores of {reference} in {out}/calibrated.toml")
+    say(f"estimates in {out}/estimate.json, as a profile in {out}/estimated.toml")
 
 
 def _estimate(found: "Estimate", before: "Mapping[str, object]") -> Group:

@@ -4,12 +4,13 @@ from optipmb_client.tuning.ablation import ROWS, Row, ablate
 from optipmb_client.tuning.display import TrialDisplay
 from optipmb_client.tuning.estimate import Estimate, estimate
 from optipmb_client.tuning.figures import Figures
-from optipmb_client.tuning.run import Source, Tuned, estimate_all, tune_all
+from optipmb_client.tuning.run import Curves, Source, Tuned, calibrate_scores, estimate_all, tune_all
 from optipmb_client.tuning.session import Plan, Refined, refine
 from optipmb_client.tuning.values import value_of
 
 __all__ = [
     "ROWS",
+    "Curves",
     "Estimate",
     "Figures",
     "Plan",
@@ -19,6 +20,7 @@ __all__ = [
     "TrialDisplay",
     "Tuned",
     "ablate",
+    "calibrate_scores",
     "estimate",
     "estimate_all",
     "refine",

@@ -27,9 +27,10 @@ from optipmb_client.tuning.pairing import (
     trajectories,
 )
 from optipmb_client.tuning.robust import fit_motion, spread, usual
+from optipmb_client.tuning.score_curves import counted_scores
 from optipmb_client.tuning.values import Value, rounded, value_of
 
-__all__ = ["Estimate", "ScoreBin", "estimate"]
+__all__ = ["Estimate", "ScoreBin", "estimate", "pair_all"]
 
 WINDOW_S = 1.0
 """Pieces of trajectories in which motion is fitted; at low frame rates four frames."""
@@ -112,7 +113,7 @@ def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Ru
     """
     table = parameters.classes[name]
     paths = [trajectories(clip, name) for clip in clips]
-    everything = [pair_detections(clip, name, 0.0, min(PAIR_LIMIT, table.gate), rules) for clip in clips]
+    everything = pair_all(clips, name, parameters, rules)
     pairs = [pair_detections(clip, name, table.score_filter, min(PAIR_LIMIT, table.gate), rules) for clip in clips]
     errors = residuals(pairs, paths)
     count = len(errors.heading)
@@ -151,6 +152,12 @@ def estimate(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Ru
         score_scale=scale,
         score_shift=shift,
     )
+
+
+def pair_all(clips: Sequence[Clip], name: str, parameters: Parameters, rules: Rules) -> list[Pairs]:
+    """Return the detections of all scores of a class, paired with its labels; arguments as in `estimate`."""
+    limit = min(PAIR_LIMIT, parameters.classes[name].gate)
+    return [pair_detections(clip, name, 0.0, limit, rules) for clip in clips]
 
 
 def _fitting(parameters: Parameters, name: str, path: str, value: float) -> Value:
@@ -270,10 +277,7 @@ def _area(pairs: Sequence[Pairs], cell: float = 5.0) -> float:
 
 def _scores(pairs: Sequence[Pairs]) -> tuple[tuple[ScoreBin, ...], float, float]:
     """Return how often detections of each score are true, and the fit of the log odds (Platt, 1999)."""
-    score = np.concatenate([one.score for one in pairs]) if pairs else np.empty(0)
-    true = np.concatenate([one.object >= 0 for one in pairs]) if pairs else np.empty(0, dtype=np.bool_)
-    counted = true | (np.concatenate([one.false for one in pairs]) if pairs else true)
-    score, true = score[counted], true[counted]
+    score, true = counted_scores(pairs)
     edges = np.linspace(0.0, 1.0, _BINS + 1)
     which = np.clip(np.digitize(score, edges) - 1, 0, _BINS - 1)
     bins = tuple(

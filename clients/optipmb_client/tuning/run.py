@@ -1,29 +1,35 @@
 """Tuning a dataset: its classes one after the other, and the files that come of it.
 
-In the output folder: `estimate.json` and `estimated.toml` (what the data say without tracking), `trials.db` (every
-trial, to go on from), `report.json` (figures, folds, evidence) and `tuned.toml`, the profile. The same data, options
-and versions give the same bytes of all but `trials.db`.
+In the output folder: `estimate.json` and `estimated.toml` (what the data say without tracking), `calibrated.toml` (the
+profile with the curves of scores alone, where a reference was given), `trials.db` (every trial, to go on from),
+`report.json` (figures, folds, evidence) and `tuned.toml`, the profile. The same data, options and versions give the
+same bytes of all but `trials.db`.
 """
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from optipmb import Parameters
-from optipmb_client.datasets import DataSequence
+from optipmb import Parameters, ScoreCalibration
+from optipmb_client.datasets import DataSequence, DatasetArguments
 from optipmb_client.errors import UsageError
 from optipmb_client.files import AtomicText
-from optipmb_client.tuning.estimate import Estimate, estimate
+from optipmb_client.tuning.estimate import Estimate, estimate, pair_all
 from optipmb_client.tuning.material import Clip, load, of_class
+from optipmb_client.tuning.score_curves import score_curve
 from optipmb_client.tuning.scoring import rules_of, scorer_of
 from optipmb_client.tuning.session import Plan, Refined, refine
-from optipmb_client.tuning.values import only, with_classes, with_values, write_profile
+from optipmb_client.tuning.values import only, with_classes, with_score_calibration, with_values, write_profile
 from optipmb_client.tuning.watch import Watch
 
-__all__ = ["Source", "Tuned", "estimate_all", "tune_all"]
+__all__ = ["Curves", "Source", "Tuned", "calibrate_scores", "estimate_all", "tune_all"]
+
+
+Curves = dict[str, ScoreCalibration | None]
+"""By class; None where there was too little to measure one."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +104,61 @@ def estimate_all(source: Source, parameters: Parameters, out: Path) -> dict[str,
     provenance = f"{_from(parameters)}\n{_by('estimate')}: {source.title}; classes {' '.join(source.classes)}."
     write_profile(out / "estimated.toml", with_classes(parameters, tables, _named(parameters, "estimated"), provenance))
     return found
+
+
+def calibrate_scores(
+    data: DatasetArguments,
+    reference: str,
+    sequences: Sequence[DataSequence],
+    parameters: Parameters,
+    classes: Sequence[str] | None,
+    out: Path,
+    name: str | None = None,
+) -> tuple[Parameters, Curves]:
+    """Measure the curves from a detector's scores to a reference detector's, and write `calibrated.toml`.
+
+    Args:
+        data: the dataset with the detector.
+        reference: the name of the reference detector.
+        sequences: of the dataset; those that the reference has too are used.
+        parameters: the profile; score calibrations that it has are replaced.
+        classes: as of a `Source`.
+        out: the folder.
+        name: of the new profile.
+
+    Returns:
+        The profile with the curves, and the curve of each class, None where there is too little to measure one.
+
+    Raises:
+        DatasetError: there is no such detector, or a sequence has no truth.
+        UsageError: the reference has none of the sequences, or a class is not there.
+
+    """
+    names = {one.name for one in sequences}
+    known = [one for one in replace(data, detections=reference).open().sequences(["all"]) if one.name in names]
+    if not known:
+        raise UsageError(f"--reference {reference}: detections of one of the sequences, received none")
+    common = {one.name for one in known}
+    plain = with_score_calibration(parameters, dict.fromkeys(parameters.labels))
+    source = Source.of(data.name, data.detections, sequences, plain, classes)
+    other = Source.of(data.name, reference, known, plain, None)
+    curves: Curves = {}
+    for label in source.classes:
+        base, rules = only(plain, label), rules_of(data.name)
+        own = [clip for clip in source.of_class(label) if clip.name in common]
+        curves[label] = score_curve(
+            pair_all(own, label, base, rules), pair_all(other.of_class(label), label, base, rules)
+        )
+    measured = " ".join(label for label, curve in curves.items() if curve) or "none"
+    provenance = (
+        f"{_from(parameters, name)}\n{_by('score calibration')}: {replace(source, sequences=known).title}, to the"
+        f" scores of {Path(reference).name}; classes {measured}."
+    )
+    calibrated = with_score_calibration(plain, curves)
+    out.mkdir(parents=True, exist_ok=True)
+    title = name or _named(parameters, "calibrated")
+    write_profile(out / "calibrated.toml", with_classes(calibrated, {}, title, provenance))
+    return calibrated, curves
 
 
 def tune_all(

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from optipmb import Calibration, HeadingSign, OptipmbError, Parameters, parse_parameters
+from optipmb import Calibration, HeadingSign, OptipmbError, Parameters, ScoreCalibration, parse_parameters
 from optipmb_client.errors import UsageError
 from optipmb_client.files import AtomicText
 
@@ -21,6 +21,7 @@ __all__ = [
     "with_calibration",
     "with_classes",
     "with_heading_sign",
+    "with_score_calibration",
     "with_values",
     "write_profile",
 ]
@@ -64,6 +65,14 @@ def with_calibration(parameters: Parameters, name: str, calibration: Calibration
     """Return the parameters with another calibration of one class."""
     document = parameters.model_dump()
     document["classes"][name]["calibration"] = calibration.model_dump() if calibration else None
+    return _parsed(document)
+
+
+def with_score_calibration(parameters: Parameters, curves: Mapping[str, ScoreCalibration | None]) -> Parameters:
+    """Return the parameters with other score calibrations of some classes."""
+    document = parameters.model_dump()
+    for name, curve in curves.items():
+        document["classes"][name]["score_calibration"] = curve.model_dump() if curve else None
     return _parsed(document)
 
 

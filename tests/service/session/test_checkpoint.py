@@ -101,6 +101,24 @@ def test_fields_of_view_outlive_a_restore() -> None:
     assert state_bytes(one.snapshot()) == state_bytes(other.snapshot())
 
 
+def test_scores_are_calibrated_once_also_over_a_restore() -> None:
+    """The window keeps the scores that came: tracks are those of a session that was sent the calibrated scores."""
+    document = NUSCENES.model_dump()
+    document["classes"]["car"]["score_calibration"] = {"detector": [0.2, 0.4], "calibrated": [0.5, 0.8]}
+    one, other = Session(SENSOR.stream, optipmb.parse_parameters(document)), Session(SENSOR.stream, NUSCENES)
+    found, wanted = Merged(), Merged()
+    for seq in (0, 1, 2, 4, 5, 3, 6):
+        found.take([*one.on_detections(SENSOR.detections(seq, score=np.full(3, 0.3)), 0)], one.run)
+        wanted.take(other.on_detections(SENSOR.detections(seq, score=np.full(3, 0.65)), 0))
+        one = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0)
+        found.take(one.recovered(0), one.run)
+    told, expected = ([message for _, message in merged.newest.values()] for merged in (found, wanted))
+    assert sum(len(message.id) for message in told) > 7
+    for column in ("id", "score", "center", "existence", "covariance"):
+        pairs = zip(told, expected, strict=True)
+        assert all(np.array_equal(getattr(a, column), getattr(b, column)) for a, b in pairs), column
+
+
 def test_rewind_goes_back_over_a_restore() -> None:
     """A frame that was late before the crash and comes after it is put in its place."""
     one, other = (Session(SENSOR.stream, NUSCENES) for _ in range(2))
