@@ -60,17 +60,20 @@ class Library(Way):
         self._publisher = Publisher(self.stream, where, frame="world")
         self._subscriber = Subscriber(self.stream, where)
 
-    def send(self, frame: Detections) -> None:  # noqa: D102 - see `Way`
+    def send(self, frame: Detections) -> None:
+        """Send a frame."""
         columns = {name: getattr(frame, name) for name in ("label", "center", "size", "yaw", "score")}
         self._publisher.publish(stamp_ns=frame.stamp_ns, labels=frame.labels, **columns)
 
-    def receive(self) -> int:  # noqa: D102 - see `Way`
+    def receive(self) -> int:
+        """Wait for the next tracks; return when they came, as `time.monotonic_ns`."""
         tracks = self._subscriber.receive(10.0)
         if tracks is None:
             raise SystemExit(f"no tracks over {self.name}")
         return tracks.monotonic_ns
 
-    def close(self) -> None:  # noqa: D102 - see `Way`
+    def close(self) -> None:
+        """End it."""
         self._publisher.close()
         self._subscriber.close()
 
@@ -86,16 +89,19 @@ class Raw(Way):
         self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._call: Any = None
 
-    def send(self, frame: Detections) -> None:  # noqa: D102 - see `Way`
+    def send(self, frame: Detections) -> None:
+        """Send a frame."""
         self._requests.put(self._packed(frame))
 
-    def receive(self) -> int:  # noqa: D102 - see `Way`
+    def receive(self) -> int:
+        """Wait for the next tracks; return when they came, as `time.monotonic_ns`."""
         if self._call is None:  # a gateway waits for the first message of a call, but not for ever
             self._call = self._channel.stream_stream(self._method)(iter(self._requests.get, None))
         next(self._call)
         return time.monotonic_ns()
 
-    def close(self) -> None:  # noqa: D102 - see `Way`
+    def close(self) -> None:
+        """End it."""
         self._requests.put(None)
         self._channel.close()
 

