@@ -339,14 +339,17 @@ def test_subscriber_takes_names_and_patterns(link: Connection, service: Service,
 
 
 def settle(subscriber: Subscriber, service: Service) -> None:
-    """Wait until what the service puts arrives at the subscriber: its declaration has reached the other session."""
+    """Wait until what the service puts arrives at the subscriber: its declaration has reached the other session.
+
+    The epoch is one that no test uses: a frame of a test must not be a correction of one that came from here.
+    """
     deadline = time.monotonic() + DEADLINE_S
     number = -1
     arrived = None
     while arrived is None:
         assert time.monotonic() < deadline, "nothing arrives"
         number += 1
-        service.tracks(tracks(number, session="f" * 32))
+        service.tracks(tracks(number, epoch=b"settle".ljust(16)))
         arrived = subscriber.receive(0.05)
     while arrived is not None and arrived.tracks.seq != number:
         arrived = subscriber.receive(DEADLINE_S)
