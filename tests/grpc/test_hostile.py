@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import grpc
 import pytest
-from gateway import GatewayProcess, detections, frame, resident
+from gateway import GatewayProcess, connected, detections, frame, resident
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
 
@@ -24,10 +24,6 @@ CONNECTIONS = 2_000
 
 CONNECTION_BYTES = 64 * 2**10
 """Memory that the gateway may take for each of them; it is about 17 KB."""
-
-PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])
-"""How a client of HTTP/2 begins: with this the handshake is over, and the connection is idle."""
-
 
 ALLOWED = 4
 """Connections of the gateway that allows few."""
@@ -51,14 +47,6 @@ def served(gateway: GatewayProcess, stream: str) -> None:
     """Frames are tracked."""
     responses = list(gateway.stub().Track((detections(frame(seq, stream)) for seq in range(5)), timeout=30))
     assert [one.tracks.seq for one in responses] == list(range(5))
-
-
-def connected(gateway: GatewayProcess) -> socket.socket:
-    """A connection without calls."""
-    host, _, port = gateway.address.rpartition(":")
-    one = socket.create_connection((host, int(port)), timeout=10)
-    one.sendall(PREFACE)
-    return one
 
 
 def test_a_message_of_100_mb_is_refused(gateway: GatewayProcess, stream: str) -> None:

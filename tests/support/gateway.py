@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
 
 EPOCH = bytes(range(16))
 STREAM = "garage/robot-1/lidar"
+
+PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])
+"""How a client of HTTP/2 begins: with this the handshake is over, and the connection is idle."""
 
 
 class GatewayProcess(ServiceProcess):
@@ -40,6 +44,14 @@ class GatewayProcess(ServiceProcess):
     def stub(self, options: Sequence[tuple[str, int]] = ()) -> Any:
         """The generated stub on a channel of its own."""
         return rpc.TrackingServiceStub(grpc.insecure_channel(self.address, options=options))
+
+
+def connected(gateway: GatewayProcess) -> socket.socket:
+    """A connection without calls."""
+    host, _, port = gateway.address.rpartition(":")
+    one = socket.create_connection((host, int(port)), timeout=10)
+    one.sendall(PREFACE)
+    return one
 
 
 def resident(pid: int) -> int:

@@ -23,7 +23,7 @@ LONGEST_PAUSE_S: Final = 1.0
 
 OPTIONS: Final = (
     ("grpc.keepalive_time_ms", 10_000),
-    ("grpc.keepalive_timeout_ms", 5_000),
+    ("grpc.http2.ping_timeout_ms", 5_000),  # keepalive_timeout_ms has no effect in grpcio 1.85
     ("grpc.max_receive_message_length", -1),
     ("grpc.max_send_message_length", -1),
     ("grpc.initial_reconnect_backoff_ms", 50),

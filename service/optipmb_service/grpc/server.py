@@ -61,7 +61,7 @@ HEADROOM: Final = 64 * 2**10
 OPTIONS: Final = (
     ("grpc.so_reuseport", 0),  # two gateways on one port would share it without a word
     ("grpc.keepalive_time_ms", 20_000),
-    ("grpc.keepalive_timeout_ms", 10_000),
+    ("grpc.http2.ping_timeout_ms", 10_000),  # keepalive_timeout_ms has no effect in grpcio 1.85
     ("grpc.keepalive_permit_without_calls", 1),
     ("grpc.http2.min_ping_interval_without_data_ms", 5_000),
     ("grpc.max_connection_idle_ms", 300_000),
