@@ -19,7 +19,7 @@ Or as a pure function, from a density and a frame to the next density and tracks
 Pure computation: no files but the profiles, no network, no state outside the density.
 """
 
-from optipmb.class_names import common_name, like
+from optipmb.class_names import class_indices, common_name
 from optipmb.columns import columns_of, density_of
 from optipmb.density import Bernoullis, Density, Poissons
 from optipmb.errors import DensityError, EffortError, FrameError, OptipmbError, ParameterError
@@ -75,11 +75,11 @@ __all__ = [
     "Tracker",
     "Tracks",
     "bev_iou",
+    "class_indices",
     "columns_of",
     "common_name",
     "density_of",
     "generic_parameters",
-    "like",
     "load_profile",
     "make_frame",
     "parse_parameters",

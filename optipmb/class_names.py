@@ -4,7 +4,11 @@
 """
 
 import re
+from functools import lru_cache
 from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 KINDS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
     ("car", ("car", "van", "suv", "vehicle", "auto", "automobile", "taxi", "sedan", "passenger_car", "police",
@@ -38,9 +42,19 @@ def common_name(name: str) -> str | None:
 
 
 def like(name: str, names: tuple[str, ...]) -> str | None:
-    """Return the one of `names` that means the same as `name`; None where there is none, or several."""
+    """Return the one of `names` that means the same as `name`, at best itself; None where there is none, or several."""
+    if name in names:
+        return name
     kind = common_name(name)
     fitting = [one for one in names if one.lower() == name.lower()] or [
         one for one in names if kind is not None and common_name(one) == kind
     ]
     return fitting[0] if len(fitting) == 1 else None
+
+
+@lru_cache(maxsize=64)  # lists of classes, of which a detector has one or a few
+def class_indices(labels: tuple[str, ...], names: tuple[str, ...]) -> NDArray[np.int64]:
+    """Return where in `names` each label has the name that means the same, -1 for none; for looking up only."""
+    found = np.array([names.index(known) if (known := like(label, names)) else -1 for label in labels], dtype=np.int64)
+    found.setflags(write=False)
+    return found

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from optipmb.class_names import class_indices
 from optipmb.compiled import kernel
 from optipmb.errors import FrameError
 from optipmb.field_of_view import FieldOfView, check_view
@@ -197,7 +198,8 @@ def make_frame(
     Args:
         parameters: whose classes are meant.
         stamp_ns: sensor time, nanoseconds, not negative.
-        labels: names of the classes that `label` points into.
+        labels: names of the classes that `label` points into. Names that mean the same as one class of the parameters
+            are that class: `car`, `Car` and `vehicle.car`.
         label: (M,) integers.
         center: (M, 3) geometric centres, m, in the world frame, or in the sensor frame when `pose` is given.
         size: (M, 3) length, width, height, m, all positive.
@@ -239,8 +241,7 @@ def make_frame(
         yaw = np.arctan2(heading[:, 1], heading[:, 0])
         velocity = velocity @ rotation[:2, :2].T
 
-    index = {name: i for i, name in enumerate(parameters.classes)}
-    known = np.array([index.get(name, -1) for name in labels], dtype=np.int64)[which] if m else which
+    known = class_indices(tuple(labels), parameters.labels)[which] if m else which
     calibrate_scores(parameters, known, score)
     source = ((known >= 0) & (score > 0.0)).nonzero()[0]
     if source.shape[0] < m:

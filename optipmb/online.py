@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from optipmb.class_names import like
+from optipmb.class_names import class_indices
 from optipmb.errors import FrameError
 from optipmb.frame import make_frame
 from optipmb.parameters import Parameters, load_profile
@@ -215,9 +215,8 @@ class OnlineTracker:
         if given.dtype.kind in "iu" or not given.size:
             return known, given.astype(np.int64), 0
         found, label = np.unique(given.astype(np.str_), return_inverse=True)
-        names = tuple(like(name, known) or name for name in found.tolist())
-        unknown = [place for place, name in enumerate(names) if name not in known]
-        rows = np.flatnonzero(np.isin(label, unknown))
+        names = tuple(found.tolist())
+        rows = np.flatnonzero(class_indices(names, known)[label] < 0)
         if len(rows) and not self._leave_out:
             expected = f"one of {', '.join(known)} (unknown_classes='leave out' takes any)"
             raise FrameError(f"label[{rows[0]}]", expected, repr(str(given[rows[0]])))

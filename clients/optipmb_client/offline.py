@@ -23,8 +23,8 @@ from optipmb import (
     StepResult,
     Tracker,
     Tracks,
+    class_indices,
     generic_parameters,
-    like,
     load_profile,
     make_frame,
     profile_source,
@@ -42,6 +42,7 @@ __all__ = [
     "NamedTracks",
     "TrackedSequence",
     "doubts",
+    "profile_compared",
     "profile_for",
     "read_profile",
     "track",
@@ -237,23 +238,41 @@ def profile_for(profile: str, sequences: Sequence[DataSequence]) -> Parameters:
         UsageError: There is none, or its content is not valid, or it has no class of the sequences.
     """
     parameters = _made_for(sequences) if profile == AUTO else read_profile(profile)
-    labels = tuple(dict.fromkeys(label for one in sequences for label in one.labels))
-    if labels and not set(labels) & set(parameters.labels):
-        raise UsageError(
-            f"--profile {profile}: it has the classes {', '.join(parameters.labels)}, and the detections are of "
-            f"{', '.join(labels)}: nothing would be tracked{_renamed(labels, parameters.labels)}"
-        )
+    labels = _labels(sequences)
+    if labels and (class_indices(labels, parameters.labels) < 0).all():
+        raise UsageError(_nothing(profile, parameters, labels))
     return parameters
+
+
+def profile_compared(profile: str, sequences: Sequence[DataSequence]) -> Parameters:
+    """Return a profile as `profile_for` does, whose tracks are compared with a truth: class names have to be equal.
+
+    Raises:
+        UsageError: There is none, or its content is not valid, or no class has a name of the sequences.
+    """
+    parameters = profile_for(profile, sequences)
+    labels = _labels(sequences)
+    if labels and not set(labels) & set(parameters.labels):
+        raise UsageError(_nothing(profile, parameters, labels))
+    return parameters
+
+
+def _nothing(profile: str, parameters: Parameters, labels: tuple[str, ...]) -> str:
+    return (
+        f"--profile {profile}: it has the classes {', '.join(parameters.labels)}, and the detections are of "
+        f"{', '.join(labels)}: nothing would be tracked (--profile auto takes any)"
+    )
 
 
 def doubts(parameters: Parameters, sequences: Sequence[DataSequence]) -> Iterator[str]:
     """Yield what does not fit between a profile and the sequences, a line each."""
-    missing = [
-        name for name in dict.fromkeys(n for one in sequences for n in one.labels) if name not in parameters.classes
-    ]
-    if missing:
-        hint = _renamed(missing, parameters.labels)
-        yield f"profile {parameters.name} does not track {', '.join(missing)}: left out{hint}"
+    known = parameters.labels
+    labels = _labels(sequences)
+    found = dict(zip(labels, class_indices(labels, known).tolist(), strict=True))
+    if missing := [name for name, place in found.items() if place < 0]:
+        yield f"profile {parameters.name} does not track {', '.join(missing)}: left out"
+    if renamed := [f"{name} as {known[place]}" for name, place in found.items() if place >= 0 and name != known[place]]:
+        yield f"profile {parameters.name} tracks {', '.join(renamed)}"
     period, nominal = _period(sequences, GLANCE), parameters.nominal_period
     if period is not None and not 1.0 / FAR <= period / nominal <= FAR:
         yield (
@@ -262,9 +281,8 @@ def doubts(parameters: Parameters, sequences: Sequence[DataSequence]) -> Iterato
         )
 
 
-def _renamed(labels: Sequence[str], known: tuple[str, ...]) -> str:
-    pairs = [f"--option class.{name}={alike}" for name in labels if (alike := like(name, known)) is not None]
-    return f" ({' '.join(pairs)} renames classes of a table; --profile auto takes any)" if pairs else ""
+def _labels(sequences: Sequence[DataSequence]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(label for one in sequences for label in one.labels))
 
 
 def _period(sequences: Sequence[DataSequence], frames: int) -> float | None:
@@ -278,7 +296,7 @@ def _period(sequences: Sequence[DataSequence], frames: int) -> float | None:
 
 
 def _made_for(sequences: Sequence[DataSequence]) -> Parameters:
-    labels = tuple(dict.fromkeys(label for one in sequences for label in one.labels))
+    labels = _labels(sequences)
     scores: dict[str, list[float]] = {label: [] for label in labels}
     for one in sequences[:LOOKED_AT]:
         for frame in itertools.islice(one.frames(), LOOKED_INTO):

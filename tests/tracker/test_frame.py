@@ -124,6 +124,17 @@ def test_other_classes_are_left_out_and_counted() -> None:
     assert np.isnan(frame.velocity).all()
 
 
+def test_names_that_mean_the_same_are_one_class() -> None:
+    """A class is found by its own name, else by another name or spelling of it; what could be two is neither."""
+    names = ("Car", "car", "Pedestrian", "Cyclist")
+    labels = ("car", "Car", "vehicle.car", "CYCLIST", "bicycle", "human.pedestrian.adult", "dog", "")
+    np.testing.assert_array_equal(optipmb.class_indices(labels, names), [1, 0, -1, 3, 3, 2, -1, -1])
+    exact, _ = optipmb.make_frame(KITTI, **columns(2, labels=["Car", "Cyclist"], label=[0, 1]))
+    alike, ignored = optipmb.make_frame(KITTI, **columns(2, labels=["vehicle.car", "bicycle"], label=[0, 1]))
+    np.testing.assert_array_equal(alike.label, exact.label)
+    assert ignored == 0
+
+
 @given(seed=st.integers(0, 10_000))
 @settings(deadline=None)
 def test_a_pose_moves_the_detections_to_the_world(seed: int) -> None:

@@ -52,12 +52,12 @@ def ablate(  # noqa: PLR0913  these are the command's options
     All classes of the profile are tracked, those named are shown. FPS are frames per second of the tracker alone.
     """
     from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
-    from optipmb_client.offline import profile_for  # noqa: PLC0415  as above
+    from optipmb_client.offline import profile_compared  # noqa: PLC0415  as above
 
     asked = asked_for(data, dataset, root, detections, option, truth)
     opened, chosen = open_sequences(asked, sequences)
     name = profile or opened.profile
-    parameters = profile_for(name, chosen)
+    parameters = profile_compared(name, chosen)
     source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, classes)
     lengths = [len(clip.frames) for clip in source.clips] * len(tuning.ROWS)
     done = iter(lengths)

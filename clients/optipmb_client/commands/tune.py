@@ -81,7 +81,7 @@ def tune(  # noqa: PLR0913  these are the command's options
     A second call with the same --out goes on where the first one ended.
     """
     from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
-    from optipmb_client.offline import profile_for  # noqa: PLC0415  as above
+    from optipmb_client.offline import profile_compared  # noqa: PLC0415  as above
 
     if not estimate_only:
         needed("optipmb tune", "tune", "optuna")
@@ -91,7 +91,7 @@ def tune(  # noqa: PLR0913  these are the command's options
         raise UsageError("--reference: with --estimate-only, which writes a profile that --profile then tunes")
     asked = asked_for(data, dataset, root, detections, option, truth)
     opened, chosen = open_sequences(asked, sequences)
-    parameters = profile_for(profile or opened.profile, chosen)
+    parameters = profile_compared(profile or opened.profile, chosen)
     curves: tuning.Curves = {}
     if reference is not None:
         parameters, curves = tuning.calibrate_scores(asked, reference, chosen, parameters, classes, out, name)

@@ -79,13 +79,14 @@ def frame_of(parameters: optipmb.Parameters, message: schemas.Detections) -> tup
 
 def unknown_labels(parameters: optipmb.Parameters, message: schemas.Detections) -> dict[str, int]:
     """Return the classes that the profile lacks, with the number of objects of each in the message."""
-    missing = {index: name for index, name in enumerate(message.labels) if name not in parameters.classes}
-    if not missing:
+    missing = (optipmb.class_indices(message.labels, parameters.labels) < 0).nonzero()[0]
+    if not len(missing):
         return {}
     counts = np.bincount(message.label, minlength=len(message.labels))
     unknown: dict[str, int] = {}
-    for index, name in missing.items():
+    for index in missing.tolist():
         if counts[index]:
+            name = message.labels[index]
             unknown[name] = unknown.get(name, 0) + int(counts[index])
     return unknown
 

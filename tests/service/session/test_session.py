@@ -259,6 +259,17 @@ def test_unknown_classes_are_left_out_and_told_once() -> None:
     assert len(problems(one.reset() and feed(one, [3], labels=labels, label=np.array([0, 1, 2])))) == 2
 
 
+def test_other_names_of_a_class_are_tracked() -> None:
+    """A stream that says `vehicle.car` has the tracks of one that says `car`, and no problem."""
+    said, alike = (
+        feed(session(), range(5), labels=labels, label=np.zeros(3, np.int64)) for labels in (("car",), ("vehicle.car",))
+    )
+    assert not problems(alike)
+    for one, other in zip(tracks(said), tracks(alike), strict=True):
+        np.testing.assert_array_equal(one.center, other.center)
+        assert (one.labels, len(one.id)) == (other.labels, len(other.id))
+
+
 def test_reset_forgets_tracks_but_not_frames() -> None:
     """After a reset there are no tracks, ids go on, and frames seen before stay duplicates."""
     one = session()
