@@ -32,7 +32,7 @@ help:
 	@echo "make fuzz    search for bytes that the decoders neither read nor refuse, FUZZ_S=1800 seconds per decoder"
 	@echo "make containers  build the image, run the compose file's stack in containers, and show that it works"
 	@echo "make tune    make the tuned profiles anew from DATA=... (out/tune-*/tuned.toml) and compare them with those that ship"
-	@echo "make ablate  print the tables of docs/ablation.md anew from DATA=..."
+	@echo "make ablate  print the figures of docs/ablation.md and docs/ablation/*.csv from DATA=..."
 	@echo "make docs    build the documentation site into out/site and check its links"
 	@echo "make release test, build and check a release, and print what would publish it"
 	@echo "make clean   remove the virtual environment and everything generated"
