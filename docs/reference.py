@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
 _TABLE: Final = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
-_BOUNDS: Final = {"ge": "≥", "gt": ">", "le": "≤"}
 
 
 def page(text: str) -> str:
@@ -61,18 +60,26 @@ def metrics() -> str:
 
 def _setting(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
     default = field.get_default(call_default_factory=False) if field.default_factory is None else None
-    shown = "required" if field.is_required() else "" if default is None or default == () else f"`{_plain(default)}`"
-    bounds = [
-        f"{sign} {_plain(getattr(rule, kind))}"
+    shown = "required" if field.is_required() else "" if default in (None, (), "") else f"`{_plain(default)}`"
+    bounds = {
+        kind: value
         for rule in field.metadata
-        for kind, sign in _BOUNDS.items()
-        if getattr(rule, kind, None) is not None
-    ]
+        for kind in ("ge", "gt", "le")
+        if (value := getattr(rule, kind, None)) is not None
+    }
+    allowed = _interval(bounds)
     if get_origin(field.annotation) is Literal:
-        bounds = [", ".join(f"`{choice}`" for choice in get_args(field.annotation))]
+        allowed = ", ".join(f"`{choice}`" for choice in get_args(field.annotation))
     if bool in (field.annotation, *get_args(field.annotation)):
-        bounds = ["`true`, `false`"]
-    return f"`{name}`", shown, ", ".join(bounds), field.description or ""
+        allowed = "`true`, `false`"
+    return f"`{name}`", shown, allowed, field.description or ""
+
+
+def _interval(bounds: dict[str, Any]) -> str:
+    low = f"[{_plain(bounds['ge'])}" if "ge" in bounds else f"({_plain(bounds['gt'])}" if "gt" in bounds else ""
+    if "le" in bounds:
+        return f"{low}, {_plain(bounds['le'])}]"
+    return low.replace("[", "≥ ").replace("(", "> ")
 
 
 def _plain(value: Any) -> str:

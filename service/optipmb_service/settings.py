@@ -118,13 +118,13 @@ class Ros2Stream(BaseModel):
         "vision_msgs/msg/Detection3DArray",
         "autoware_perception_msgs/msg/DetectedObjects",
         "autoware_auto_perception_msgs/msg/DetectedObjects",
-    ] = Field(default="vision_msgs/msg/Detection3DArray", description="their type")
+    ] = Field(default="vision_msgs/msg/Detection3DArray", description="type of the detections")
     points: Topic = Field(default="", description="topic of the point clouds; default: none")
     tracks: Topic = Field(
         default="", description="topic of the tracks; default: `/tracks` below that of the detections"
     )
-    classes: dict[str, str] = Field(default_factory=dict, description="names of classes by those in the messages")
-    fixed: bool = Field(default=False, description="the sensor stands still and has no tf: its frame is the world")
+    classes: dict[str, str] = Field(default_factory=dict, description="class names by those in the messages")
+    fixed: bool = Field(default=False, description="the sensor does not move and has no tf: its frame is the world")
 
     @property
     def tracks_topic(self) -> str:
@@ -147,17 +147,15 @@ class Ros2Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     domain: int = Field(default=0, ge=0, le=232, description="`ROS_DOMAIN_ID` of the system")
-    node: str = Field(default="optipmb", pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="name of our node")
+    node: str = Field(default="optipmb", pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="name of the ROS 2 node")
     fixed_frame: str = Field(
-        default="", description="frame of the tracks; default: the one that the first detections' frame hangs from"
+        default="", description="frame of the tracks; default: the root of the tf tree of the first detections"
     )
-    odometry: Topic = Field(
-        default="", description="topic of `nav_msgs/Odometry`, where it tells the pose and tf does not"
-    )
+    odometry: Topic = Field(default="", description="topic of `nav_msgs/Odometry`, when it has the pose and tf has not")
     tf_wait_s: float = Field(default=0.5, ge=0, le=60, description="longest wait of a message for its transform")
     diagnostics: Topic = Field(default="/diagnostics", description="topic of `diagnostic_msgs/DiagnosticArray`")
     streams: Annotated[dict[str, Ros2Stream], AfterValidator(_streams)] = Field(
-        default_factory=dict, description="table of stream (`site/node/sensor`) to its topics"
+        default_factory=dict, description="stream (`site/node/sensor`) to its topics"
     )
 
 
@@ -178,30 +176,30 @@ class Settings(BaseSettings):
     )
     router: bool | None = Field(
         default=None,
-        description="whether this process is a Zenoh router itself; default: yes unless `connect` is given",
+        description="run a Zenoh router in this process; default: yes unless `connect` is given",
     )
     listen: Endpoints | None = Field(
         default=None, description=f"endpoints to listen on; default: `{DEFAULT_LISTEN}` as a router, none as a client"
     )
-    connect: Endpoints = Field(default=(), description="endpoints of the routers to connect to; retried for ever")
+    connect: Endpoints = Field(default=(), description="endpoints of routers to connect to; retried without end")
     zenoh_config: Path | None = Field(
         default=None,
         description="Zenoh configuration file (JSON5) for what has no setting here: TLS, access control, limits of a"
-        " router; the settings hold over it",
+        " router; settings override it",
     )
     shared_memory: bool = Field(
         default=False,
-        description="Zenoh's implicit shared memory; faster for clouds on one host, but it may lose messages and leaves"
+        description="Zenoh's implicit shared memory: faster for clouds on one host, but may lose messages and leaves"
         " files in /dev/shm after a kill",
     )
     profile: str = Field(
-        default="generic", min_length=1, description="profile of streams that no pattern names, a name or a TOML file"
+        default="generic", min_length=1, description="profile name or TOML file, for streams that no pattern matches"
     )
     profiles: dict[str, str] = Field(
         default_factory=dict,
-        description="table of stream pattern (as `site/*/lidar*`) to profile name or file; the first match applies",
+        description="stream pattern (as `site/*/lidar*`) to profile name or file; the first match applies",
     )
-    cloud_wait_s: float = Field(default=0.1, ge=0, le=60, description="longest wait of a frame for its point cloud")
+    cloud_wait_s: float = Field(default=0.1, ge=0, le=60, description="longest wait of a frame for its cloud")
     cloud_memory_s: float = Field(
         default=2.0,
         ge=0,
@@ -209,62 +207,62 @@ class Settings(BaseSettings):
         description="frames without `has_points` wait for a cloud if the stream had one within this time, in stamps",
     )
     gap_limit_s: float = Field(
-        default=5.0, gt=0, le=86400, description="a larger step of the stamps, ahead or back, restarts the session"
+        default=5.0, gt=0, le=86400, description="a larger step of the stamps, forward or back, restarts the session"
     )
     rewind_s: float = Field(
         default=1.0,
         ge=0,
         le=60,
-        description="sensor time within which a late frame is put in its place and tracks are corrected; 0: refused",
+        description="sensor time within which a late frame is inserted and tracks are corrected; 0: late frames are"
+        " refused",
     )
     late_clouds: bool = Field(
-        default=False, description="whether a cloud that comes after its frame was tracked corrects the tracks too"
+        default=False, description="a cloud that arrives after its frame was tracked corrects the tracks"
     )
     recovery_wait_s: float = Field(
-        default=2.0, ge=0, le=60, description="after a restart, longest wait of frames behind a gap for those missing"
+        default=2.0, ge=0, le=60, description="after a restart, longest wait for missing frames"
     )
     max_speed: float = Field(
         default=100.0,
         ge=0,
         le=1e6,
-        description="fastest that a sensor moves, m/s; frames whose pose lies beyond are refused; 0: any pose is taken",
+        description="highest speed of a sensor, m/s; frames with a pose beyond it are refused; 0: no check",
     )
     queue_frames: int = Field(
-        default=256, ge=1, le=65536, description="frames waiting per stream; the oldest is shed beyond it"
+        default=256, ge=1, le=65536, description="frames waiting per stream; beyond it the oldest is dropped"
     )
     queue_clouds: int = Field(
-        default=16, ge=1, le=1024, description="point clouds kept per stream; the oldest is shed beyond it"
+        default=16,
+        ge=1,
+        le=1024,
+        description="clouds waiting per stream, and as many buffered in its session; beyond it the oldest is dropped",
     )
-    workers: int = Field(
-        default=1, ge=1, le=64, description="processes that track, each some of the streams; 1: this process itself"
-    )
+    workers: int = Field(default=1, ge=1, le=64, description="processes that share the streams; 1: this process alone")
     max_pairs: int = Field(
         default=20_000,
         ge=100,
         le=10_000_000,
-        description="pairs of objects near each other that a frame may have; about a microsecond each; a frame with"
-        " more is refused",
+        description="pairs of nearby objects in a frame, about a microsecond each; a frame with more is refused",
     )
     step_limit_s: float = Field(
         default=0.5,
         gt=0,
         le=60,
-        description="processor time that one message may take; a stream that takes more is degraded: its messages are"
-        " refused for nine times as long",
+        description="processor time of one message; a stream that takes more is refused for nine times as long",
     )
     stream_mb: int = Field(
         default=128,
         ge=4,
         le=65536,
-        description="megabytes of messages that a stream may keep: a quarter each for those that wait, clouds, frames"
-        " held, and the window; the oldest go beyond it",
+        description="megabytes of messages per stream, a quarter each for waiting messages, clouds, held frames and"
+        " the window; beyond it the oldest are dropped",
     )
     memory_mb: int = Field(
         default=1024,
         ge=16,
         le=1_048_576,
-        description="megabytes of messages that all streams of a process keep, half of it for those that wait; beyond"
-        " it messages are shed, and the least recently used sessions are closed",
+        description="megabytes of messages per process, half of them for waiting messages; beyond it messages are"
+        " dropped, and the least recently used sessions are closed",
     )
     max_sessions: int = Field(
         default=1000, ge=1, le=100_000, description="streams tracked at once; further ones are refused"
@@ -280,64 +278,71 @@ class Settings(BaseSettings):
     site_rate: int = Field(default=0, ge=0, le=1_000_000, description="messages a second of one site; 0: no limit")
     site_mb_s: int = Field(default=0, ge=0, le=100_000, description="megabytes a second of one site; 0: no limit")
     keep_days: float = Field(
-        default=30.0, ge=0, le=36_500, description="checkpoints of a stream that was silent for this long go; 0: never"
+        default=30.0,
+        ge=0,
+        le=36_500,
+        description="checkpoints of a stream that was silent for this long are deleted; 0: never",
     )
     idle_s: float = Field(
         default=600.0, gt=0, description="a session without a message for this long is closed and freed"
     )
     store: str = Field(
         default="",
-        description="folder of the checkpoints and of quarantined sessions; `none`: nothing is kept, a restart begins"
-        " anew; default: a folder named after prefix and endpoint in `$STATE_DIRECTORY`, else in `optipmb` under"
-        " `$XDG_STATE_HOME` or `~/.local/state`",
+        description="folder of checkpoints and quarantined sessions; `none`: nothing is kept; default: a folder named"
+        " after prefix and endpoint in `$STATE_DIRECTORY`, else in `optipmb` under `$XDG_STATE_HOME` or"
+        " `~/.local/state`",
     )
     checkpoint_s: float = Field(
-        default=1.0, ge=0.05, le=3600, description="time between two checkpoints of a session that changed"
+        default=1.0, ge=0.05, le=3600, description="time between two checkpoints of a changed session"
     )
     lease_s: float = Field(
         default=3.0,
         ge=0.5,
         le=60,
-        description="an instance that is frozen, or cut off, for this long loses its streams to one that stands by",
+        description="an instance that is frozen or cut off for this long loses its streams to a standby",
     )
     standby_s: float = Field(
         default=10.0,
         ge=0,
         le=600,
-        description="how much of a stream that another instance tracks is kept for a takeover; longer than `lease_s`"
-        " and `checkpoint_s` together",
+        description="time for which a standby keeps messages for a takeover; longer than `lease_s` and `checkpoint_s`"
+        " together",
     )
     standby_mb: int = Field(
-        default=256, ge=1, le=65536, description="megabytes kept for takeovers, over all streams; clouds go first"
+        default=256,
+        ge=1,
+        le=65536,
+        description="megabytes that a standby keeps, over all streams; clouds are dropped first",
     )
     stale_s: float = Field(default=2.0, gt=0, description="a stream without a frame for this long is logged as stale")
     stuck_s: float = Field(
         default=5.0,
         ge=1,
         le=600,
-        description="a tracking thread at one piece of work for this long is stuck, and so is a worker that gives no"
-        " sign: the process is not healthy, a worker is ended and replaced",
+        description="a tracking thread busy with one task for this long is stuck, and so is a silent worker: the"
+        " process is not healthy, a worker is replaced",
     )
-    grace_s: float = Field(default=1.0, ge=0, le=60, description="at the end, time for the frames already received")
+    grace_s: float = Field(default=1.0, ge=0, le=60, description="at shutdown, time for the frames already received")
     http: Annotated[str, AfterValidator(_address)] = Field(
         default="",
-        description="where the live page, `/healthz`, `/readyz` and `/metrics` are, as `127.0.0.1:8080`; default: none",
+        description="address of the live page, `/healthz`, `/readyz` and `/metrics`, as `127.0.0.1:8080`; default:"
+        " none",
     )
     http_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)] = Field(
         default=(),
-        description="names with a dot by which the HTTP endpoint may be asked; addresses and names without a dot always"
-        " may; `*`: any",
+        description="host names with a dot that HTTP requests may use; addresses and names without a dot are always"
+        " accepted; `*`: any",
     )
     http_streams: int = Field(
-        default=100, ge=0, le=10_000, description="streams that have series of their own in the metrics, by name"
+        default=100, ge=0, le=10_000, description="streams with series of their own in the metrics, by name"
     )
     grpc: Annotated[str, AfterValidator(_address)] = Field(
-        default="", description="where gRPC is served, as `127.0.0.1:50051`; default: nowhere"
+        default="", description="address of the gRPC server, as `127.0.0.1:50051`; default: none"
     )
     grpc_tls: Path | None = Field(
         default=None,
         description="folder with `key.pem`, `cert.pem` and `ca.pem` for gRPC: callers need a certificate of that"
-        " authority, and its name says what they may do; default: no TLS, everybody may do everything",
+        " authority, whose name determines their rights; default: no TLS, everybody may do everything",
     )
     grpc_names: Path | None = Field(
         default=None, description="JSON list of the names that may call; default: all that have a certificate or token"
@@ -345,21 +350,21 @@ class Settings(BaseSettings):
     grpc_tokens: str = Field(
         default="",
         pattern=r"^([A-Za-z_][\w.]*:[A-Za-z_]\w*)?$",
-        description="`module:function` that turns the metadata of a call into the caller's name; default: none",
+        description="`module:function` that returns the caller's name from the metadata of a call; default: none",
     )
     grpc_calls: int = Field(
-        default=1000, ge=1, le=100_000, description="calls over gRPC that may be open at once; further ones are refused"
+        default=1000, ge=1, le=100_000, description="gRPC calls open at once; further ones are refused"
     )
     grpc_connections: int = Field(
         default=10_000,
         ge=1,
         le=1_000_000,
-        description="connections over gRPC that may be open at once, fewer where the process may not open so many"
-        " files; further ones are closed",
+        description="gRPC connections open at once, fewer where the limit of open files is lower; further ones are"
+        " closed",
     )
     log_format: Literal["console", "json"] = Field(default="console", description="form of the log lines on stderr")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="least level that is logged"
+        default="info", description="lowest level that is logged"
     )
     ros2: Ros2Settings = Field(default=Ros2Settings(), description="topics of ROS 2, for `optipmb-service ros2`")
     limits: LimitSettings = Field(default=LimitSettings(), description="bounds on what one message may hold")
