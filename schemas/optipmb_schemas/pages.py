@@ -15,7 +15,7 @@ from optipmb_schemas.codec import MESSAGES
 from optipmb_schemas.control import SessionSummary
 from optipmb_schemas.errors import CODES
 from optipmb_schemas.limits import DEFAULT
-from optipmb_schemas.messages import Delivery, FieldOfView, Pose
+from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Pose
 from optipmb_schemas.model import Message
 
 _TABLE: Final = re.compile(r"(<!-- table: ([A-Za-z]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -35,7 +35,16 @@ def table(name: str) -> str:
         return _markdown(("limit", "default", "of"), ((f"`{n}`", f"{v:,}", text) for n, v, text in DEFAULT.described()))
     if name == "codes":
         return _markdown(("code", "meaning"), ((f"`{code}`", text) for code, text in CODES.items()))
-    return _markdown(("field", "type", "required", "meaning"), _fields(_KIND[name]))
+    return _markdown(("field", "type", "required", "meaning"), _rows(_KIND[name]))
+
+
+def _rows(kind: type[Message]) -> Iterable[tuple[str, ...]]:
+    """Yield a row per field; those that are as in `Detections` share one."""
+    first = set() if kind is Detections else set(_fields(Detections))
+    rows = list(_fields(kind))
+    if same := [row[0] for row in rows if row in first]:
+        yield ", ".join(same), "", "", "As in `Detections`."
+    yield from (row for row in rows if row not in first)
 
 
 def _fields(kind: type[Message]) -> Iterable[tuple[str, ...]]:
