@@ -53,9 +53,7 @@ def tune(  # noqa: PLR0913  these are the command's options
     classes: Classes = None,
     out: Out = Path("out/tune"),
     name: Annotated[str | None, typer.Option(help="Name of the new profile.", show_default=False)] = None,
-    estimate_only: Annotated[
-        bool, typer.Option("--estimate-only", help="Only what the data say by themselves.")
-    ] = False,
+    estimate_only: Annotated[bool, typer.Option("--estimate-only", help="Estimate, and search nothing.")] = False,
     reference: Annotated[
         str | None,
         typer.Option(
@@ -72,7 +70,7 @@ def tune(  # noqa: PLR0913  these are the command's options
     ] = None,
     degrade: Annotated[int, typer.Option(min=0, help="Degraded copies of the detections beside the plain ones.")] = 1,
     everything: Annotated[bool, typer.Option("--all", help="Search the parameters of the paper's table too.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of all chance.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of every random choice.")] = 0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that track.")] = 1,
     as_json: AsJson = False,
 ) -> None:
@@ -196,16 +194,16 @@ def _report(refined: "Refined") -> Group:
 
 
 def _calibration(refined: "Refined") -> str:
-    """Say how well tracks know themselves."""
+    """Say how well existence and covariance are calibrated."""
     found = refined.calibration
     low, high = found.interval
-    told = "  ".join(
+    shown = "  ".join(
         f"{one.predicted:.2f} -> {one.observed:.2f} ({one.count})" for one in found.deciles if one.count >= LEAST_SHOWN
     )
     whose = "each with the calibration of the others" if len(refined.sequences) > 1 else "that gave the calibration"
     return (
         f"sequences, {whose}: NEES {found.mean:.2f} ({low:.2f} to {high:.2f}, objects being independent), "
-        f"{100.0 * found.coverage:.1f} % of errors in the 95 % ellipse; existence told -> true: {told}"
+        f"{100.0 * found.coverage:.1f} % of errors in the 95 % ellipse; existence predicted -> observed: {shown}"
     )
 
 
