@@ -14,7 +14,7 @@ from optipmb_service.cluster.assignment import worker_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Tracked
 from processes import descendants, wait_until_ended
-from router import Node, Sensor, plain
+from router import Node, Sensor, plain, until
 from service_process import ServiceProcess
 
 import optipmb
@@ -52,12 +52,14 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess
 
 def status_when(node: Node, reached: Callable[[ServiceStatus], bool], instance: str = "pair") -> ServiceStatus:
     """The status, as soon as it is as wanted."""
-    ends = time.monotonic() + DEADLINE_S
-    while True:
-        status = node.ask(KEYS.status(instance), ServiceStatus)
-        if reached(status):
-            return status
-        assert time.monotonic() < ends, status
+    asked: list[ServiceStatus] = []
+
+    def is_reached() -> bool:
+        asked.append(node.ask(KEYS.status(instance), ServiceStatus))
+        return reached(asked[-1])
+
+    until(is_reached, "the status is as wanted")
+    return asked[-1]
 
 
 def arrived(node: Node, stream: str, seq: int) -> None:

@@ -169,4 +169,5 @@ class Party:
         frames = -1
         while frames != count and time.monotonic() < ends:
             frames = sum(decode(status, ServiceStatus).frames for status in self.ask(Keys().all_status()))
+            time.sleep(0.02)  # no message says it
         return frames

@@ -297,4 +297,4 @@ def until(true: Callable[[], bool], what: str, deadline_s: float = DEADLINE_S) -
     while not true():
         if time.monotonic() > ends:
             raise AssertionError(f"{what} within {deadline_s:g} s")
-        pause.wait(0.01)
+        pause.wait(0.03)  # asking costs the processor that is waited for

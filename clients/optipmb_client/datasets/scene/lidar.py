@@ -3,7 +3,7 @@
 Conventions: the sensor stands level at the origin of its frame, x forward, z up, metres, radians. The scan is taken at
 one instant. Rays are beams (elevations) by azimuths. As all boxes stand upright, a ray meets the sides of a box at a
 horizontal distance that depends on its azimuth alone, and its top, its bottom and the ground at one that depends on its
-elevation alone; so the test of a box against its sector of the scan is one comparison per ray.
+elevation alone; so the test of a box against its sector of the scan is one comparison per ray, for all boxes at once.
 """
 
 from dataclasses import dataclass
@@ -65,45 +65,48 @@ def cast(center: Floats, size: Floats, yaw: Floats, height: float) -> tuple[Floa
     owner = np.full(distance.shape, GROUND, dtype=np.int64)
     far = distance > RANGE * _COSINE[:, None]
     distance[far], owner[far] = np.inf, NOTHING
-    aimed = np.zeros(len(center))
     bearing = np.arctan2(center[:, 1], center[:, 0])
     corners = box_corners(center, size, yaw)[:, :4, :2]
     spread = wrap_angle(np.arctan2(corners[..., 1], corners[..., 0]) - bearing[:, None])
-    for i in range(len(center)):
-        first = int(np.ceil((bearing[i] + spread[i].min() + np.pi) / _STEP))
-        last = int(np.floor((bearing[i] + spread[i].max() + np.pi) / _STEP))
-        if last < first:
-            continue
-        columns = np.arange(first, last + 1) % AZIMUTHS
-        enter, leave = _sides(center[i], size[i], float(yaw[i]), _AZIMUTH[columns])
-        low, high = _heights(center[i, 2] - 0.5 * size[i, 2], center[i, 2] + 0.5 * size[i, 2])
-        near = np.maximum(enter[None, :], low[:, None])
-        hit = (near <= np.minimum(leave[None, :], high[:, None])) & (near < RANGE * _COSINE[:, None])
-        aimed[i] = hit.sum()
-        closer = hit & (near < distance[:, columns])
-        rows, places = np.nonzero(closer)
-        distance[rows, columns[places]] = near[rows, places]
-        owner[rows, columns[places]] = i
+    first = np.ceil((bearing + spread.min(axis=1) + np.pi) / _STEP).astype(np.int64)
+    last = np.floor((bearing + spread.max(axis=1) + np.pi) / _STEP).astype(np.int64)
+    # The azimuths of all boxes one after the other: (C,) of which box, and which.
+    width = np.maximum(last - first + 1, 0)
+    box = np.repeat(np.arange(len(center)), width)
+    column = (np.arange(len(box)) - np.repeat(np.cumsum(width) - width - first, width)) % AZIMUTHS
+    enter, leave = _sides(center[box], size[box], yaw[box], _AZIMUTH[column])
+    low, high = _heights(center[:, 2] - 0.5 * size[:, 2], center[:, 2] + 0.5 * size[:, 2])
+    near = np.maximum(enter[:, None], low[box])
+    hit = (near <= np.minimum(leave[:, None], high[box])) & (near < RANGE * _COSINE)
+    aimed = np.bincount(box, hit.sum(axis=1), len(center))
+    # Of the boxes that a ray meets the nearest one is taken, of equally near ones the first.
+    place, beam = np.nonzero(hit)
+    ray, met, reach = beam * AZIMUTHS + column[place], box[place], near[place, beam]
+    order = np.lexsort((reach, ray))
+    nearest = order[np.diff(ray[order], prepend=-1) > 0]
+    nearest = nearest[reach[nearest] < distance.ravel()[ray[nearest]]]
+    np.put(distance, ray[nearest], reach[nearest])
+    np.put(owner, ray[nearest], met[nearest])
     stopped = aimed - np.bincount(owner[owner >= 0], minlength=len(center))
     return distance, owner, np.where(aimed > 0, stopped / np.maximum(aimed, 1.0), np.nan)
 
 
-def _sides(center: Floats, size: Floats, yaw: float, azimuth: Floats) -> tuple[Floats, Floats]:
-    """Return the horizontal distances (C,) at which rays of these azimuths enter and leave the outline of a box."""
+def _sides(center: Floats, size: Floats, yaw: Floats, azimuth: Floats) -> tuple[Floats, Floats]:
+    """Return the horizontal distances (C,) at which rays of these azimuths enter and leave the outlines of C boxes."""
     cos, sin = np.cos(yaw), np.sin(yaw)
-    origin = (-cos * center[0] - sin * center[1], sin * center[0] - cos * center[1])
+    origin = (-cos * center[:, 0] - sin * center[:, 1], sin * center[:, 0] - cos * center[:, 1])
     enter, leave = np.zeros(len(azimuth)), np.full(len(azimuth), np.inf)
     for axis, way in enumerate((np.cos(azimuth - yaw), np.sin(azimuth - yaw))):
         slope = np.where(np.abs(way) < _PARALLEL, _PARALLEL, way)
-        a, b = (-0.5 * size[axis] - origin[axis]) / slope, (0.5 * size[axis] - origin[axis]) / slope
+        a, b = (-0.5 * size[:, axis] - origin[axis]) / slope, (0.5 * size[:, axis] - origin[axis]) / slope
         enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
     return enter, leave
 
 
-def _heights(bottom: float, top: float) -> tuple[Floats, Floats]:
-    """Return the horizontal distances (beams,) between which each beam is between two heights over the sensor."""
+def _heights(bottom: Floats, top: Floats) -> tuple[Floats, Floats]:
+    """Return the horizontal distances (N, beams) between which the beams are between two heights (N,)."""
     slope = np.where(np.abs(_TANGENT) < _PARALLEL, _PARALLEL, _TANGENT)
-    a, b = bottom / slope, top / slope
+    a, b = bottom[:, None] / slope, top[:, None] / slope
     return np.maximum(np.minimum(a, b), 0.0), np.maximum(a, b)
 
 
@@ -118,8 +121,8 @@ def scan(center: Floats, size: Floats, yaw: Floats, height: float, rng: np.rando
     kept: Bools = rng.random(len(reach)) >= lost
     reach = reach + rng.laplace(0.0, 0.012, len(reach)) * (1.0 + part)
     beam, column, target, reach = beam[kept], column[kept], target[kept], reach[kept]
-    level, azimuth = reach * _COSINE[beam], _AZIMUTH[column]
-    xyz = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), reach * np.sin(BEAMS[beam])])
+    level, cos, sin = reach * _COSINE[beam], np.cos(_AZIMUTH)[column], np.sin(_AZIMUTH)[column]
+    xyz = np.column_stack([level * cos, level * sin, reach * np.sin(BEAMS)[beam]])
     return Scan(
         xyz.astype(np.float32),
         target,

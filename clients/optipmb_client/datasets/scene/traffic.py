@@ -8,6 +8,7 @@ cross. A body lies on its path with both axles, as a car does that is steered at
 model of a tracker.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,11 +95,14 @@ class Vehicles:
         discs = center[:, None] + part[None, :, None] * (reach[:, None] * heading)[:, None]
         ahead = np.arange(1.0, _LOOK_AHEAD, 1.0)
         way = interpolate(self._points, self._all[:, None], self._s[:, None] + 0.5 * self._length[:, None] + ahead)
-        close = np.full((len(center), len(ahead), len(center)), np.inf)
-        for k in range(3):
-            close = np.minimum(close, np.linalg.norm(way[:, :, None] - discs[None, None, :, k], axis=3))
-        touch = np.asarray(close < 0.5 * (self._width[:, None] + self._width)[:, None, :] + 0.35, dtype=np.bool_)
-        touch[self._all, :, self._all] = False
+        # Who is too far away to be met is left out. Way and discs of each pair: (P, A, 1, 2) and (P, 1, 3, 2).
+        apart = np.linalg.norm(center[:, None] - center, axis=2)
+        far = _LOOK_AHEAD + 0.5 * (self._length[:, None] + self._length) + self._width[:, None] + self._width
+        one, two = np.nonzero((apart < far) & (self._all[:, None] != self._all))
+        offset = way[one, :, None] - discs[two, None]
+        close = np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2).min(axis=2)
+        touch = np.zeros((len(center), len(ahead), len(center)), dtype=np.bool_)
+        touch[one, :, two] = close < 0.5 * (self._width[one] + self._width[two])[:, None] + 0.35
         hit = touch.any(axis=2)
         first = np.asarray(hit.argmax(axis=1), dtype=np.int64)
         blocked = np.take_along_axis(hit, first[:, None], axis=1)[:, 0]
@@ -170,8 +174,8 @@ class Walkers:
             stop = min(self._kerb(i, h, crossing), self._resting_place(i, h))
             speed = self._speed[i]
             index = min(int(s / STEP), len(route.limit) - 1)
-            wanted = min(route.limit[index], np.sqrt(max(0.0, 2.0 * _WALK_ACCELERATION * (stop - s - 0.05))))
-            new = speed + np.clip(wanted - speed, -2.0 * _WALK_ACCELERATION * h, _WALK_ACCELERATION * h)
+            wanted = min(float(route.limit[index]), math.sqrt(max(0.0, 2.0 * _WALK_ACCELERATION * (stop - s - 0.05))))
+            new = speed + min(max(wanted - speed, -2.0 * _WALK_ACCELERATION * h), _WALK_ACCELERATION * h)
             self._s[i] = s + 0.5 * h * (speed + new)
             self._speed[i] = new
 
