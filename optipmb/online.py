@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from optipmb.extract import Tracks
     from optipmb.field_of_view import FieldOfView
     from optipmb.frame import PointCloud, Pose
+    from optipmb.paths import PredictedPaths
     from optipmb.tracker import Modules
 
     Array = NDArray[np.float64]
@@ -53,6 +54,7 @@ class OnlineTracks:
         velocity: (N, 2) over ground, m/s; NaN while it is unknown: before the second detection, where the detector
             gives none.
         left_out: detections of classes that the profile lacks.
+        paths: where the tracks will be at the `horizons` of the profile; None where it has none.
     """
 
     stamp_ns: int
@@ -60,6 +62,7 @@ class OnlineTracks:
     name: NDArray[np.str_]
     velocity: Array
     left_out: int
+    paths: PredictedPaths | None = None
 
     def __len__(self) -> int:
         return len(self.tracks)
@@ -206,6 +209,7 @@ class OnlineTracker:
             name=np.asarray(self.parameters.labels, dtype=np.str_)[tracks.label],
             velocity=np.where(once[:, None], np.nan, tracks.velocity),
             left_out=max(left_out, missing),
+            paths=result.paths,
         )
 
     def _classes(self, values: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.int64], int]:

@@ -14,8 +14,9 @@ import tomllib
 from difflib import get_close_matches
 from importlib import resources
 from itertools import pairwise
+from operator import not_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -35,6 +36,22 @@ def _printable(name: str) -> str:
     if not name.isprintable():
         raise ValueError("a name of printable characters")
     return name
+
+
+MAX_HORIZON_S: Final = 30.0
+"""Farthest horizon of a predicted path, s."""
+
+MAX_HORIZONS: Final = 100
+"""Most horizons of a predicted path."""
+
+HORIZONS: Final = f"at most {MAX_HORIZONS} ascending times above 0 s up to {MAX_HORIZON_S:g} s"
+
+
+def _ascending(horizons: tuple[float, ...]) -> tuple[float, ...]:
+    ordered = all(before < later for before, later in pairwise((0.0, *horizons)))
+    if len(horizons) > MAX_HORIZONS or not ordered or (horizons and horizons[-1] > MAX_HORIZON_S):
+        raise ValueError(HORIZONS)
+    return horizons
 
 
 ClassName = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable)]
@@ -283,6 +300,11 @@ class Parameters(_Table):
         default=False,
         description="true: p_d holds per nominal period, and a miss weighs by its time where frames come faster; "
         "false: per frame (the paper)",
+    )
+    horizons: Annotated[tuple[float, ...], AfterValidator(_ascending)] = Field(
+        default=(),
+        exclude_if=not_,  # a profile without is the document that it was before there were horizons
+        description=f"times ahead, s, at which tracks carry their predicted path, {HORIZONS}; none: no paths",
     )
     provenance: str = Field(default="", max_length=10_000, description="where the values come from")
     classes: Annotated[dict[ClassName, ClassParameters], Field(min_length=1, max_length=256)] = Field(

@@ -18,6 +18,7 @@ from optipmb.density import PHI, STATE, Density, copy_state
 from optipmb.errors import DensityError, FrameError
 from optipmb.heading import doubt
 from optipmb.motion import predict_state
+from optipmb.parameters import HORIZONS, MAX_HORIZON_S, MAX_HORIZONS
 from optipmb.records import record
 from optipmb.soundness import sound, unsound
 from optipmb.table import ClassTable
@@ -32,12 +33,6 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
-
-MAX_HORIZON_S: Final = 30.0
-"""Farthest horizon, s."""
-
-MAX_HORIZONS: Final = 100
-"""Most horizons of a call."""
 
 MAX_STEPS: Final = 1000
 """Most steps of a path, whatever the nominal period."""
@@ -111,28 +106,32 @@ def predict_tracks(
     if label.size and not 0 <= label.min() <= label.max() < len(parameters.labels):
         classes = f"indices below {len(parameters.labels)}"
         raise FrameError("tracks.label", classes, f"{label.min()} to {label.max()}")
+    return paths_of(tracks, times, table)
+
+
+def paths_of(tracks: Tracks, times: Array, table: ClassTable) -> PredictedPaths:
+    """Predict tracks that are known to be of the classes of the table, to times that are known to ascend."""
     speed = tracks.velocity[:, 0] * np.cos(tracks.yaw) + tracks.velocity[:, 1] * np.sin(tracks.yaw)
     mean = np.column_stack((tracks.center[:, :2], speed, tracks.yaw, tracks.yaw_rate, tracks.acceleration))
     unsure = _doubts(tracks.heading_confidence)
     covariance = tracks.covariance.copy()
     covariance[:, PHI, PHI] -= unsure
-    paths = _predict(tracks.id, label, mean, covariance, times, table)
+    paths = _predict(tracks.id, tracks.label, mean, covariance, times, table)
     paths.covariance[:, :, PHI, PHI] += unsure[:, None]
     return paths
 
 
 def _horizons(values: Sequence[float] | Array) -> Array:
-    expected = f"at most {MAX_HORIZONS} ascending times above 0 s up to {MAX_HORIZON_S:g} s"
     try:
         times = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise FrameError("horizons", expected, repr(values)[:200]) from None
+        raise FrameError("horizons", HORIZONS, repr(values)[:200]) from None
     if times.ndim != 1 or times.size > MAX_HORIZONS:
-        raise FrameError("horizons", expected, f"an array of shape {times.shape}")
+        raise FrameError("horizons", HORIZONS, f"an array of shape {times.shape}")
     before = np.concatenate((np.zeros(1), times[:-1]))[: times.size]
     wrong = np.flatnonzero(~((times > before) & (times <= MAX_HORIZON_S)))
     if wrong.size:
-        raise FrameError(f"horizons[{wrong[0]}]", expected, f"{times[wrong[0]]:g}")
+        raise FrameError(f"horizons[{wrong[0]}]", HORIZONS, f"{times[wrong[0]]:g}")
     return times
 
 

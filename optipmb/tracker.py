@@ -19,6 +19,7 @@ from optipmb.extract import extract
 from optipmb.field_of_view import detection_probability_in_view, follow_looks, look
 from optipmb.hypotheses import enumerate_hypotheses
 from optipmb.lightweight import light_weight_filter
+from optipmb.paths import paths_of
 from optipmb.predict import predict
 from optipmb.preprocess import preprocess
 from optipmb.prune import surviving_objects
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from optipmb.frame import Frame, PointCloud
     from optipmb.hypotheses import Hypotheses
     from optipmb.parameters import Parameters
+    from optipmb.paths import PredictedPaths
     from optipmb.preprocess import Measurements
     from optipmb.prune import Survivors
 
@@ -106,11 +108,12 @@ class Diagnostics:
 
 @record
 class StepResult:
-    """Posterior density, extracted tracks and diagnostics of one step."""
+    """Posterior density, extracted tracks and diagnostics of one step; paths where the profile has horizons."""
 
     density: Density
     tracks: Tracks
     diagnostics: Diagnostics
+    paths: PredictedPaths | None = None
 
 
 class Tracker:
@@ -150,6 +153,7 @@ class Tracker:
         self.modules = modules if modules is not None else Modules()
         self._clock = clock
         self._table = ClassTable.of(parameters)
+        self._horizons = np.array(parameters.horizons, np.float64)
 
     def initial(self, next_id: int = 1) -> Density:
         """Return the density before the first frame."""
@@ -228,6 +232,7 @@ class Tracker:
         posterior = Density(now, predicted.next_id + born, objects, undetected, density.labels, misses)
         since_ns = posterior.missed_from_ns
         tracks = extract(objects, since_ns, survivors.measurement, measurements, now, table, two_thresholds=modules.ote)
+        paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None
         times.append(clock())
 
         diagnostics = Diagnostics(
@@ -240,7 +245,7 @@ class Tracker:
             repaired + repaired_now,
             tuple(map(sub, times[1:], times)),  # stage_ns
         )
-        return StepResult(posterior, tracks, diagnostics)
+        return StepResult(posterior, tracks, diagnostics, paths)
 
     def _check(self, density: Density, frame: Frame) -> None:
         """Refuse what kernels would read or write out of bounds for."""

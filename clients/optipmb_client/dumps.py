@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Pose, Tracks, decode_dump
+from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Pose, Tracks, decode_dump, path_fields
 
 import optipmb
 from optipmb_client.errors import UsageError
@@ -112,6 +112,8 @@ def _step(
     )
     found = steps.step(density, frame)
     columns = {column.name: getattr(found.tracks, column.name) for column in fields(found.tracks)}
+    if (paths := found.paths) is not None:
+        columns |= path_fields(paths.horizons, paths.mean, paths.covariance)
     Tracks(
         stream=message.stream,
         epoch=message.epoch,

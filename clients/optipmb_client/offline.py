@@ -8,10 +8,15 @@ import itertools
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from optipmb_schemas import path_fields
 
 from optipmb import (
     FieldOfView,
@@ -20,6 +25,7 @@ from optipmb import (
     Parameters,
     PointCloud,
     Pose,
+    PredictedPaths,
     StepResult,
     Tracker,
     Tracks,
@@ -27,6 +33,7 @@ from optipmb import (
     generic_parameters,
     load_profile,
     make_frame,
+    predict_tracks,
     profile_source,
     profiles,
     warm_up,
@@ -34,7 +41,7 @@ from optipmb import (
 from optipmb_client.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.geometry import Floats, Ints
-from optipmb_client.recording import Latency, Results, latency, selected_frames
+from optipmb_client.recording import Latency, Results, horizons_for, latency, selected_frames
 from optipmb_client.smoothing import Smoother
 
 __all__ = [
@@ -70,6 +77,32 @@ class NamedTracks:
 
     tracks: Tracks
     labels: tuple[str, ...]
+    paths: PredictedPaths | None = None
+
+    @cached_property
+    def _path_fields(self) -> dict[str, NDArray[Any]]:
+        """The predicted paths as messages have them."""
+        return {} if self.paths is None else path_fields(self.paths.horizons, self.paths.mean, self.paths.covariance)
+
+    @property
+    def horizons(self) -> Floats | None:
+        """(H,) of the predicted paths; this and the next three are None without paths."""
+        return self._path_fields.get("horizons")
+
+    @property
+    def path_position(self) -> Floats | None:
+        """(N, H, 2)."""
+        return self._path_fields.get("path_position")
+
+    @property
+    def path_yaw(self) -> NDArray[np.float32] | None:
+        """(N, H)."""
+        return self._path_fields.get("path_yaw")
+
+    @property
+    def path_covariance(self) -> NDArray[np.float32] | None:
+        """(N, H, 2, 2)."""
+        return self._path_fields.get("path_covariance")
 
     @property
     def id(self) -> Ints:
@@ -321,7 +354,7 @@ def track_sequence(
     """
     names = tuple(parameters.classes)
     for given, result, left_out, took in _steps(parameters, sequence, classes, modules):
-        yield given, NamedTracks(result.tracks, names), left_out, took
+        yield given, NamedTracks(result.tracks, names, result.paths), left_out, took
 
 
 def _steps(
@@ -375,7 +408,7 @@ def run(job: Job, sequence: DataSequence | None = None, on_frame: Callable[[], N
     names = tuple(job.parameters.classes)
     smoother = Smoother(job.parameters) if job.smooth else None
     for frame, result, missed, took in _steps(job.parameters, sequence, job.classes, job.modules):
-        results[frame.index] = NamedTracks(result.tracks, names)
+        results[frame.index] = NamedTracks(result.tracks, names, result.paths)
         if smoother is not None:
             smoother.add(frame.index, result.density, result.tracks)
         steps.append(took)
@@ -384,8 +417,14 @@ def run(job: Job, sequence: DataSequence | None = None, on_frame: Callable[[], N
         left_out += missed
         on_frame()
     if smoother is not None:
-        results = {index: NamedTracks(tracks, names) for index, tracks in smoother.tracks()}
+        results = {index: _with_paths(job.parameters, NamedTracks(one, names)) for index, one in smoother.tracks()}
     return Tracked(results, clouds, detections, left_out, tuple(steps), time.monotonic() - begun)
+
+
+def _with_paths(parameters: Parameters, named: NamedTracks) -> NamedTracks:
+    """Return tracks with the paths that the profile asks for."""
+    horizons = parameters.horizons
+    return replace(named, paths=predict_tracks(named.tracks, horizons, parameters)) if horizons else named
 
 
 def track(  # noqa: PLR0913  one argument per decision of the caller
@@ -412,6 +451,8 @@ def track(  # noqa: PLR0913  one argument per decision of the caller
         UsageError: No such class, or values that the tracker refuses.
     """
     results = Results(dataset, out, full=full)
+    if (horizons := horizons_for(out)) is not None:
+        parameters = parameters.model_copy(update={"horizons": horizons})
     work = [Job(data, sequence.name, parameters, tuple(classes), modules, smooth) for sequence in sequences]
     done = (
         run_jobs(work, jobs)

@@ -15,7 +15,7 @@ from optipmb_client.results.full import FullRows, full_path, write_full
 from optipmb_client.results.table import TrackColumns, join
 from optipmb_client.table_files import Columns, is_table, write_table
 
-__all__ = ["Latency", "Preloaded", "Results", "latency", "selected_frames"]
+__all__ = ["Latency", "Preloaded", "Results", "horizons_for", "latency", "selected_frames"]
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,15 @@ def selected_frames(sequence: DataSequence, classes: Sequence[str]) -> Iterator[
             score=frame.score[rows],
             velocity=None if frame.velocity is None else frame.velocity[rows],
         )
+
+
+def horizons_for(out: Path) -> tuple[float, ...] | None:
+    """Return the horizons of the predicted paths that a result needs: a bag of ROS 2; None: those of the profile."""
+    if out.suffix != ".mcap":
+        return None
+    from optipmb_schemas.ros2.tracks import HORIZONS  # noqa: PLC0415  packages of an extra
+
+    return HORIZONS
 
 
 class Results:

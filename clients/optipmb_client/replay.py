@@ -17,12 +17,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 from optipmb_schemas import PREFIX, Problem, SessionParameters, Tracks
 
 from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame
 from optipmb_client.links import Link
 from optipmb_client.publisher import Publisher
-from optipmb_client.recording import Latency, Results, latency, selected_frames
+from optipmb_client.recording import Latency, Results, horizons_for, latency, selected_frames
 from optipmb_client.sessions import close_session, set_parameters
 from optipmb_client.subscriber import Subscriber
 
@@ -103,7 +104,7 @@ def replay(  # noqa: PLR0913  one argument per decision of the caller
     """
     run = f"{dataset.name}-{secrets.token_hex(3)}"
     results = Results(dataset, out, full=full)
-    task = _Task(connection, results, profile, pace, classes, prefix, on_frame)
+    task = _Task(connection, results, profile, horizons_for(out), pace, classes, prefix, on_frame)
     work = [_Replay(task, sequence, f"replay/{run}/{sequence.name}") for sequence in sequences]
     with concurrent.futures.ThreadPoolExecutor(max_workers=streams, thread_name_prefix="replay") as pool:
         try:
@@ -153,6 +154,7 @@ class _Task:
     connection: Link
     results: Results
     profile: str
+    horizons: Sequence[float] | None
     pace: Pace
     classes: Sequence[str]
     prefix: str
@@ -199,7 +201,8 @@ class _Replay:
             ) as publisher,
         ):
             self._epoch = publisher.epoch
-            wanted = SessionParameters(profile=self.task.profile, cloud_wait_s=CLOUD_WAIT_S)
+            horizons = None if self.task.horizons is None else np.array(self.task.horizons)
+            wanted = SessionParameters(profile=self.task.profile, cloud_wait_s=CLOUD_WAIT_S, horizons=horizons)
             set_parameters(
                 self.task.connection, self.stream, wanted, prefix=self.task.prefix, patience_s=self.task.pace.service_s
             )

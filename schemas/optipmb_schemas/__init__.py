@@ -21,13 +21,24 @@ from optipmb_schemas.dump import STORED, Dump, DumpedFrame, decode_dump, encode_
 from optipmb_schemas.errors import CODES, Code, MessageError
 from optipmb_schemas.keys import PREFIX, Keys, Query, Topic
 from optipmb_schemas.limits import DEFAULT, Limits
-from optipmb_schemas.messages import Delivery, Density, Detections, FieldOfView, Points, Pose, Tracks
+from optipmb_schemas.messages import (
+    PATHS,
+    Delivery,
+    Density,
+    Detections,
+    FieldOfView,
+    Points,
+    Pose,
+    Tracks,
+    path_fields,
+)
 from optipmb_schemas.model import Message
 
 __all__ = [
     "CODES",
     "DEFAULT",
     "MESSAGES",
+    "PATHS",
     "PREFIX",
     "STORED",
     "Array",
@@ -61,5 +72,6 @@ __all__ = [
     "encode_json",
     "encoding_of",
     "pack_columns",
+    "path_fields",
     "read_columns",
 ]

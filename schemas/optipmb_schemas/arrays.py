@@ -5,7 +5,7 @@ is given (an array of another number type, nested lists), what it holds afterwar
 dtype of the description, native byte order, C-contiguous, aligned and read-only. Compiled code that is specialised on
 array types therefore sees one type. An array that is all this already is held as a view, without a copy.
 
-A letter is a symbolic number of rows: equal letters are equal numbers within one message (`Message` compares them).
+A letter is a symbolic dimension: equal letters are equal numbers within one message (`Message` compares them).
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Array:
 
     Attributes:
         dtype: `f4`, `f8` or `i8`: what the field holds.
-        shape: the first dimension may be a letter, the others are numbers.
+        shape: numbers, or letters for symbolic dimensions, the first of which is a number of rows.
         low, high: range of every value, both ends included. NaN and infinity are in no range.
         above: the values must be greater than `low`, not equal.
         unknown: a row may be all NaN (null in JSON), which means that it is not known for this object.
@@ -53,6 +53,11 @@ class Array:
         """The letter of the symbolic number of rows."""
         return self.shape[0] if isinstance(self.shape[0], str) else None
 
+    @cached_property
+    def letters(self) -> tuple[tuple[int, str], ...]:
+        """The symbolic dimensions: which one it is, and its letter."""
+        return tuple((axis, want) for axis, want in enumerate(self.shape) if isinstance(want, str))
+
     @property
     def shape_described(self) -> str:
         """The shape for people, as `(M, 3)`."""
@@ -68,12 +73,16 @@ class Array:
         )
 
     def check_shape(self, shape: tuple[int, ...]) -> None:
-        """Refuse a shape that the description does not allow. A symbolic number of rows may be anything here."""
+        """Refuse a shape that the description does not allow. A symbolic dimension may be anything here."""
         columns = self.shape[-1]
         if self.wider and isinstance(columns, int) and len(shape) > 1 and columns < shape[-1] <= MAX_COLUMNS:
             shape = (*shape[:-1], columns)
         if shape[1:] == self.shape[1:] and len(shape) == len(self.shape) and (self.rows or shape == self.shape):
             return
+        if len(self.letters) > 1 and len(shape) == len(self.shape):
+            wanted = zip(self.shape, shape, strict=True)
+            if all(want == length or isinstance(want, str) for want, length in wanted):
+                return
         raise MessageError("invalid_value", "", f"shape {self.shape_described}", f"shape {cut(shape_text(shape))}")
 
     def validate(self, value: object) -> NDArray[Any]:
@@ -111,8 +120,8 @@ class Array:
         level: list[Any] = [value]
         shape: tuple[int, ...] = ()
         for depth, want in enumerate(self.shape):
-            if not level:  # no rows: their lengths are the described ones
-                return [], (*shape, *(n for n in self.shape[depth:] if isinstance(n, int)))
+            if not level:  # no rows: their lengths are the described ones, and a symbolic one is not known
+                return [], (*shape, *(n if isinstance(n, int) else 0 for n in self.shape[depth:]))
             if not set(map(type, level)) <= {list, tuple}:
                 at = next(i for i, item in enumerate(level) if type(item) not in {list, tuple})
                 expected = "a list" if depth else f"an array of shape {self.shape_described}"

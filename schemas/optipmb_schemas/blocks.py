@@ -6,6 +6,7 @@ optional field `pad`), so that the receiver's view is aligned.
 """
 
 import sys
+from collections.abc import Sequence
 from functools import lru_cache
 from math import prod
 from typing import Any, Final
@@ -42,18 +43,23 @@ def read_array(value: object, description: Array, limits: Limits) -> NDArray[Any
             described or above a limit. The values are not checked here.
     """
     if isinstance(value, dict):
-        array = _read_block(value, description)
-    elif isinstance(value, list):
-        array = description.from_lists(value)
-    else:
+        return _read_block(value, description, limits)
+    if not isinstance(value, list):
         raise invalid("", f"an array of shape {description.shape_described}", value)
-    most = limits.rows(description.rows) if description.rows else len(array)
-    if len(array) > most:
-        raise MessageError("too_large", "", f"at most {most} rows", f"{len(array)} rows")
+    array = description.from_lists(value)
+    _check_lengths(array.shape, description, limits)
     return array
 
 
-def _read_block(block: dict[str, Any], description: Array) -> NDArray[Any]:
+def _check_lengths(shape: Sequence[int], description: Array, limits: Limits) -> None:
+    for axis, letter in description.letters:
+        most, length = limits.rows(letter), shape[axis]
+        if length > most:
+            what = "of dimension " + letter if axis else "rows"
+            raise MessageError("too_large", "", f"at most {most} {what}", f"{length} {what}")
+
+
+def _read_block(block: dict[str, Any], description: Array, limits: Limits) -> NDArray[Any]:
     for name in ("dtype", "shape", "data"):
         if block.get(name) is None:
             raise MessageError("missing_field", name, "a value", "nothing")
@@ -72,6 +78,7 @@ def _read_block(block: dict[str, Any], description: Array) -> NDArray[Any]:
     size = prod(shape) * dtype.itemsize  # integers of Python do not overflow
     if size != len(data):
         raise invalid("data", f"{size} bytes, from dtype and shape", data)
+    _check_lengths(shape, description, limits)
     return np.frombuffer(data, dtype).reshape(shape) if size else np.empty(shape, dtype)
 
 

@@ -10,6 +10,7 @@ from optipmb_schemas.fields import (
     Count,
     Epoch,
     Flag,
+    Horizons,
     Name,
     NonNegative,
     Plain,
@@ -28,6 +29,11 @@ class SessionParameters(Message):
     profile: Name | None = Field(default=None, description="Name of a profile of the service, such as `nuscenes`.")
     cloud_wait_s: NonNegative | None = Field(
         default=None, description="Longest time in seconds that detections wait for the cloud of the same stamp."
+    )
+    horizons: Horizons | None = Field(
+        default=None,
+        description="Times ahead in seconds, ascending, at which `Tracks` carry predicted paths; none: no paths. They "
+        "may change at any time; a profile that is set brings its own.",
     )
     restart: Flag = Field(
         default=False,

@@ -26,10 +26,12 @@ class Limits:
     max_detections: int = _limit(5_000, "detections of one message (M)")
     max_tracks: int = _limit(20_000, "tracks, or components of a density, of one message (N)")
     max_labels: int = _limit(256, "labels of one message")
+    max_horizons: int = _limit(100, "horizons of predicted paths (H)")
 
     def rows(self, dimension: str) -> int:
-        """Return the limit of the symbolic dimension `M` (detections), `N` (tracks, components) or `P` (points)."""
-        return {"M": self.max_detections, "N": self.max_tracks, "P": self.max_points}[dimension]
+        """Return the limit of a symbolic dimension: M detections, N tracks or components, P points, H horizons."""
+        most = {"M": self.max_detections, "N": self.max_tracks, "P": self.max_points, "H": self.max_horizons}
+        return most[dimension]
 
     def described(self) -> list[tuple[str, int, str]]:
         """Return name, value and meaning of every limit, for people."""

@@ -6,7 +6,7 @@ described here and nowhere else: the JSON Schemas and the tables of the document
 """
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field
 
 from optipmb_schemas.arrays import Array, unit_quaternion
 from optipmb_schemas.errors import MessageError, invalid, show
-from optipmb_schemas.fields import Count, Epoch, Flag, Labels, Name, NonNegative, SessionId, Stamp, Stream
+from optipmb_schemas.fields import Count, Epoch, Flag, Horizons, Labels, Name, NonNegative, SessionId, Stamp, Stream
 from optipmb_schemas.model import Message
 
 FAR = 1e8
@@ -230,16 +230,60 @@ class Tracks(Header):
         description="1: the track is confirmed, its existence reached a threshold of the profile and has not fallen "
         "below a lower one since; 0: it may be of nothing. Absent: from a service that did not tell.",
     )
+    horizons: Horizons | None = Field(
+        default=None,
+        description="Times after `stamp_ns` in seconds, ascending, at which the predicted paths are given. Absent, as "
+        "are the next three: the session has no horizons.",
+    )
+    path_position: Annotated[NDArray[np.float64], Array("f8", ("N", "H", 2), -FAR * 1e4, FAR * 1e4)] | None = Field(
+        default=None, description="Predicted x and y of the centres at each horizon: metres, world frame."
+    )
+    path_yaw: Annotated[NDArray[np.float32], Array("f4", ("N", "H"), -1e5, 1e5)] | None = Field(
+        default=None, description="Predicted headings, as `yaw`."
+    )
+    path_covariance: Annotated[NDArray[np.float32], Array("f4", ("N", "H", 2, 2), -1e30, 1e30)] | None = Field(
+        default=None, description="Covariance of the predicted x and y, m^2."
+    )
     delivery: Delivery | None = Field(default=None, description="How this publication came about.")
 
     def check(self) -> None:
-        """Labels must be in the list, ids ascending."""
+        """Labels must be in the list, ids ascending, the fields of paths there together."""
         super().check()
         _check_labels(self.label, self.labels)
         steps = np.diff(self.id)
         if steps.size and steps.min() <= 0:
             at = int(np.argmax(steps <= 0)) + 1
             raise invalid(f"id[{at}]", f"an id above {self.id[at - 1]}, in ascending order", self.id[at])
+        absent = [name for name in PATHS if getattr(self, name) is None]
+        if absent and len(absent) < len(PATHS):
+            raise MessageError("missing_field", absent[0], f"a value beside {', '.join(PATHS)}", "nothing")
+
+
+PATHS: Final = ("horizons", "path_position", "path_yaw", "path_covariance")
+"""Fields of `Tracks` with predicted paths."""
+
+
+def path_fields(
+    horizons: NDArray[np.float64], mean: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> dict[str, NDArray[Any]]:
+    """Return the fields of `Tracks` with predicted paths.
+
+    Args:
+        horizons: (H,) times ahead, s.
+        mean: (N, H, 6) states [x, y, speed, heading, turn rate, acceleration] at them.
+        covariance: (N, H, 6, 6) of those.
+
+    Raises:
+        MessageError: they hold numbers that no message may.
+    """
+    values = (horizons, mean[:, :, :2], mean[:, :, 3], covariance[:, :, :2, :2])
+    fields = {}
+    for name, value in zip(PATHS, values, strict=True):
+        try:
+            fields[name] = Tracks.arrays[name].validate(value)
+        except MessageError as error:
+            raise error.under(name) from None
+    return fields
 
 
 class Density(Message):

@@ -26,8 +26,8 @@ class Message(BaseModel):
     """Names of the fields, in the order of their description."""
     arrays: ClassVar[dict[str, Array]] = {}
     """Descriptions of the array fields, by name."""
-    columns: ClassVar[tuple[tuple[str, str], ...]] = ()
-    """Name and letter of the array fields whose number of rows is symbolic."""
+    columns: ClassVar[tuple[tuple[str, int, str], ...]] = ()
+    """Name, dimension and letter of all symbolic dimensions of array fields."""
     optional: ClassVar[dict[str, Any]] = {}
     """Values of the fields that need not be given, by name."""
     nested: ClassVar[dict[str, type["Message"]]] = {}
@@ -52,7 +52,7 @@ class Message(BaseModel):
                     cls.nested[name] = part
         cls.optional = {name: one.default for name, one in cls.model_fields.items() if not one.is_required()}
         cls.names = tuple(cls.model_fields)
-        cls.columns = tuple((name, one.rows) for name, one in cls.arrays.items() if one.rows is not None)
+        cls.columns = tuple((name, axis, letter) for name, one in cls.arrays.items() for axis, letter in one.letters)
 
     @classmethod
     def trusted(cls, /, **fields: Any) -> Self:
@@ -87,13 +87,17 @@ class Message(BaseModel):
     def _check(self) -> Self:
         rows: dict[str, tuple[str, int]] = {}
         values = self.__dict__
-        for name, letter in self.columns:
+        for name, axis, letter in self.columns:
             array = values[name]
             if array is None:
                 continue
-            first, number = rows.setdefault(letter, (name, len(array)))
-            if len(array) != number:
-                expected = f"{number} rows as in {first}, for shape {self.arrays[name].shape_described}"
+            length = array.shape[axis]
+            first, number = rows.setdefault(letter, (name, length))
+            if length != number and axis and not len(array):  # lists cannot say how long the rows of no rows are
+                values[name] = array.reshape((*array.shape[:axis], number, *array.shape[axis + 1 :]))
+            elif length != number:
+                what = "of dimension " + letter if axis else "rows"
+                expected = f"{number} {what} as in {first}, for shape {self.arrays[name].shape_described}"
                 raise MessageError("invalid_value", name, expected, f"shape {shape_text(array.shape)}")
         self.check()
         return self

@@ -9,6 +9,7 @@ from optipmb_client.datasets import Dataset, open_dataset
 from optipmb_client.errors import UsageError
 from optipmb_client.offline import read_profile, track, track_sequence
 from optipmb_client.recording import Preloaded, latency, selected_frames
+from optipmb_schemas import PATHS
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +26,24 @@ def test_the_same_data_give_the_same_bytes(dataset: Dataset, tmp_path: Path) -> 
         files.append(result.file.read_bytes())
     assert files[0] == files[1]
     assert len(files[0].splitlines()) > 40
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_predicted_paths_are_written_with_all_columns(dataset: Dataset, tmp_path: Path, *, smooth: bool) -> None:
+    """With horizons in the profile the file of all columns has a path for each row; the result file is as without."""
+    sequences, parameters = dataset.sequences(["0000"]), read_profile("kitti")
+    asking = parameters.model_copy(update={"horizons": (0.1, 2.0)})
+    (plain,) = track(dataset, sequences, tmp_path / "a", parameters=parameters, full=True, smooth=smooth)
+    (found,) = track(dataset, sequences, tmp_path / "b", parameters=asking, full=True, smooth=smooth)
+    assert plain.file.read_bytes() == found.file.read_bytes()
+    without, columns = (np.load(one.file.with_suffix(".npz")) for one in (plain, found))
+    assert set(columns) - set(without) == set(PATHS)
+    assert columns["horizons"].tolist() == [0.1, 2.0]
+    assert columns["path_covariance"].shape == (len(columns["id"]), 2, 2, 2)
+    ahead = columns["center"][:, :2] + 0.1 * columns["velocity"]
+    np.testing.assert_allclose(columns["path_position"][:, 0], ahead, atol=0.2)
+    assert (np.trace(columns["path_covariance"][:, 1], axis1=1, axis2=2)
+            > np.trace(columns["path_covariance"][:, 0], axis1=1, axis2=2)).all()  # fmt: skip
 
 
 def test_what_is_reported_is_what_was_written(dataset: Dataset, tmp_path: Path) -> None:

@@ -145,6 +145,10 @@ def test_a_bag_of_tracks_says_what_is_known_of_them(bag: Path, tmp_path: Path) -
         (path,) = one.kinematics.predicted_paths
         assert (len(path.path), path.time_step.sec, path.time_step.nanosec) == (7, 0, 500_000_000)
         np.testing.assert_allclose([path.path[0].position.x, path.path[0].position.y], table.center[row, :2])
+        ahead = [[pose.position.x, pose.position.y] for pose in path.path]
+        step = np.hypot(*np.diff(ahead, axis=0).T)
+        speed = np.hypot(*table.velocity[row])
+        assert step[0] == pytest.approx(0.5 * speed, abs=0.1 + 0.2 * speed)
     for _, message in found["/detector/boxes/tracks/markers"]:
         assert message.markers[0].action == 3
         assert {one.header.frame_id for one in message.markers} == {"map"}

@@ -11,7 +11,7 @@ from optipmb_client.child import ServiceProcess
 from optipmb_client.datasets import open_dataset
 from optipmb_client.mcap_files.writing import RecordingWriter
 from optipmb_client.offline import track_sequence
-from optipmb_schemas import Detections, Keys, encode, encoding_of
+from optipmb_schemas import PATHS, Detections, Keys, encode, encoding_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Tracked
 from real_data import kitti_root
@@ -97,11 +97,17 @@ def test_kitti(both: Both) -> None:
         assert sum(entry["clouds"] for entry in both.replay(*data, "--streams", streams)["sequences"]) > 0
 
 
+@pytest.mark.parametrize("horizons", [(), (0.5, 1.0, 3.0)])
 @pytest.mark.parametrize("posed", [False, True])
-def test_a_recording_of_a_publisher_of_the_world_frame(tmp_path: Path, *, posed: bool) -> None:
-    """Boxes in the world frame, recorded and tracked offline, give the bytes of a session: no heading is turned."""
+def test_a_recording_of_a_publisher_of_the_world_frame(
+    tmp_path: Path, horizons: tuple[float, ...], *, posed: bool
+) -> None:
+    """Boxes in the world frame, recorded and tracked offline, give the bytes of a session: no heading is turned.
+
+    So do the predicted paths where the profile asks for them.
+    """
     sensor, path, chance = Sensor("site/world/lidar"), tmp_path / "world.mcap", np.random.default_rng(7)
-    parameters = load_profile("nuscenes")
+    parameters = load_profile("nuscenes").model_copy(update={"horizons": horizons})
     session, expected = Session(sensor.stream, parameters), []
     with RecordingWriter(path) as writer:
         for seq in range(30):
@@ -122,10 +128,14 @@ def test_a_recording_of_a_publisher_of_the_world_frame(tmp_path: Path, *, posed:
             writer.add(key, encode(message), encoding_of(message), seq)
             expected += [one.tracks for one in session.on_detections(message, 0) if isinstance(one, Tracked)]
     (sequence,) = open_dataset("mcap", path).sequences(["all"])
-    found = [tracks.tracks for _, tracks, _, _ in track_sequence(parameters, sequence)]
+    found = [tracks for _, tracks, _, _ in track_sequence(parameters, sequence)]
     assert len(found) == len(expected) == 30
     assert len(found[-1].id) >= 8
     for offline, online in zip(found, expected, strict=True):
-        for field in fields(offline):
-            one, other = getattr(offline, field.name), getattr(online, field.name)
+        for field in fields(offline.tracks):
+            one, other = getattr(offline.tracks, field.name), getattr(online, field.name)
             assert np.asarray(one).tobytes() == np.asarray(other, np.asarray(one).dtype).tobytes(), field.name
+        for name in PATHS:
+            one, other = getattr(offline, name), getattr(online, name)
+            assert (one is None) == (other is None) == (not horizons)
+            assert not horizons or (one.dtype == other.dtype and one.tobytes() == other.tobytes()), name

@@ -14,12 +14,14 @@ import zenoh
 import zenoh.ext
 from optipmb_client.datasets import DataSequence, open_dataset
 from optipmb_client.offline import read_profile, track_sequence
+from optipmb_schemas import Keys, SessionParameters, decode
 from optipmb_schemas.ros2.arrays import CLOUD
-from optipmb_schemas.ros2.tracks import TOPICS, TRACKED
+from optipmb_schemas.ros2.tracks import HORIZONS, TOPICS, TRACKED
 from optipmb_schemas.ros2.types import own_types
 from optipmb_service.app import cli
 from optipmb_service.ros2 import graph
 from ros2_client import Ros2Client, hash_by_sdk
+from router import until
 from routers import open_client
 from service_process import ServiceProcess
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile
@@ -134,6 +136,18 @@ def ids(message: Any) -> list[int]:
     return [int.from_bytes(bytes(one.object_id.uuid)[8:], "big") for one in message.objects]
 
 
+def horizons_of(session: zenoh.Session, stream: str) -> list[float]:
+    """Ask which horizons the session of a stream has; none while nobody answers."""
+    answers = [one.ok for one in session.get(Keys().query(stream, "parameters"), timeout=PATIENCE_S)]
+    parameters = [decode(one.payload.to_bytes(), SessionParameters) for one in answers if one is not None]
+    return parameters[0].horizons.tolist() if parameters and parameters[0].horizons is not None else []
+
+
+def paths_of(message: Any) -> list[Any]:
+    """Give the predicted paths in a PredictedObjects."""
+    return [path for one in message.objects for path in one.kinematics.predicted_paths]
+
+
 def told(client: Ros2Client, text: str) -> str:
     """Wait until a diagnostic says a text, and give it."""
 
@@ -166,10 +180,13 @@ def test_topics_become_tracks_of_another_node(robot: Robot, scene: DataSequence,
         publisher = publish_static(session, robot.domain, static)
         with ready_client(robot) as client:
             client.subscribe(TRACKS, TRACKED, name="of Humble", type_hash=graph.NO_HASH)
-            play(client, frames)
+            play(client, frames[:4])
+            until(lambda: horizons_of(session, robot.stream) == list(HORIZONS), "the bridge has asked for paths")
+            play(client, frames[4:])
             tracked = client.received[TRACKS]
             detections = client.wait(f"{TRACKS}/detections", lambda got: len(got) == len(frames))
             shown = client.wait(f"{TRACKS}/markers", lambda got: len(got) == len(frames))
+            predicted = client.wait(f"{TRACKS}/predicted", lambda got: len(got) == len(frames))
             last = tracked[-1].header.stamp
             of_humble = client.wait("of Humble", lambda got: bool(got) and got[-1].header.stamp == last)[-1]
             published = {"/diagnostics": DIAGNOSTICS} | {TRACKS + end: kind for end, kind in TOPICS.items()}
@@ -178,6 +195,7 @@ def test_topics_become_tracks_of_another_node(robot: Robot, scene: DataSequence,
             for topic, kind in (("/detector/boxes", bags.VISION), ("/points", CLOUD), ("/tf", TF), ("/tf_static", TF)):
                 assert ("subscription", "/optipmb", kind, hash_by_sdk(kind)) in client.endpoints(topic)
         publisher.undeclare()
+    assert {len(path.path) for path in paths_of(predicted[-1])} == {7}
     assert ids(of_humble) == ids(tracked[-1])
     assert process.process.poll() is not None
     expected = [step[1] for step in track_sequence(read_profile("scene"), scene)]

@@ -99,6 +99,23 @@ def test_filters(stub: Any, stream: str) -> None:
     assert last(min_existence=1.0).id.shape[0] == int((full.existence >= 1.0).sum())
 
 
+def test_predicted_paths_are_asked_for_and_chosen(stub: Any, stream: str) -> None:
+    """`SetParameters` with horizons gives tracks with paths; rows and columns of these are chosen as of all others."""
+    horizons = np.array([0.5, 1.0, 3.0])
+    wanted = pb.SessionParameters(horizons=pb.Array(dtype=pb.DATA_TYPE_F8, shape=[3], data=horizons.tobytes()))
+    in_force = stub.SetParameters(pb.SetParametersRequest(stream=stream, parameters=wanted)).parameters
+    assert convert.column(in_force.horizons).tolist() == horizons.tolist()
+    full = convert.from_proto(tracked(stub, stream)[-1], Tracks)
+    assert full.path_yaw is not None
+    assert full.path_yaw.shape == (2, 3)
+    chosen = pb.TrackFilter(classes=["pedestrian"], fields=["path_yaw"])
+    last = [one.tracks for one in stub.QueryTracks(pb.QueryTracksRequest(pattern=stream, filter=chosen))][-1]
+    (row,) = np.flatnonzero(full.label == full.labels.index("pedestrian"))
+    assert convert.column(last.path_yaw).tolist() == full.path_yaw[[row]].tolist()
+    assert convert.column(last.horizons).tolist() == horizons.tolist()
+    assert not last.HasField("path_position")
+
+
 def test_an_unlikely_object_is_not_confirmed(stub: Any, stream: str) -> None:
     """A track that the tracker does not confirm is left out of confirmed ones, as long as it does not."""
     # The generic profile confirms at the second detection, that of nuScenes weighs scores.

@@ -69,6 +69,10 @@ def _examples() -> list[Message]:
         age=np.array([1.5, 0.0]),
         time_since_detection=np.array([0.0, 0.5]),
         detection=np.array([1, -1]),
+        horizons=np.array([0.5, 1.0, 3.0]),
+        path_position=np.arange(12.0).reshape(2, 3, 2),
+        path_yaw=np.array([[0.1, 0.2, -3.0], [0.0, -0.0, 1e-9]], dtype="f4"),
+        path_covariance=np.broadcast_to(np.eye(2), (2, 3, 2, 2)),
         delivery=Delivery(instance="host-1", received_ns=5, published_ns=6, queue_ms=0.5, decode_ms=0.125, step_ms=3.0),
     )
     state = SessionState(
@@ -95,6 +99,7 @@ def _examples() -> list[Message]:
     parameters = SessionParameters(
         profile="kitti",
         cloud_wait_s=0.05,
+        horizons=np.array([0.5, 2.0]),
         restart=True,
         values={"b": [1, 2.5, None, True], "a": {"text": "ü", "low": -(2**63)}},
     )

@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 from optipmb_schemas import MessageError
 from optipmb_schemas.ros2.arrays import CLOUD, DETECTIONS, boxes_of, points_of
-from optipmb_schemas.ros2.tracks import TOPICS, TrackColumns, predicted_paths
+from optipmb_schemas.ros2.tracks import HORIZONS, TOPICS, TrackColumns, messages
 from optipmb_schemas.ros2.transforms import TransformError, Transforms
 from optipmb_schemas.ros2.types import own_types
-
-from optipmb.motion import ctra_displacement
 
 REFERENCE = json.loads(Path(__file__).with_name("ros2_reference.json").read_text())
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -299,24 +297,42 @@ def test_other_shapes_become_boxes() -> None:
             boxes_of(autoware(**changes))
 
 
-def test_paths_are_those_of_the_motion_model() -> None:
-    """The path of an object is what CTRA of the tracker says; one that brakes stops and does not go back."""
+@pytest.mark.parametrize("more", [(), (0.75, 10.0)])
+def test_predicted_objects_have_the_paths_of_tracks(more: tuple[float, ...]) -> None:
+    """A path is the box now and at each of the horizons of ROS; tracks without these have none."""
+    horizons = sorted((*HORIZONS, *more))
+    at = np.array(horizons)
     tracks = SimpleNamespace(
-        yaw=np.array([0.3, 0.0, math.pi]),
-        center=np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]),
-        velocity=np.array([[8 * math.cos(0.3), 8 * math.sin(0.3)], [3.0, 0.0], [0.0, 0.0]]),
-        yaw_rate=np.array([0.4, 0.0, 0.0]),
-        acceleration=np.array([1.0, -2.0, 0.0]),
+        id=np.array([4, 9]),
+        labels=("car",),
+        label=np.array([0, 0]),
+        center=np.array([[1.0, 2.0, 3.0], [5.0, 0.0, 0.5]]),
+        size=np.ones((2, 3)),
+        yaw=np.array([0.25, 0.0]),
+        velocity=np.zeros((2, 2)),
+        yaw_rate=np.zeros(2),
+        acceleration=np.zeros(2),
+        existence=np.ones(2),
+        score=np.ones(2),
+        covariance=np.zeros((2, 6, 6)),
+        horizons=at,
+        path_position=np.stack([np.c_[1 + at, 2 * np.ones(len(at))], np.c_[5 - at, at]]),
+        path_yaw=np.stack([0.25 + at / 8, at / 4]).astype("f4"),
     )
-    places, headings = predicted_paths(cast("TrackColumns", tracks))
-    assert places.shape == (7, 3, 2)
-    for step in range(7):
-        along, across = ctra_displacement(8.0, 0.4, 1.0, 0.5 * step)
-        turn = np.array([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]])
-        np.testing.assert_allclose(places[step, 0], turn @ [along, across] + [1.0, 2.0], atol=1e-3)
-        assert headings[step, 0] == pytest.approx(0.3 + 0.2 * step)
-    assert places[-1, 1, 0] == pytest.approx(2.25, abs=1e-2)
-    assert places[:, 2].tolist() == [[5.0, 0.0]] * 7
+    made = dict(messages(own_types(), cast("TrackColumns", tracks), 5, "map", "a/b/c"))
+    paths = [one.kinematics.predicted_paths for one in made["/predicted"].objects]
+    for row, (path,) in enumerate(paths):
+        assert (path.time_step.sec, path.time_step.nanosec, path.confidence) == (0, 500_000_000, 1.0)
+        assert len(path.path) == 7
+        for step, pose in enumerate(path.path):
+            ahead = 0.5 * step
+            x, y, yaw = (1 + ahead, 2.0, 0.25 + ahead / 8) if row == 0 else (5 - ahead, ahead, ahead / 4)
+            assert (pose.position.x, pose.position.y, pose.position.z) == (x, y, tracks.center[row, 2])
+            assert 2 * math.atan2(pose.orientation.z, pose.orientation.w) == pytest.approx(yaw)
+    for lacking in (None, at[1:]):
+        tracks.horizons = lacking
+        made = dict(messages(own_types(), cast("TrackColumns", tracks), 5, "map", "a/b/c"))
+        assert [one.kinematics.predicted_paths for one in made["/predicted"].objects] == [[], []]
 
 
 def test_damaged_bytes_raise_nothing_else() -> None:

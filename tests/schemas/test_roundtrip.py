@@ -46,6 +46,9 @@ epoch = st.binary(min_size=16, max_size=16)
 session = st.binary(min_size=16, max_size=16).map(bytes.hex)
 
 
+horizons = st.none() | st.lists(st.floats(0, 30, exclude_min=True), max_size=4, unique=True).map(sorted).map(np.array)
+
+
 def rows(shape: tuple[int, ...], low: float, high: float, *, above: bool = False) -> st.SearchStrategy[Any]:
     """Return arrays of numbers."""
     return arrays("f8", shape, elements=st.floats(low, high, exclude_min=above, allow_nan=False))
@@ -149,7 +152,23 @@ def tracks(draw: st.DrawFn) -> Tracks:
         detection=draw(whole(n, -1, INT64)),
         delivery=draw(st.none() | delivery),
         **column,
+        **draw(paths(n)),
     )
+
+
+@st.composite
+def paths(draw: st.DrawFn, n: int) -> dict[str, Any]:
+    """Return the fields of predicted paths, or none."""
+    given = draw(horizons)
+    if given is None:
+        return {}
+    single = st.floats(-1e5, 1e5, width=32)
+    return {
+        "horizons": given,
+        "path_position": draw(rows((n, len(given), 2), -1e12, 1e12)),
+        "path_yaw": draw(arrays("f4", (n, len(given)), elements=single)),
+        "path_covariance": draw(arrays("f4", (n, len(given), 2, 2), elements=single)),
+    }
 
 
 @st.composite
@@ -211,6 +230,7 @@ messages: dict[type[Message], st.SearchStrategy[Message]] = {
         SessionParameters,
         profile=st.none() | chunk,
         cloud_wait_s=st.none() | duration,
+        horizons=horizons,
         restart=st.booleans(),
         values=st.none() | values,
     ),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from optipmb_schemas import (
     Detections,
+    Limits,
     Message,
     MessageError,
     Points,
@@ -16,6 +17,7 @@ from optipmb_schemas import (
     SessionParameters,
     Tracks,
     decode,
+    encode,
     encode_json,
 )
 
@@ -152,11 +154,26 @@ RULES: list[tuple[str, str, Any, str]] = [
     ("Tracks", "age", [0, -1], "age[1]"),
     ("Tracks", "time_since_detection", [0, -1], "time_since_detection[1]"),
     ("Tracks", "detection", [-2, 0], "detection[0]"),
+    ("Tracks", "horizons", [0, 1, 2], "horizons[0]"),
+    ("Tracks", "horizons", [1, 2, 30.1], "horizons[2]"),
+    ("Tracks", "horizons", [1, 2, 2], "horizons[2]"),
+    ("Tracks", "horizons", [1, 2], "path_position"),
+    ("Tracks", "horizons", None, "horizons"),
+    ("Tracks", "path_position", [[[1, 2]], [[1, 2]]], "path_position"),
+    ("Tracks", "path_position", [[[1, 2]] * 3, [[1, 2], [1, NAN], [1, 2]]], "path_position[1][1][1]"),
+    ("Tracks", "path_position", [[[1, 2]] * 3, [[1, 2]] * 2], "path_position[1]"),
+    ("Tracks", "path_position", [[[1, 2, 3]] * 3] * 2, "path_position[0][0]"),
+    ("Tracks", "path_yaw", [[0] * 3], "path_yaw"),
+    ("Tracks", "path_yaw", None, "path_yaw"),
+    ("Tracks", "path_covariance", [[[[1, 0], [0, 1e31]]] * 3] * 2, "path_covariance[0][0][1][1]"),
     ("Tracks", "delivery", {"instance": "a"}, "delivery.received_ns"),
     # control
     ("SessionParameters", "cloud_wait_s", -1, "cloud_wait_s"),
     ("SessionParameters", "cloud_wait_s", "0.1", "cloud_wait_s"),
     ("SessionParameters", "profile", "/etc/passwd", "profile"),
+    ("SessionParameters", "horizons", [2.0, 1.0], "horizons[1]"),
+    ("SessionParameters", "horizons", [-1.0], "horizons[0]"),
+    ("SessionParameters", "horizons", 1.0, "horizons"),
     ("SessionParameters", "restart", None, "restart"),
     ("SessionParameters", "values", [1], "values"),
     ("ResetRequest", "close", 1, "close"),
@@ -203,6 +220,29 @@ def test_integers_where_numbers_are_wanted(examples: dict[str, Message]) -> None
     assert decode(json.dumps(fields).encode(), Detections).yaw.dtype == np.float64
     status = {**plain(examples["ServiceStatus"]), "uptime_s": 5}
     assert decode(json.dumps(status).encode(), type(examples["ServiceStatus"])).uptime_s == 5.0
+
+
+def test_paths_of_no_tracks_are_a_message(examples: dict[str, Message]) -> None:
+    """A frame without tracks keeps its horizons in both forms, although lists of no rows cannot say how long they are.
+
+    Paths without horizons, and more horizons than the limit, are refused.
+    """
+    tracks = examples["Tracks"]
+    none = type(tracks)(**{name: value[:0] if tracks.arrays.get(name) and name != "horizons" else value
+                           for name, value in tracks.present()})  # fmt: skip
+    assert none.path_covariance.shape == (0, 3, 2, 2)  # type: ignore[attr-defined]
+    for payload in (encode(none), encode_json(none)):
+        assert decode(payload, Tracks) == none
+    fields = plain(tracks)
+    with pytest.raises(MessageError, match="horizons"):
+        decode(json.dumps(fields | {"horizons": None}).encode(), Tracks)
+    for payload in (encode(tracks), encode_json(tracks)):
+        with pytest.raises(MessageError, match="horizons: expected at most 2 rows, received 3 rows"):
+            decode(payload, Tracks, limits=Limits(max_horizons=2))
+    endless = msgpack.unpackb(encode(tracks))
+    endless["path_yaw"] |= {"shape": [0, 2**62], "data": b""}
+    with pytest.raises(MessageError, match="path_yaw: expected at most 100 of dimension H"):
+        decode(msgpack.packb(endless), Tracks)
 
 
 def test_a_score_of_zero_is_valid(detections: Detections) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -107,6 +107,42 @@ def test_a_doubtful_heading_changes_no_motion() -> None:
     np.testing.assert_allclose(b.mean, a.mean, rtol=1e-9, atol=1e-9)
     b.covariance[:, :, 3, 3] -= doubt
     np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-9, atol=1e-9)
+
+
+def test_a_step_gives_the_paths_that_the_profile_asks_for() -> None:
+    """With horizons in the profile they are those of `predict_tracks`; tracks and densities are the same bytes."""
+    document = KITTI.model_dump()
+    assert "horizons" not in document
+    asking = optipmb.parse_parameters(document | {"horizons": [0.5, 1.0, 3.0]})
+    tracker, other = optipmb.Tracker(KITTI), optipmb.Tracker(asking)
+    online = optipmb.OnlineTracker(asking)
+    a, b = tracker.initial(), other.initial()
+    for k in range(4):
+        given = frame(k * 100_000_000, k)
+        without, found = tracker.step(a, given), other.step(b, given)
+        a, b = without.density, found.density
+        assert without.paths is None
+        assert found.paths is not None
+        paths = optipmb.predict_tracks(found.tracks, [0.5, 1.0, 3.0], KITTI)
+        for field in fields(paths):
+            assert getattr(paths, field.name).tobytes() == getattr(found.paths, field.name).tobytes()
+        for field in fields(without.tracks):
+            assert getattr(without.tracks, field.name).tobytes() == getattr(found.tracks, field.name).tobytes()
+    assert len(found.paths) == 3
+    boxes = {"center": [[0, 0, 1]], "size": [[4, 2, 1.5]], "yaw": [0], "score": [0.9], "label": ["Car"]}
+    told = online.update(boxes, t=0.0)
+    assert told.paths is not None
+    assert told.paths.position.shape == (1, 3, 2)
+    assert optipmb.OnlineTracker(KITTI).update(boxes, t=0.0).paths is None
+
+
+@pytest.mark.parametrize("horizons", [[0.0], [1.0, 1.0], [30.1], [math.nan], np.linspace(0.1, 1, 101).tolist()])
+def test_a_profile_of_other_horizons_is_refused(horizons: list[float]) -> None:
+    """Bounds of the profile are those of `predict_tracks`, and the error names the field."""
+    with pytest.raises(optipmb.ParameterError) as caught:
+        optipmb.parse_parameters(KITTI.model_dump() | {"horizons": horizons})
+    assert caught.value.path.startswith("horizons")
+    assert optipmb.parse_parameters(KITTI.model_dump() | {"horizons": [30.0]}).horizons == (30.0,)
 
 
 def test_no_objects_and_no_horizons_have_empty_paths() -> None:

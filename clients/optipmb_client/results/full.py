@@ -2,7 +2,7 @@
 
 Result files of the benchmarks have no room for covariances and probabilities. This one holds every column of the tracks
 as a numpy array, one row per track and frame, in the world frame, ordered by frame and, in a frame, as in the result
-file. The same tracks always give the same bytes.
+file; where tracks have predicted paths, these too, named as in messages. The same tracks always give the same bytes.
 """
 
 import io
@@ -14,6 +14,8 @@ from typing import Protocol
 from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile
 
 import numpy as np
+from numpy.typing import NDArray
+from optipmb_schemas import PATHS
 
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Ints
@@ -42,6 +44,18 @@ class FullRows(TrackRows, Protocol):
 
     @property
     def detection(self) -> Ints: ...  # noqa: D102 - (N,)
+
+    @property
+    def horizons(self) -> Floats | None: ...  # noqa: D102 - (H,)
+
+    @property
+    def path_position(self) -> Floats | None: ...  # noqa: D102 - (N, H, 2)
+
+    @property
+    def path_yaw(self) -> NDArray[np.float32] | None: ...  # noqa: D102 - (N, H)
+
+    @property
+    def path_covariance(self) -> NDArray[np.float32] | None: ...  # noqa: D102 - (N, H, 2, 2)
 
 
 @dataclass(frozen=True)
@@ -105,6 +119,10 @@ def write_full(path: Path, tracks: Mapping[int, FullRows]) -> None:
         for name in _COLUMNS
     }
     labels = tracks[order[0]].labels if order else ()
+    horizons = [one for index in order if (one := tracks[index].horizons) is not None]
+    if horizons and len(horizons) == len(order) and len({one.tobytes() for one in horizons}) == 1:
+        columns |= {name: np.concatenate([getattr(tracks[i], name) for i in order]) for name in PATHS[1:]}
+        columns["horizons"] = horizons[0]
     columns |= {"labels": np.array(labels, dtype=np.str_), "frame": np.repeat(np.array(order, dtype=np.int64), count)}
     content = io.BytesIO()
     with ZipFile(content, "w", ZIP_DEFLATED) as archive:  # as numpy's own savez, but without the time of day

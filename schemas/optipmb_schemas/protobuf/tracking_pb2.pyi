@@ -142,7 +142,7 @@ class Delivery(_message.Message):
     def __init__(self, instance: _Optional[str] = ..., received_ns: _Optional[int] = ..., published_ns: _Optional[int] = ..., queue_ms: _Optional[float] = ..., decode_ms: _Optional[float] = ..., step_ms: _Optional[float] = ..., run: _Optional[int] = ...) -> None: ...
 
 class Tracks(_message.Message):
-    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "session", "revision", "profile", "cloud_used", "gap", "ignored", "labels", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "delivery")
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "session", "revision", "profile", "cloud_used", "gap", "ignored", "labels", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "horizons", "path_position", "path_yaw", "path_covariance", "delivery")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -170,6 +170,10 @@ class Tracks(_message.Message):
     TIME_SINCE_DETECTION_FIELD_NUMBER: _ClassVar[int]
     DETECTION_FIELD_NUMBER: _ClassVar[int]
     CONFIRMED_FIELD_NUMBER: _ClassVar[int]
+    HORIZONS_FIELD_NUMBER: _ClassVar[int]
+    PATH_POSITION_FIELD_NUMBER: _ClassVar[int]
+    PATH_YAW_FIELD_NUMBER: _ClassVar[int]
+    PATH_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     DELIVERY_FIELD_NUMBER: _ClassVar[int]
     stream: str
     epoch: bytes
@@ -198,8 +202,12 @@ class Tracks(_message.Message):
     time_since_detection: Array
     detection: Array
     confirmed: Array
+    horizons: Array
+    path_position: Array
+    path_yaw: Array
+    path_covariance: Array
     delivery: Delivery
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
 
 class Problem(_message.Message):
     __slots__ = ("stream", "instance", "code", "path", "expected", "received", "message", "seq", "stamp_ns", "count", "reported_ns")
@@ -286,16 +294,18 @@ class SessionState(_message.Message):
     def __init__(self, stream: _Optional[str] = ..., session: _Optional[str] = ..., state: _Optional[str] = ..., profile: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., received: _Optional[int] = ..., frames: _Optional[int] = ..., duplicates: _Optional[int] = ..., late: _Optional[int] = ..., inserted: _Optional[int] = ..., corrected: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., new_epochs: _Optional[int] = ..., clouds_used: _Optional[int] = ..., clouds_missed: _Optional[int] = ..., repaired: _Optional[int] = ..., clouds_refused: _Optional[int] = ..., tracks: _Optional[int] = ..., bernoullis: _Optional[int] = ..., poissons: _Optional[int] = ..., next_id: _Optional[int] = ..., queue: _Optional[int] = ..., digest: _Optional[str] = ...) -> None: ...
 
 class SessionParameters(_message.Message):
-    __slots__ = ("profile", "cloud_wait_s", "restart", "values")
+    __slots__ = ("profile", "cloud_wait_s", "horizons", "restart", "values")
     PROFILE_FIELD_NUMBER: _ClassVar[int]
     CLOUD_WAIT_S_FIELD_NUMBER: _ClassVar[int]
+    HORIZONS_FIELD_NUMBER: _ClassVar[int]
     RESTART_FIELD_NUMBER: _ClassVar[int]
     VALUES_FIELD_NUMBER: _ClassVar[int]
     profile: str
     cloud_wait_s: float
+    horizons: Array
     restart: bool
     values: _struct_pb2.Struct
-    def __init__(self, profile: _Optional[str] = ..., cloud_wait_s: _Optional[float] = ..., restart: _Optional[bool] = ..., values: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ...) -> None: ...
+    def __init__(self, profile: _Optional[str] = ..., cloud_wait_s: _Optional[float] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., restart: _Optional[bool] = ..., values: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ...) -> None: ...
 
 class SessionSummary(_message.Message):
     __slots__ = ("stream", "profile", "state", "rate_hz", "latency_p50_ms", "latency_p99_ms", "frames", "refused", "shed", "gaps", "tracks", "queue", "age_s", "worker")

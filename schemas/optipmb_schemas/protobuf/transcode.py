@@ -31,11 +31,6 @@ MOST_ITEMS: Final = 256
 _ENCODING: Final = encoding_of(Tracks)
 _REQUIRED: Final = frozenset(name for name, info in Tracks.model_fields.items() if info.is_required())
 _SCALARS: Final = tuple(name for name in Tracks.names if name not in Tracks.arrays)
-_SHAPES: Final = [
-    (name, one.dtype, [*map(int, one.shape[1:])], prod(map(int, one.shape[1:])) * DTYPES[one.dtype].itemsize)
-    for name, one in Tracks.arrays.items()
-]
-"""Of each array field: name, number type, shape of a row, and bytes of a row."""
 
 _msgpack: Any = msgpack  # its type information is partial
 
@@ -105,32 +100,33 @@ def _tracks(fields: Any, limits: Limits) -> EncodedTracks | None:
     (rows,) = fields["id"]["shape"]
     if type(rows) is not int or not 0 <= rows <= limits.max_tracks:
         return None
-    prefixes = _prefixes(rows)
+    horizons = fields["horizons"]["shape"][0] if "horizons" in fields else 0
+    if type(horizons) is not int or not 0 <= horizons <= limits.max_horizons:
+        return None
     parts: list[bytes] = []
-    for name, dtype, tail, size in _SHAPES:
+    for name, dtype, shape, size, prefix in _columns(rows, horizons):
         block = fields.get(name)
         if block is not None:
             data = block["data"]
-            if block["dtype"] != dtype or block["shape"] != [rows, *tail] or type(data) is not bytes:
+            if block["dtype"] != dtype or block["shape"] != shape or type(data) is not bytes or len(data) != size:
                 return None
-            if len(data) != rows * size:
-                return None
-            parts += (prefixes[name], data)
+            parts += (prefix, data)
     scalars = {name: fields[name] for name in _SCALARS if name in fields}
     return EncodedTracks.of(pb.Tracks(**scalars), b"".join(parts))
 
 
 @lru_cache(512)
-def _prefixes(rows: int) -> dict[str, bytes]:
-    """Return of each column of so many rows what stands before its data in the serialized message."""
-    prefixes = {}
-    for name, dtype, tail, size in _SHAPES:
+def _columns(rows: int, horizons: int) -> list[tuple[str, str, list[int], int, bytes]]:
+    """Return of each column name, number type, shape, bytes, and what stands before them in the serialized message."""
+    sizes, columns = {"N": rows, "H": horizons}, []
+    for name, one in Tracks.arrays.items():
+        shape = [length if isinstance(length, int) else sizes[length] for length in one.shape]
+        size = prod(shape) * DTYPES[one.dtype].itemsize
         proto: Any = pb.Tracks()
-        array = pb.Array(dtype=DTYPE_CODES[DTYPES[dtype]], shape=[rows, *tail], data=bytes(rows * size))
-        getattr(proto, name).CopyFrom(array)
+        getattr(proto, name).CopyFrom(pb.Array(dtype=DTYPE_CODES[DTYPES[one.dtype]], shape=shape, data=bytes(size)))
         field: bytes = proto.SerializeToString()
-        prefixes[name] = field[: len(field) - rows * size]
-    return prefixes
+        columns.append((name, one.dtype, shape, size, field[: len(field) - size]))
+    return columns
 
 
 def _refuse(code: int, _data: bytes) -> None:

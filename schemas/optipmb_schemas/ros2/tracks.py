@@ -6,8 +6,7 @@ All in the world frame, under the name that the caller gives it. What the messag
   estimated; their entries are 0.
 - twist and acceleration: in the frame of the object, x forward, as Autoware has them; covariance of the speed along x
   and of the turn rate about z, and of the acceleration along x.
-- predicted paths, in `PredictedObjects` alone: the box at every 0.5 s of the next 3 s if turn rate and acceleration
-  stay; a braking object stops and does not go back.
+- predicted paths, in `PredictedObjects` alone: the box now and at the `HORIZONS`, of tracks that have paths at these.
 - existence probability, class (probability 1: a track keeps its class), box, and a UUID whose last eight bytes are the
   track's id, big endian, and whose first eight are a digest of the stream's name.
 """
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from optipmb_schemas.ros2.definitions import CLASS_NAMES, UNKNOWN_CLASS
 from optipmb_schemas.ros2.types import Types
 
-__all__ = ["TOPICS", "TRACKED", "TrackColumns", "messages", "predicted_paths"]
+__all__ = ["HORIZONS", "TOPICS", "TRACKED", "TrackColumns", "has_paths", "messages"]
 
 TRACKED: Final = "autoware_perception_msgs/msg/TrackedObjects"
 DETECTION_ARRAY: Final = "vision_msgs/msg/Detection3DArray"
@@ -34,10 +33,9 @@ PREDICTED: Final = "autoware_perception_msgs/msg/PredictedObjects"
 TOPICS: Final = {"": TRACKED, "/detections": DETECTION_ARRAY, "/markers": MARKERS, "/predicted": PREDICTED}
 """Types of the messages by what their topics' names end with, below the topic of the tracks."""
 
-HORIZON_S: Final = 3.0
 STEP_NS: Final = 500_000_000
-SUBSTEPS: Final = 20
-"""Of a step; with midpoints of 25 ms the error is below a millimetre."""
+HORIZONS: Final = tuple(step * STEP_NS / 1e9 for step in range(1, 7))
+"""Of predicted paths, s: a step apart, as the messages have them."""
 
 FACES: Final = 0.95
 """Least confidence of a heading whose sign counts as known."""
@@ -106,6 +104,15 @@ class TrackColumns(Protocol):
     @property
     def covariance(self) -> Floats: ...  # noqa: D102 - (N, 6, 6) of x, y, speed, heading, turn rate, acceleration
 
+    @property
+    def horizons(self) -> Floats | None: ...  # noqa: D102 - (H,) s; None: without paths
+
+    @property
+    def path_position(self) -> Floats | None: ...  # noqa: D102 - (N, H, 2) m
+
+    @property
+    def path_yaw(self) -> NDArray[np.float32] | None: ...  # noqa: D102 - (N, H) rad
+
 
 def messages(types: Types, tracks: TrackColumns, stamp_ns: int, frame: str, stream: str) -> Iterator[tuple[str, Any]]:
     """Yield the messages of one frame with what their topics' names end with (`TOPICS`).
@@ -126,28 +133,9 @@ def messages(types: Types, tracks: TrackColumns, stamp_ns: int, frame: str, stre
     yield "/predicted", types.new(PREDICTED, header=header, objects=[objects.predicted(row) for row in rows])
 
 
-def predicted_paths(tracks: TrackColumns) -> tuple[Floats, Floats]:
-    """Return where the tracks are at each step of the horizon if turn rate and acceleration stay (CTRA).
-
-    Returns:
-        Places (K, N, 2) and headings (K, N), K steps of 0.5 s; the first is the present.
-    """
-    heading, place = tracks.yaw.copy(), tracks.center[:, :2].copy()
-    speed = np.cos(heading) * tracks.velocity[:, 0] + np.sin(heading) * tracks.velocity[:, 1]
-    forward = speed >= 0
-    dt = STEP_NS / 1e9 / SUBSTEPS
-    places, headings = [place.copy()], [heading.copy()]
-    for _ in range(round(HORIZON_S * 1e9 / STEP_NS)):
-        for _ in range(SUBSTEPS):
-            later = speed + dt * tracks.acceleration
-            later = np.where(forward, np.maximum(later, 0.0), np.minimum(later, 0.0))
-            along, middle = 0.5 * (speed + later) * dt, heading + 0.5 * dt * tracks.yaw_rate
-            place = place + along[:, None] * np.column_stack([np.cos(middle), np.sin(middle)])
-            heading = heading + dt * tracks.yaw_rate * (later != 0.0)
-            speed = later
-        places.append(place.copy())
-        headings.append(heading.copy())
-    return np.array(places), np.array(headings)
+def has_paths(tracks: TrackColumns) -> bool:
+    """Tell whether the tracks have paths at all the `HORIZONS`; they may have them at others too."""
+    return tracks.horizons is not None and set(HORIZONS) <= set(tracks.horizons.tolist())
 
 
 class _Objects:
@@ -157,7 +145,9 @@ class _Objects:
         self._types = types
         self._tracks = tracks
         self._key = hashlib.blake2b(stream.encode(), digest_size=8).digest()
-        self._places, self._headings = predicted_paths(tracks)
+        self._time_step = types.new("builtin_interfaces/msg/Duration", sec=0, nanosec=STEP_NS)
+        at = () if tracks.horizons is None else tracks.horizons
+        self._at = np.flatnonzero(np.isin(at, HORIZONS)) if has_paths(tracks) else None
         self._package = TRACKED.rpartition("/")[0]
         confidence = getattr(tracks, "heading_confidence", None)
         self._faces = np.ones(len(tracks.id), dtype=np.bool_) if confidence is None else confidence >= FACES
@@ -176,26 +166,27 @@ class _Objects:
         return self._types.new(f"{self._package}/TrackedObject", **self._what(row), kinematics=moving)
 
     def predicted(self, row: int) -> Any:
-        """Return a `PredictedObject` with one path."""
+        """Return a `PredictedObject` with one path, if its track has one."""
         pose, twist, acceleration = self._motion(row)
-        z = float(self._tracks.center[row, 2])
-        path = self._types.new(
-            f"{self._package}/PredictedPath",
-            path=[
-                _pose(self._types, [*place[row].tolist(), z], float(heading[row]))
-                for place, heading in zip(self._places, self._headings, strict=True)
-            ],
-            time_step=self._types.new("builtin_interfaces/msg/Duration", sec=STEP_NS // 10**9, nanosec=STEP_NS % 10**9),
-            confidence=1.0,
-        )
         moving = self._types.new(
             f"{self._package}/PredictedObjectKinematics",
             initial_pose_with_covariance=pose,
             initial_twist_with_covariance=twist,
             initial_acceleration_with_covariance=acceleration,
-            predicted_paths=[path],
+            predicted_paths=self._paths(row),
         )
         return self._types.new(f"{self._package}/PredictedObject", **self._what(row), kinematics=moving)
+
+    def _paths(self, row: int) -> list[Any]:
+        """Return the path of a track: the box now and at each horizon."""
+        tracks, types = self._tracks, self._types
+        if self._at is None or tracks.path_position is None or tracks.path_yaw is None:
+            return []
+        *place, z = tracks.center[row].tolist()
+        places = [place, *tracks.path_position[row, self._at].tolist()]
+        headings = [float(tracks.yaw[row]), *tracks.path_yaw[row, self._at].tolist()]
+        path = [_pose(types, [x, y, z], yaw) for (x, y), yaw in zip(places, headings, strict=True)]
+        return [types.new(f"{self._package}/PredictedPath", path=path, time_step=self._time_step, confidence=1.0)]
 
     def _what(self, row: int) -> dict[str, Any]:
         """Return the fields that say what it is."""

@@ -10,6 +10,7 @@ import collections
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
@@ -45,6 +46,7 @@ CACHE: Final = 200
 
 DIAGNOSTICS_S: Final = 1.0
 TICK_S: Final = 0.02
+QUERY_S: Final = 2.0
 
 SENSOR: Final = graph.Qos(reliable=False, depth=10)
 MOVING: Final = graph.Qos(reliable=False, depth=100)
@@ -87,6 +89,8 @@ class _Process:
         self._subscriptions: list[Subscription] = []
         self._queue: collections.deque[tuple[Callable[[], None], int]] = collections.deque()
         self._waiting_bytes = 0
+        self._asking = ThreadPoolExecutor(1, "ask")
+        self._asked: set[str] = set()
         self._lock = threading.Lock()
         self._filled = threading.Event()
         self._shed = 0
@@ -120,6 +124,7 @@ class _Process:
             subscription.close()
         for outgoing in self._outgoing.values():
             outgoing.close()
+        self._asking.shutdown(cancel_futures=True)
         self._node.close()
 
     def work(self, seconds: float) -> None:
@@ -153,6 +158,29 @@ class _Process:
     def publish(self, topic: str, message: Any) -> None:
         """Publish to ROS."""
         self._node.publish(topic, self._types.write(message))
+
+    def listened(self, topic: str) -> bool:
+        """Whether ROS has a subscription to a topic."""
+        return self._node.listened(topic)
+
+    def ask(self, stream: str, parameters: schemas.SessionParameters) -> None:
+        """Set parameters of a stream's session, on a thread of its own; one request of a stream at a time."""
+        if stream not in self._asked:
+            self._asked.add(stream)
+            self._asking.submit(self._ask, stream, parameters)
+
+    def _ask(self, stream: str, parameters: schemas.SessionParameters) -> None:
+        client = self._node.client
+        key, encoding = client.keys.query(stream, "parameters"), schemas.encoding_of(parameters)
+        try:
+            answers = client.ask(key, schemas.encode(parameters), encoding, timeout=QUERY_S)
+            if not any(answer.good for answer in answers):
+                said = schemas.decode(answers[0].payload, schemas.Problem).message if answers else "nobody answered"
+                log.warning("problem", stream=stream, message=f"predicted paths: {said}")
+        except (TransportError, schemas.MessageError) as error:
+            log.warning("problem", stream=stream, message=f"predicted paths: {error}")
+        finally:
+            self._asked.discard(stream)
 
     # What comes in
 

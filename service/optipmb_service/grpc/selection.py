@@ -50,17 +50,18 @@ class Selection:
         self._confirmed = asked.confirmed_only
         self._min_existence = asked.min_existence
         self._area = _polygon(asked.area) if asked.HasField("area") else None
-        self._fields = frozenset((*asked.fields, "id")) if asked.fields else None
+        paths = ["horizons"] if set(schemas.PATHS).intersection(asked.fields) else []
+        self._fields = frozenset((*asked.fields, "id", *paths)) if asked.fields else None
 
     def of(self, tracks: pb.Tracks) -> pb.Tracks:
         """Return what is wanted of the tracks of a frame."""
         rows = self._rows(tracks)
         chosen = pb.Tracks()
         chosen.CopyFrom(tracks)
-        for name in schemas.Tracks.arrays:
+        for name, array in schemas.Tracks.arrays.items():
             if self._fields is not None and name not in self._fields:
                 chosen.ClearField(name)
-            elif chosen.HasField(name):
+            elif chosen.HasField(name) and array.rows == "N":
                 select(getattr(chosen, name), rows)
         return chosen
 

@@ -34,6 +34,8 @@ WAITING: Final[dict[Kind, int]] = {"detections": 64, "points": 16}
 KEPT: Final = 4096
 """Stamps of each moving frame: 40 s at 100 Hz."""
 FRAMES: Final = 2000
+ASK_S: Final = 5.0
+"""Time between two requests for the predicted paths of a stream."""
 CLOUDS_S: Final = 2.0
 """Without a cloud for so long none is waited for."""
 CLOCK_BACK_NS: Final = 5 * 10**9
@@ -51,6 +53,12 @@ class Sink(Protocol):
 
     def publish(self, topic: str, message: Any) -> None:
         """Publish to ROS."""
+
+    def listened(self, topic: str) -> bool:
+        """Whether ROS has a subscription to a topic."""
+
+    def ask(self, stream: str, parameters: schemas.SessionParameters) -> None:
+        """Set parameters of a stream's session."""
 
 
 @dataclass
@@ -96,6 +104,8 @@ class _Stream:
     """When the newest cloud came; clock of the bridge."""
     newest_ns: int = -1
     """Stamp of the newest detections."""
+    ask_s: float = -math.inf
+    """When predicted paths may be asked for again; clock of the bridge."""
     shown_ns: int = -1
     """Stamp of the newest tracks that went to ROS."""
     counts: Counts = field(default_factory=Counts)
@@ -199,6 +209,8 @@ class Bridge:
         if arrived is not None:
             stream.counts.latency_ms = 1e3 * (self._clock() - arrived)
         stream.counts.tracks += 1
+        if not tracks.has_paths(message):
+            self._ask_paths(stream, message)
         made = tracks.messages(self._types, message, message.stamp_ns, stream.world, stream.name)
         for end, one in made:
             self._sink.publish(stream.topics.tracks_topic + end, one)
@@ -208,6 +220,16 @@ class Bridge:
         if problem.instance != self._instance and (stream := self._streams.get(problem.stream)) is not None:
             stream.counts.problems += 1
             stream.counts.service_problem = f"{problem.instance}: {problem.message}"
+
+    def _ask_paths(self, stream: _Stream, message: schemas.Tracks) -> None:
+        """Ask the service for paths at the horizons of ROS beside those that the session has, now and then."""
+        now, present = self._clock(), () if message.horizons is None else message.horizons.tolist()
+        horizons = sorted({*tracks.HORIZONS, *present})
+        if now < stream.ask_s or len(horizons) > schemas.DEFAULT.max_horizons:
+            return
+        if self._sink.listened(f"{stream.topics.tracks_topic}/predicted"):
+            stream.ask_s = now + ASK_S
+            self._sink.ask(stream.name, schemas.SessionParameters(horizons=np.array(horizons)))
 
     def _sent(self, stream: _Stream, waiting: _Waiting, now: float) -> bool:
         """Send a message, or give it up; False while it has to wait."""

@@ -12,6 +12,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Literal, TypeVar
 
+import numpy as np
 import optipmb_schemas as schemas
 import structlog
 
@@ -236,7 +237,8 @@ class Queries:
         session = actor.session
         if session is not None and asked != empty:
             try:
-                actor.deliver(session.configure(parameters, asked.cloud_wait_s, restart=asked.restart))
+                horizons = None if asked.horizons is None else asked.horizons.tolist()
+                actor.deliver(session.configure(parameters, asked.cloud_wait_s, horizons, restart=asked.restart))
             except RefusedError as error:
                 refusal = schemas.MessageError("invalid_value", error.path, error.expected, error.received)
                 request.refuse(self._problem(actor.stream, refusal, code="refused"))
@@ -249,6 +251,7 @@ class Queries:
         return schemas.SessionParameters(
             profile=parameters.name,
             cloud_wait_s=session.cloud_wait_s if session else self._registry.cloud_wait_s,
+            horizons=np.array(parameters.horizons, np.float64),
             values=parameters.model_dump(mode="json"),
         )
 

@@ -111,6 +111,7 @@ def density_of(
 
 def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
     tracks: optipmb.Tracks,
+    paths: optipmb.PredictedPaths | None,
     *,
     stream: str,
     frame_id: FrameId,
@@ -121,7 +122,7 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
     gap: int,
     ignored: int,
 ) -> schemas.Tracks:
-    """Return the message for the tracks of a frame, without its delivery part.
+    """Return the message for the tracks of a frame, and for their paths if there are any, without its delivery part.
 
     What the tracker made of checked detections needs one look, not the checks of a message from elsewhere; where that
     look finds something odd, those checks say what it is.
@@ -130,6 +131,7 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
         schemas.MessageError: the tracks hold numbers that no message may.
     """
     make = schemas.Tracks.trusted if optipmb.sound(tracks) else schemas.Tracks
+    path_fields = {} if paths is None else schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
     return make(
         stream=stream,
         epoch=frame_id.epoch,
@@ -158,5 +160,6 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
         time_since_detection=tracks.time_since_detection,
         detection=tracks.detection,
         confirmed=tracks.confirmed.astype(np.int64),
+        **path_fields,
         delivery=None,
     )

@@ -109,6 +109,11 @@ class ProcessedFrames:
         self._history = ReorderWindow(state, self.transition.step)
         self.timeline = self.timeline.settle(state.cursor, state.last, frozenset(self.timeline.frame_ids))
 
+    def report_by(self, transition: Transition) -> None:
+        """Go on by a transition that tracks as the one before and reports more or less of the tracks."""
+        self.transition = transition
+        self._history.step = transition.step
+
     def portable(self) -> tuple[FilterState, tuple[Recorded, ...]]:
         """Return the beginning and the frames of as much of the window as a checkpoint takes along."""
         base, entries = self._history.portable(self._policy.checkpoint_bytes)

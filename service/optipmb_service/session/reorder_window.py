@@ -43,7 +43,7 @@ class ReorderWindow:
         self, base: FilterState, step: Step, entries: Sequence[Entry] = (), head: FilterState | None = None
     ) -> None:
         self.base = base
-        self._step = step
+        self.step = step
         self._entries = list(entries)
         self._after: list[FilterState | None] = [None] * len(self._entries)
         if self._entries:
@@ -67,13 +67,13 @@ class ReorderWindow:
         state = self._after[known - 1] if known else self.base
         assert state is not None  # noqa: S101 - the search ended at one that is there; said for the type checker
         for at in range(known, number):
-            state, _ = self._step(state, self._entries[at])
+            state, _ = self.step(state, self._entries[at])
             self._after[at] = state
         return state
 
     def append(self, entry: Entry) -> list[Outcome]:
         """Go on by a frame that belongs behind all others and moves none."""
-        state, outcome = self._step(self.head, entry)
+        state, outcome = self.step(self.head, entry)
         self._entries.append(entry)
         self._after.append(state)
         return [outcome]
@@ -119,7 +119,7 @@ class ReorderWindow:
         for i in range(first, len(entries)):
             if entries[i].frame_id in known:
                 entries[i] = replace(entries[i], revision=entries[i].revision + 1)
-            state, outcome = self._step(state, entries[i])
+            state, outcome = self.step(state, entries[i])
             after.append(state)
             outcomes.append(outcome)
         self._entries = entries

@@ -38,7 +38,7 @@ from optipmb_service.session.values import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     import optipmb_schemas as schemas
 
@@ -173,9 +173,20 @@ class Session:
         return [*outputs, Begun(self.session, reason)]
 
     def configure(
-        self, parameters: optipmb.Parameters | None, cloud_wait_s: float | None, *, restart: bool
+        self,
+        parameters: optipmb.Parameters | None,
+        cloud_wait_s: float | None,
+        horizons: Sequence[float] | None = None,
+        *,
+        restart: bool,
     ) -> list[Output]:
         """Change what a session runs with; another profile only before the first frame or with `restart`.
+
+        Args:
+            parameters: the profile; None: as before.
+            cloud_wait_s: the longest wait for a cloud; None: as before.
+            horizons: those of predicted paths, valid ones; None: those of the profile that is set, else as before.
+            restart: whether the session may begin anew.
 
         Raises:
             RefusedError: another profile, frames were processed, and no restart was asked for; or too long a wait.
@@ -183,19 +194,25 @@ class Session:
         if cloud_wait_s is not None and cloud_wait_s * SECOND > MAX_CLOUD_WAIT_NS:
             longest = f"at most {MAX_CLOUD_WAIT_NS / SECOND:g} seconds"
             raise RefusedError("cloud_wait_s", longest, f"{cloud_wait_s:g}")
-        changes = parameters is not None and parameters != self.parameters
+        before = self.parameters
+        wanted = parameters or before
+        if horizons is not None:
+            wanted = wanted.model_copy(update={"horizons": tuple(horizons)})
+        changes = wanted.model_copy(update={"horizons": before.horizons}) != before
         if changes and not restart and self.counters.frames:
             raise RefusedError(
                 "profile",
                 f"{self.parameters.name!r}, or restart = true: {self.counters.frames} frames have been tracked with it",
-                repr(parameters.name if parameters else ""),
+                repr(wanted.name),
             )
         outputs = self.flush() if changes else []
         if cloud_wait_s is not None:
             self._wait(round(cloud_wait_s * SECOND))
-        if parameters is not None and changes:
+        if changes:
             # Frames are given to the tracker by the classes of the old profile: they cannot be gone over again.
-            self._begin(self._processed.head, self._transition(parameters))
+            self._begin(self._processed.head, self._transition(wanted))
+        elif wanted != before:
+            self._processed.report_by(self._transition(wanted))
         if restart:
             outputs += self.reset("parameters")
         elif changes:

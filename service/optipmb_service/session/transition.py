@@ -82,7 +82,7 @@ class Transition:
         self.parameters = parameters
         self._tracker = tracker
         self._policy = policy
-        values = json.dumps(parameters.model_dump(mode="json"))
+        values = json.dumps(parameters.model_dump(mode="json", exclude={"horizons"}))  # no track depends on them
         self._digest = hashlib.blake2b(values.encode(), digest_size=16).digest()
 
     def name(self, frame_id: FrameId | None, starts: int) -> str:
@@ -142,6 +142,7 @@ class Transition:
         gap = max(0, frame_id.seq - highest - 1)
         tracks = convert.tracks_of(
             result.tracks,
+            result.paths,
             stream=self.stream,
             frame_id=frame_id,
             session=session,

@@ -98,6 +98,11 @@ class Ros2Node:
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
 
+    def listened(self, topic: str) -> bool:
+        """Whether somebody subscribes to a topic that is published here."""
+        publication = self._publications[topic]
+        return any(one.matching_status.matching for one in (publication.hashed, publication.unhashed))
+
     def subscribe(
         self,
         topic: str,

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import optipmb_schemas as schemas
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -69,10 +70,11 @@ def test_a_covariance_that_no_message_can_carry_is_not_told() -> None:
     assert "expected a number in" in two.quarantine
 
 
-def told(found: optipmb.Tracks) -> schemas.Tracks:
+def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> schemas.Tracks:
     """The message for tracks."""
     return convert.tracks_of(
         found,
+        paths,
         stream=SENSOR.stream,
         frame_id=FrameId(SENSOR.epoch, 1, 2),
         session="0" * 32,
@@ -91,6 +93,8 @@ def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.Data
     columns = {}
     for name, array in schemas.Tracks.arrays.items():
         shape = (count, *array.shape[1:])
+        if name in schemas.PATHS:
+            continue
         if name == "confirmed":
             columns[name] = data.draw(arrays(np.bool_, shape))
         elif array.dtype == "i8":
@@ -109,6 +113,38 @@ def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.Data
         return
     assert schemas.decode(schemas.encode(message), schemas.Tracks) == message
     assert all(not getattr(message, name).flags.writeable for name in columns)
+
+
+@pytest.mark.parametrize("value", [1e12, 1.1e12, 1e31, 1e39, np.inf, np.nan])
+@pytest.mark.parametrize("entry", ["position", "yaw", "covariance"])
+def test_paths_that_no_message_can_carry_are_not_told(entry: str, value: float) -> None:
+    """Whatever numbers predicted paths hold: the message is valid, or it is not made and the error names the field."""
+    found = tracks_after(4)
+    count = len(found.id)
+    mean, covariance = np.zeros((count, 2, 6)), np.broadcast_to(np.eye(6), (count, 2, 6, 6)).copy()
+    if entry == "covariance":
+        covariance[-1, -1, 1, 1] = value
+    else:
+        mean[-1, -1, 1 if entry == "position" else 3] = value
+    paths = optipmb.PredictedPaths(found.id, found.label, np.array([0.5, 1.0]), mean, covariance)
+    if (entry, value) == ("position", 1e12) or (entry == "covariance" and value < 1e13):
+        message = told(found, paths)
+        assert schemas.decode(schemas.encode(message), schemas.Tracks) == message
+    else:
+        with pytest.raises(schemas.MessageError, match=rf"path_{entry}\[{count - 1}\]\[1\]"):
+            told(found, paths)
+
+
+def tracks_after(frames: int) -> optipmb.Tracks:
+    """The tracks of the sensor's objects after some frames."""
+    tracker = optipmb.Tracker(NUSCENES)
+    density = tracker.initial()
+    for seq in range(frames):
+        frame, _ = convert.frame_of(NUSCENES, SENSOR.detections(seq))
+        result = tracker.step(density, frame)
+        density = result.density
+    assert len(result.tracks)
+    return result.tracks
 
 
 def test_repairs_are_counted_and_shown() -> None:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import sessions
+from optipmb_schemas import PATHS
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Lineage, Output, Policy, RefusedError
 from router import SECOND, Sensor, plain
@@ -310,6 +312,50 @@ def test_parameters_change_only_before_frames_or_with_a_restart() -> None:
     assert begun(one.configure(kitti, None, restart=True)) == ["parameters"]
     assert one.session != old
     assert tracks(feed(one, [3]))[0].labels == kitti.labels
+
+
+def test_horizons_add_paths_and_change_nothing_else() -> None:
+    """Asked for in a running session, tracks carry predicted paths from the next frame on until they are asked not to.
+
+    Session, density and all other fields stay as they are; corrections and a restored session have the paths too.
+    """
+    one, other = session(), session()
+    expected = tracks(feed(other, range(8)))
+    got = tracks(feed(one, range(3)))
+    assert one.configure(None, None, [0.5, 2.0], restart=False) == []
+    got += tracks(feed(one, [3]))
+    one = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0, instance="test")
+    got += tracks(feed(one, [4, 6]) + one.recovered(0))
+    corrected = tracks(feed(one, [5]))
+    assert [message.seq for message in corrected] == [5, 6]
+    one.configure(None, None, [], restart=False)
+    got = [*got[:5], *corrected, *tracks(feed(one, [7]))]
+    for before, after in zip(expected, got, strict=True):
+        bare = after.model_copy(update=dict.fromkeys(PATHS))
+        assert plain(bare.model_copy(update={"revision": 0})) == plain(before)
+        assert (after.horizons is not None) == (3 <= after.seq <= 6)
+    last = got[6]
+    assert last.horizons is not None
+    assert last.horizons.tolist() == [0.5, 2.0]
+    assert last.path_position is not None
+    assert last.path_position.shape == (len(last.id), 2, 2)
+    assert len(last.id)
+
+
+def test_a_profile_brings_its_own_horizons() -> None:
+    """Setting a profile sets its horizons; the same profile with other horizons needs no restart."""
+    asking = NUSCENES.model_copy(update={"horizons": (1.0,)})
+    one = session()
+    feed(one, range(2))
+    one.configure(asking, None, restart=False)
+    assert one.parameters.horizons == (1.0,)
+    one.configure(asking, None, [3.0], restart=False)
+    assert one.parameters.horizons == (3.0,)
+    one.configure(NUSCENES, None, restart=False)
+    assert one.parameters.horizons == ()
+    with pytest.raises(RefusedError, match="profile"):
+        one.configure(optipmb.load_profile("kitti"), None, [1.0], restart=False)
+    assert one.parameters == NUSCENES
 
 
 def test_state_counts() -> None:

@@ -340,7 +340,7 @@ def test_parameters(node: Node) -> None:
     """q/parameters asks and sets, ahead of the first frame or with a restart; what is not possible is refused."""
     key = KEYS.query(SENSOR.stream, "parameters")
     asked = node.ask(key, SessionParameters)
-    assert (asked.profile, asked.cloud_wait_s) == ("nuscenes", 0.1)
+    assert (asked.profile, asked.cloud_wait_s, len(asked.horizons)) == ("nuscenes", 0.1, 0)
     assert asked.values == json.loads(json.dumps(NUSCENES.model_dump(mode="json")))
     assert node.ask(KEYS.status("test"), ServiceStatus).sessions == ()
     given = node.ask(key, SessionParameters, SessionParameters(profile="kitti", cloud_wait_s=0.3))
@@ -355,6 +355,15 @@ def test_parameters(node: Node) -> None:
     node.ask(key, SessionParameters, SessionParameters(profile="nuscenes", restart=True))
     node.send(SENSOR.detections(1))
     assert node.tracks(SENSOR.stream, 2)[1].profile == "nuscenes"
+    given = node.ask(key, SessionParameters, SessionParameters(horizons=np.array([1.0, 3.0])))
+    assert given.horizons.tolist() == [1.0, 3.0]
+    node.send(SENSOR.detections(2))
+    before, after = node.tracks(SENSOR.stream, 3)[1:]
+    assert before.session == after.session
+    assert before.horizons is None
+    assert after.path_position is not None
+    assert after.path_position.shape == (len(after.id), 2, 2)
+    assert node.refused(key, b'{"horizons":[3,1]}').path == "horizons[1]"
 
 
 def test_profiles_follow_patterns(start: Callable[..., Any]) -> None:
