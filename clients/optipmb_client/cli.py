@@ -1,5 +1,6 @@
 """The command `optipmb`. An error is one line on standard error and a status: 2 for what was asked, 1 for the rest."""
 
+import inspect
 import signal
 import sys
 from collections.abc import Sequence
@@ -9,6 +10,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 from optipmb_schemas import MessageError
+from typer.core import TyperCommand, TyperGroup
 
 from optipmb_client.arguments import spread
 from optipmb_client.commands.ablate import ablate
@@ -41,8 +43,30 @@ TERMINATED = 128 + signal.SIGTERM
 # What the option parser raises for a wrong option: the base of its public subclass, as it has no public name itself.
 _OptionError: Any = typer.BadParameter.__base__
 
+
+class _Command(TyperCommand):
+    def get_params(self, ctx: Any) -> list[Any]:  # the context and the parameters have no public types
+        return _without_types_of_flags(super().get_params(ctx))
+
+
+class _Group(TyperGroup):
+    def get_params(self, ctx: Any) -> list[Any]:  # as above
+        return _without_types_of_flags(super().get_params(ctx))
+
+
+def _without_types_of_flags(parameters: list[Any]) -> list[Any]:
+    """Let the help show no type beside a flag, because a flag takes no value."""
+    for one in parameters:
+        if getattr(one, "is_flag", False):
+            one.metavar = ""
+    return parameters
+
+
 app = typer.Typer(
-    name="optipmb", help="Track objects in 3D: offline, or through a tracking service.", add_completion=False
+    name="optipmb",
+    cls=_Group,
+    help="Track objects in 3D: offline, or through a tracking service.",
+    add_completion=False,
 )
 for command in (
     demo,
@@ -61,7 +85,8 @@ for command in (
     move,
     warm_up,
 ):
-    app.command()(command)
+    paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
+    app.command(cls=_Command, help="\n\n".join(" ".join(part.split()) for part in paragraphs))(command)
 
 
 def _version(value: bool) -> None:  # noqa: FBT001  the parser calls it so

@@ -18,7 +18,7 @@ def demo(
     speed: Speed = "max",
     as_json: AsJson = False,
 ) -> None:
-    """Start a service, send generated traffic through it, and show what the tracks are worth.
+    """Start a service, send generated traffic through it, evaluate and draw the tracks.
 
     The service is a process of its own on a free port and ends with the demo.
     """

@@ -21,7 +21,7 @@ def move(
     *,
     as_json: AsJson = False,
 ) -> None:
-    """Give a stream to another worker process of a service that has several; tracks and ids go on."""
+    """Move a stream to another worker process of a service; tracks and ids continue."""
     with Connection(connect, config=config, timeout=2.0) as connection:
         names = [instance] if instance else [found.instance for found in find_services(connection, prefix=prefix)]
         if not names:

@@ -1,4 +1,4 @@
-"""`optipmb profiles`: the parameter profiles that come along; list, show, copy, explain."""
+"""`optipmb profiles`: the parameter profiles that ship; list, show, copy, explain."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,7 +25,7 @@ def profiles(
     explain: Annotated[bool, typer.Option("--explain", help="Say what each field means, with its values.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """List the profiles that come along, show one, copy it, or explain its fields.
+    """List the profiles that ship, show one, copy it, or explain its fields.
 
     A profile of your own is checked by showing it: `optipmb profiles mine.toml`.
     """

@@ -24,8 +24,8 @@ def status(
     timeout: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a router, and for a service.")] = 2.0,
     prefix: Prefix = PREFIX,
     *,
-    watch: Annotated[bool, typer.Option("--watch", help="Go on until Ctrl-C, the worst streams on top.")] = False,
-    interval: Annotated[float, typer.Option(min=0.1, help="Seconds between two looks, with --watch.")] = 1.0,
+    watch: Annotated[bool, typer.Option("--watch", help="Update until Ctrl-C, the worst streams on top.")] = False,
+    interval: Annotated[float, typer.Option(min=0.1, help="Seconds between updates, with --watch.")] = 1.0,
     as_json: AsJson = False,
 ) -> None:
     """Show the services that are alive, their streams, rates and latencies, and their newest problems."""

@@ -76,7 +76,7 @@ def tune(  # noqa: PLR0913  these are the command's options
 ) -> None:
     """Estimate the parameters of each class from labelled data, then refine them by tracking.
 
-    A second call with the same --out goes on where the first one ended.
+    A second call with the same --out continues where the first one ended.
     """
     from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
     from optipmb_client.offline import profile_compared  # noqa: PLC0415  as above

@@ -47,7 +47,7 @@ TICK_S = 0.2
 
 def watch(  # noqa: PLR0913  these are the command's options
     file: Annotated[
-        Path | None, typer.Argument(help="A recording; default: what a service does now.", show_default=False)
+        Path | None, typer.Argument(help="A recording; default: the running service.", show_default=False)
     ] = None,
     *,
     streams: Annotated[
@@ -76,7 +76,7 @@ def watch(  # noqa: PLR0913  these are the command's options
     timeout: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a router.")] = 5.0,
     prefix: Prefix = PREFIX,
 ) -> None:
-    """Watch streams from above and in 3D: tracks, their velocity, uncertainty and ways, detections, clouds.
+    """Watch streams from above and in 3D: tracks, their velocity, uncertainty and paths, detections, clouds.
 
     Ends when it is interrupted, or at the end of a recording with --save. With --foxglove also problems, as logs.
     """
