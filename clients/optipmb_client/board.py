@@ -13,6 +13,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from optipmb_client.columns import without
 from optipmb_client.status import duration
 
 __all__ = ["Board"]
@@ -24,6 +25,12 @@ LATE_MS = 50.0  # latency that is worth a colour
 VERY_LATE_MS = 200.0
 SHOWN_PROBLEMS = 6
 FRAME_LINES = 6  # lines of the board that are neither services, streams nor problems
+SPARE = {
+    "instances": ("frames/s lately", "stands by", "up", "p50 ms", "waiting"),
+    "streams": ("profile", "p50 ms", "lost", "instance", "tracks", "last frame", "waiting"),
+}
+"""Columns that a narrow terminal does not show, the first ones first."""
+
 BARS = " ▁▂▃▄▅▆▇█"
 GOOD, POOR, BAD, QUIET = "green", "yellow", "bold red", "dim"
 STATES = {"ready": GOOD, "running": GOOD, "new": QUIET, "starting": POOR, "degraded": POOR, "stale": POOR}
@@ -72,19 +79,19 @@ class Board:
         for instance in [name for name, seen in self._seen.items() if now_s - seen.at_s > GONE_S]:
             del self._seen[instance]
 
-    def render(self, height: int) -> RenderableType:
-        """Return the board, at most so many lines high; streams that are well are left out first."""
+    def render(self, height: int, width: int) -> RenderableType:
+        """Return the board, at most so many lines and characters; streams that are well are left out first."""
         alive = [seen for seen in self._seen.values() if seen.at_s == self._now_s]
         parts: list[RenderableType] = [self._title(alive)]
         if not self._seen:
             parts.append(Text("no service answers", style=BAD))
             return Group(*parts)
-        parts += [Text(), self._instances()]
+        parts += [Text(), without(self._instances(), width, SPARE["instances"])]
         problems = sorted(self._problems.values(), key=lambda noted: noted[0])[-SHOWN_PROBLEMS:]
         rows = [(seen, session) for seen in alive for session in seen.status.sessions]
         room = max(1, height - FRAME_LINES - len(self._seen) - (len(problems) + 1 if problems else 0))
         if rows:
-            parts += [Text(), self._streams(rows, room)]
+            parts += [Text(), without(self._streams(rows, room), width, SPARE["streams"])]
         if problems:
             parts += [Text(), *(self._problem(at_s, problem) for at_s, problem in problems)]
         return Group(*parts)
@@ -108,7 +115,8 @@ class Board:
         streams = sum(len(seen.status.sessions) for seen in alive)
         frames = sum(seen.frames_hz for seen in alive)
         lost = sum(seen.lost_hz for seen in alive)
-        text = Text.assemble(("OptiPMB", "bold"), f"  {self._where}   {len(alive)} services, {streams} streams, ")
+        text = Text.assemble(("OptiPMB", "bold"), f"  {self._where}   ")
+        text.append(f"{_counted(len(alive), 'service')}, {_counted(streams, 'stream')}, ")
         text.append(f"{frames:.0f} frames/s", style="bold")
         text.append(f", {lost:.1f} lost/s", style=BAD if lost else QUIET)
         return text
@@ -163,7 +171,7 @@ class Board:
                 "never" if session.age_s is None else duration(session.age_s),
             )
         if len(shown) < len(ordered):
-            table.add_row(Text(f"and {len(ordered) - len(shown)} more that are better off", style=QUIET))
+            table.add_row(Text(f"and {len(ordered) - len(shown)} more in better state", style=QUIET))
         return table
 
     def _urgency(self, seen: _Seen, session: SessionSummary) -> float:
@@ -191,6 +199,10 @@ def _table(names: Iterable[str], figures: Iterable[str]) -> Table:
     for name in figures:
         table.add_column(name, justify="right", no_wrap=True)
     return table
+
+
+def _counted(number: int, name: str) -> str:
+    return f"{number} {name}" if number == 1 else f"{number} {name}s"
 
 
 def _state(state: str) -> Text:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from optipmb_schemas import Problem, ServiceStatus, SessionSummary
-from rich.console import Group, RenderableType
+from rich.console import Group, JustifyMethod, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -11,6 +11,9 @@ __all__ = ["duration", "render"]
 
 COLUMNS = ("stream", "profile", "state", "frames/s", "p50 ms", "p99 ms", "frames", "tracks", "queue")
 COUNTED = ("refused", "shed", "gaps", "last frame")
+TEXTS = 3
+"""Columns of texts; the others are of numbers."""
+
 SHOWN_PROBLEMS = 5
 
 
@@ -28,7 +31,8 @@ def render(services: Sequence[ServiceStatus]) -> RenderableType:
 def _streams(sessions: Sequence[SessionSummary]) -> Table:
     table = Table(box=None, pad_edge=False)
     for number, name in enumerate(COLUMNS + COUNTED):
-        table.add_column(name, justify="left" if number < 3 else "right", no_wrap=True)  # noqa: PLR2004  texts first
+        side: JustifyMethod = "right" if number >= TEXTS else "default" if number else "left"
+        table.add_column(name, justify=side, no_wrap=True)  # of a table in parts, each has the columns on the left
     for session in sessions:
         table.add_row(
             session.stream,

@@ -3,6 +3,7 @@
 import io
 from typing import Any
 
+import pytest
 from optipmb_client.board import Board
 from optipmb_schemas import Problem, ServiceStatus, SessionSummary
 from rich.console import Console
@@ -22,10 +23,10 @@ def service(instance: str = "one", *sessions: SessionSummary, **changes: Any) ->
     return ServiceStatus(instance=instance, sessions=sessions, **fields | changes)
 
 
-def text(board: Board, height: int = HEIGHT) -> str:
+def text(board: Board, height: int = HEIGHT, width: int = 140) -> str:
     """The board as a terminal would show it, without colours."""
-    console = Console(width=140, record=True, file=io.StringIO())
-    console.print(board.render(height))
+    console = Console(width=width, record=True, file=io.StringIO())
+    console.print(board.render(height, width))
     return console.export_text()
 
 
@@ -35,7 +36,7 @@ def test_rates_are_those_of_the_last_interval() -> None:
     board.take([service("one", session("a/b/c", shed=50), frames=5000)], 10.0)
     board.take([service("one", session("a/b/c", shed=54), frames=5040)], 12.0)
     title = text(board).splitlines()[0]
-    assert "1 services, 1 streams, 20 frames/s, 2.0 lost/s" in title
+    assert "1 service, 1 stream, 20 frames/s, 2.0 lost/s" in title
 
 
 def test_a_restart_is_no_negative_rate() -> None:
@@ -57,7 +58,7 @@ def test_the_worst_come_first_and_the_rest_is_counted() -> None:
     assert len(lines) <= 20
     streams = [line.split()[0] for line in lines if "/" in line.split(" ")[0]]
     assert streams[:4] == ["z/z/losing", "z/z/silent", "z/z/late", "a/b/well-00"]
-    assert f"and {53 - len(streams)} more that are better off" in text(board, 20)
+    assert f"and {53 - len(streams)} more in better state" in text(board, 20)
 
 
 def test_an_instance_that_vanished_is_shown_for_a_while() -> None:
@@ -81,6 +82,20 @@ def test_problems_are_shown_once_with_their_age() -> None:
     assert len(lines) == 1
     assert lines[0].split()[:4] == ["4.0", "s", "ago", "late"]
     assert "(3 times)" in lines[0]
+
+
+@pytest.mark.parametrize("width", [80, 140])
+def test_a_narrow_terminal_shows_fewer_columns(width: int) -> None:
+    """Names and what says that something is wrong are whole at any width; what matters less needs a wide terminal."""
+    board = Board("tcp/127.0.0.1:7447")
+    for second in range(60):
+        board.take([service("edge-1", session("garage/robot-1/lidar-front"), state="degraded")], float(second))
+    lines = text(board, width=width).splitlines()
+    assert max(map(len, lines)) <= width
+    assert not any("…" in line for line in lines)
+    for word in ("edge-1", "degraded", "garage/robot-1/lidar-front", "running", "p99 ms", "lost/s"):
+        assert any(word in line for line in lines)
+    assert any("nuscenes" in line for line in lines) == (width > 80)
 
 
 def test_nothing_there_is_said() -> None:

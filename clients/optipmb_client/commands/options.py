@@ -11,9 +11,9 @@ from typing import Annotated, Any, Final
 
 import typer
 from rich.console import Console, Group, RenderableType
-from rich.measure import Measurement
 from rich.table import Table
 
+from optipmb_client.columns import parts
 from optipmb_client.datasets import DATASETS, DataSequence, Dataset, DatasetArguments, dataset_at
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.transport import DEFAULT_ENDPOINT
@@ -209,36 +209,10 @@ def print_table(table: RenderableType) -> None:
     width = console.width if console.is_terminal or "COLUMNS" in os.environ else WIDE
     console = Console(width=width)
     for part in table.renderables if isinstance(table, Group) else (table,):
-        for fitting in _parts(console, part) if isinstance(part, Table) else (part,):
+        for number, fitting in enumerate(parts(part, width) if isinstance(part, Table) else (part,)):
+            if number:
+                console.print()
             console.print(fitting)
-
-
-def _parts(console: Console, table: Table) -> Iterator[Table]:
-    """Yield a table in parts that fit; its leading columns that are aligned left stand in each of them."""
-    columns = table.columns
-    widths = [Measurement.get(console, console.options, _only(table, [place])).maximum for place in range(len(columns))]
-    space = 2 if table.box is None else 3
-    lead = [place for place in range(len(columns)) if all(one.justify == "left" for one in columns[: place + 1])]
-    taken, used = list(lead), sum(widths[place] + space for place in lead)
-    for place in range(len(lead), len(columns)):
-        if used + widths[place] > console.width and taken != lead:
-            yield _only(table, taken)
-            console.print()
-            taken, used = list(lead), sum(widths[one] + space for one in lead)
-        taken.append(place)
-        used += widths[place] + space
-    yield _only(table, taken)
-
-
-def _only(table: Table, places: list[int]) -> Table:
-    """Return a table with some of its columns."""
-    part = Table(box=table.box, pad_edge=table.pad_edge, title=table.title, title_justify=table.title_justify)
-    for place in places:
-        column = table.columns[place]
-        part.add_column(column.header, justify=column.justify, no_wrap=column.no_wrap)
-    for row in zip(*(table.columns[place].cells for place in places), strict=True):
-        part.add_row(*row)
-    return part
 
 
 def print_json(result: Any) -> None:

@@ -59,5 +59,5 @@ def _watch(connection: Connection, prefix: str, interval_s: float) -> None:
             except (ConnectionFailed, ServiceRefused):
                 services = []
             board.take(services, time.monotonic())
-            live.update(board.render(console.height), refresh=True)
+            live.update(board.render(console.height, console.width), refresh=True)
             time.sleep(max(0.05, interval_s - (time.monotonic() - began)))
