@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 
 from optipmb_client.commands.options import AsJson, print_json, print_table, say
 from optipmb_client.errors import UsageError
@@ -47,8 +49,7 @@ def profiles(
     elif as_json:
         print_json({"command": "profiles", "profile": parameters.model_dump()})
     elif explain:
-        for field in offline.fields_of(parameters):
-            say(_line(field))
+        print_table(Group(*(Text(_line(field)) for field in offline.fields_of(parameters))))
     else:
         say(offline.profile_text(name).rstrip())
 

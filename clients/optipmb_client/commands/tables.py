@@ -34,6 +34,7 @@ _NUSCENES = {
 }
 _METRES = frozenset({"amotp", "motp"})
 _COUNTS = frozenset({"gt", "tp", "fp", "fn", "ids", "frag"})
+SCORE = "score ≥"
 _HOTA = ("HOTA", "DetA", "AssA")
 _DIRECTIONS = ("along", "across", "height", "heading", "length", "width", "tall")
 _GOSPA = ("GOSPA", "localisation", "missed", "false", "OSPA")
@@ -41,7 +42,7 @@ _GOSPA = ("GOSPA", "localisation", "missed", "false", "OSPA")
 
 def clear_table(results: "Sequence[ClassResult]", *, metres: bool) -> RenderableType:
     """Return the CLEAR MOT figures; MOTP is in metres or in percent."""
-    table = _empty(("class", "score from", *_CLEAR))
+    table = _empty(("class", SCORE, *_CLEAR))
     for result in results:
         best = result.sweep.best
         for name, threshold, figures in (
@@ -116,7 +117,7 @@ def _protocol(figures: "Sequence[ClassFigures]") -> Table:
 def _sets(figures: "Sequence[ClassFigures]") -> Table:
     image = any(one.everything.hota_2d for one in figures)
     heads = [*(f"2D {name}" for name in _HOTA if image), *(f"centre {name}" for name in (*_HOTA, "LocA")), *_GOSPA]
-    table = _empty(("class", "score from", *heads))
+    table = _empty(("class", SCORE, *heads))
     for one in figures:
         for place, part in enumerate((one.everything, one.best)):
             if part is None:
@@ -167,9 +168,9 @@ def _errors(figures: "Sequence[ClassFigures]") -> Iterator[RenderableType]:
                     label = (head, str(values["boxes"])) if kind == "track" else ("", "")
                     boxes.add_row(*label, kind[:5], *(_shown(values[kind][key], plain=True) for key in _DIRECTIONS))
             if heading["boxes"]:
-                told = (_shown(heading["NEES"], plain=True), _shown(heading["coverage"]))
+                spread = (_shown(heading["NEES"], plain=True), _shown(heading["coverage"]))
                 both = (_shown(heading["backward"]), _shown(turned["detection"]))
-                headings.add_row(head, str(heading["boxes"]), *both, *told)
+                headings.add_row(head, str(heading["boxes"]), *both, *spread)
     if boxes.row_count:
         yield _titled("Errors of tracks that exist with 50 % or more, and of their detections: m, rad", boxes)
     if headings.row_count:
@@ -185,15 +186,15 @@ def _reliability(figures: "Sequence[ClassFigures]") -> Table:
     table = _empty(("class", "", *heads))
     for name, deciles in calibrations:
         table.add_row(name, "tracks", *(str(deciles[place].count) for place in used))
-        table.add_row("", "said", *(_shown(_known(deciles[place].predicted)) for place in used))
-        table.add_row("", "found", *(_shown(_known(deciles[place].observed)) for place in used))
+        table.add_row("", "predicted", *(_shown(_known(deciles[place].predicted)) for place in used))
+        table.add_row("", "observed", *(_shown(_known(deciles[place].observed)) for place in used))
     return table
 
 
 def _empty(columns: Sequence[str]) -> Table:
     table = Table(box=None, pad_edge=False)
     for name in columns:
-        table.add_column(name, justify="left" if name in {"class", "tracks", ""} else "right", no_wrap=True)
+        table.add_column(name, justify="left" if name in {"class", "tracks", SCORE, ""} else "right", no_wrap=True)
     return table
 
 
