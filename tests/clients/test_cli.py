@@ -221,7 +221,7 @@ def test_tracks_are_evaluated_and_drawn(tmp_path: Path, capsys: pytest.CaptureFi
     capsys.readouterr()
     assert run(["evaluate", *data, *tracks]) == 0
     head, *rows = capsys.readouterr().out.splitlines()
-    assert head.split()[:4] == ["class", "score", "from", "MOTA"]
+    assert head.split()[:4] == ["class", "score", "≥", "MOTA"]
     assert [row.split()[0] for row in rows[:6] if not row.startswith(" ")] == ["Car", "Pedestrian", "Cyclist"]
     assert run(["evaluate", *data, *tracks, "--class", "Car", "Cyclist", "--iou", "0.25", "--json"]) == 0
     classes = json.loads(capsys.readouterr().out)["classes"]
