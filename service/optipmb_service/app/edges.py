@@ -10,14 +10,12 @@ import structlog
 from optipmb_service.runtime.ports import EdgeError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
 
+    from optipmb_service.grpc.beside import AddFigures
     from optipmb_service.http import Source, Watched
-    from optipmb_service.observability.metrics import Value
     from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
-
-    AddFigures = Callable[[Callable[[], Iterable[Value]]], None]
 
     class Monitored(Source, Watched, Protocol):
         """What is served over HTTP."""
@@ -62,8 +60,8 @@ def grpc_edge(settings: Settings, client: Callable[[], Client], add: AddFigures)
         yield
         return
     try:
-        from optipmb_service.app.gateway import beside  # noqa: PLC0415 - an extra that only this needs
+        from optipmb_service.grpc.beside import serving  # noqa: PLC0415 - an extra that only this needs
     except ModuleNotFoundError as error:
         raise EdgeError(f"gRPC needs {error.name}, which is not installed: pip install 'optipmb[grpc]'") from error
-    with beside(settings, client(), add):
+    with serving(settings, client(), add):
         yield

@@ -1,11 +1,9 @@
-"""The gateway as a process of its own, and beside the service on a thread with a loop of its own."""
+"""The gateway as a process of its own."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import sys
-import threading
 from typing import TYPE_CHECKING, Final
 
 import structlog
@@ -13,15 +11,12 @@ import structlog
 from optipmb_service import __version__
 from optipmb_service.app.edges import monitoring
 from optipmb_service.app.loops import StopRequest, beat, settle, unless
-from optipmb_service.grpc.server import GRACE_S, Server
+from optipmb_service.grpc.server import Server
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from optipmb_service.app.edges import AddFigures
     from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
@@ -81,33 +76,3 @@ async def run(settings: Settings) -> int:
         beating.cancel()
     log.info("stopped", drained=True)
     return 0
-
-
-@contextlib.contextmanager
-def beside(settings: Settings, client: Client, add: AddFigures) -> Iterator[None]:
-    """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other.
-
-    Raises:
-        EdgeError: the address, the certificates or the access cannot be used.
-    """
-    loop = asyncio.new_event_loop()
-    thread = threading.Thread(target=loop.run_forever, name="grpc", daemon=True)
-    thread.start()
-
-    async def begin() -> Server:
-        server = Server(settings, client)
-        await server.start()
-        return server
-
-    server: Server | None = None
-    try:
-        server = asyncio.run_coroutine_threadsafe(begin(), loop).result()
-        add(server.metrics.figures)
-        log.info("grpc", address=server.address)
-        yield
-    finally:
-        if server is not None:
-            with contextlib.suppress(TimeoutError):
-                asyncio.run_coroutine_threadsafe(server.stop(), loop).result(2 * GRACE_S)
-        loop.call_soon_threadsafe(loop.stop)
-        thread.join(GRACE_S)
