@@ -168,7 +168,7 @@ def _report(refined: "Refined") -> Group:
     for title, rows in (
         ("before", refined.before),
         ("cross-validated", refined.crossed),
-        ("after (on what chose it)", refined.after),
+        ("after (on the tuning data)", refined.after),
     ):
         for copy, row in zip(copies, rows, strict=False):
             figures.add_row(title + copy, *_cells(row))
