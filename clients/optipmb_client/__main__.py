@@ -1,5 +1,6 @@
 """The command `optipmb`, which is also `python -m optipmb_client`."""
 
+import gc
 import sys
 from typing import NoReturn
 
@@ -8,6 +9,7 @@ from optipmb_client.extras import to_install
 
 def main() -> NoReturn:
     """Run the command line of this process and exit; say what to install where its packages are missing."""
+    gc.disable()  # what imports make stays: walking it again and again would be a tenth of the start
     try:
         from optipmb_client import cli  # noqa: PLC0415 - packages of an extra
     except ModuleNotFoundError as error:
@@ -15,6 +17,7 @@ def main() -> NoReturn:
         if text is None:
             raise
         sys.exit(f"optipmb: {text}")
+    gc.enable()
     cli.main()
 
 

@@ -3,6 +3,7 @@
 import sys
 
 from optipmb_service.app import health_command
+from optipmb_service.app.uncollected import uncollected
 
 
 def main() -> None:
@@ -10,7 +11,8 @@ def main() -> None:
     if sys.argv[1:2] == ["health"]:
         sys.exit(health_command.main(sys.argv[2:]))
     try:
-        from optipmb_service.app import cli  # noqa: PLC0415 - a second that `health` can do without
+        with uncollected():
+            from optipmb_service.app import cli  # noqa: PLC0415 - a second that `health` can do without
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("optipmb"):
             raise

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 SUBSCRIBERS = 200
-FRAMES = 40
+FRAMES = 20
 
 SUBSCRIBER_BYTES = 512 * 2**10
 """Memory that the gateway may take for each of many subscribers."""

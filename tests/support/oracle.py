@@ -206,10 +206,12 @@ class Oracle:
 
     def _in_gate(self, component: Bernoulli | Poisson, z: Measurement) -> bool:
         """Class gate and distance gate."""
+        if component.label != z.label:
+            return False
         distance, c = math.hypot(*(component.mean[:2] - z.xy)), self.classes[z.label]
         eta = c.gate * (1 + c.gate_growth * max(0.0, self.dt / self.nominal - 1))
         spread = math.sqrt(component.covariance[2, 2])
-        return component.label == z.label and distance <= max(eta, c.gate_deviations * spread * self.dt)
+        return distance <= max(eta, c.gate_deviations * spread * self.dt)
 
     def _log_likelihood(self, component: Bernoulli | Poisson, z: Measurement) -> float:
         position = self.classes[z.label].measurement_noise.position

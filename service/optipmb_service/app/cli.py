@@ -20,6 +20,7 @@ from typer.main import get_command
 from optipmb_service import __version__
 from optipmb_service.app import health_command, router
 from optipmb_service.app.loops import leave
+from optipmb_service.app.uncollected import uncollected
 from optipmb_service.observability import logs
 from optipmb_service.settings import DEFAULT_GRPC, DEFAULT_LISTEN, Loaded, Settings, SettingsInvalidError, load
 
@@ -204,7 +205,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run_one(settings: Settings) -> int:
     # It takes the tracker along: 150 MB and seconds.
-    from optipmb_service.app.worker import run_alone  # noqa: PLC0415 - neither a parent nor a question needs it
+    with uncollected():
+        from optipmb_service.app.worker import run_alone  # noqa: PLC0415 - neither a parent nor a question needs it
 
     return run_alone(settings)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 import optipmb
+from optipmb_service.app.uncollected import uncollected
 
 UNUSED: Final = "scipy.linalg"
 COMPILER: Final = "libllvmlite"
@@ -22,13 +23,14 @@ def warm_up() -> None:
     With its array functions numba loads scipy's linear algebra where that is installed: 17 MB, for functions that no
     kernel uses. It does without where there is none, so it is shown none.
     """
-    if UNUSED not in sys.modules:
-        sys.modules[UNUSED] = None  # type: ignore[assignment]  # what makes an import fail, as Python has it
-        try:
-            import_module("numba.np.arraymath")
-        finally:
-            del sys.modules[UNUSED]
-    optipmb.warm_up()
+    with uncollected():
+        if UNUSED not in sys.modules:
+            sys.modules[UNUSED] = None  # type: ignore[assignment]  # what makes an import fail, as Python has it
+            try:
+                import_module("numba.np.arraymath")
+            finally:
+                del sys.modules[UNUSED]
+        optipmb.warm_up()
     release_compiler()
 
 
