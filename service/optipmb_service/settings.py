@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 PREFIX: Final = "OPTIPMB_"
 DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"
 DEFAULT_GRPC: Final = "127.0.0.1:50051"
+DEFAULT_NATS: Final = "127.0.0.1:4222"
 
 Source = Literal["option", "environment", "file", "default"]
 
@@ -53,10 +54,22 @@ def _endpoint(value: str) -> str:
     return value
 
 
-def _address(value: str) -> str:
+def address(value: str) -> str:
+    """Return an address as it is, `host:port` or nothing.
+
+    Raises:
+        ValueError: it is none.
+    """
     if value and not re.fullmatch(r"([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.%]+\]):\d{1,5}", value):
         raise ValueError(f"an address looks like 127.0.0.1:8080, received {value!r}")
     return value
+
+
+def state_home() -> Path:
+    """Return the folder below which state is kept that no setting gives a place."""
+    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(state or Path(home) / "optipmb")
 
 
 def _prefix(value: str) -> str:
@@ -77,6 +90,13 @@ def _listed(value: Any) -> Any:
         raise ValueError(f"names separated by commas, or a JSON list, received {value!r}") from error
 
 
+def _server(value: str) -> str:
+    if not re.fullmatch(r"(nats|tls)://\S+", value):
+        raise ValueError(f"a NATS server looks like nats://127.0.0.1:4222, received {value!r}")
+    return value
+
+
+Server = Annotated[str, AfterValidator(_server)]
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
 Endpoints = Annotated[tuple[Endpoint, ...], NoDecode, BeforeValidator(_listed)]
 
@@ -286,6 +306,11 @@ class Settings(BaseSettings):
     idle_s: float = Field(
         default=600.0, gt=0, description="a session without a message for this long is closed and freed"
     )
+    cluster: Annotated[tuple[Server, ...], NoDecode, BeforeValidator(_listed)] = Field(
+        default=(),
+        description="NATS servers where the instances of many machines share streams and checkpoints, as"
+        " `nats://10.0.0.1:4222`; default: none, and instances on one router share the folder `store`",
+    )
     store: str = Field(
         default="",
         description="folder of checkpoints and quarantined sessions; `none`: nothing is kept; default: a folder named"
@@ -323,7 +348,7 @@ class Settings(BaseSettings):
         " process is not healthy, a worker is replaced",
     )
     grace_s: float = Field(default=1.0, ge=0, le=60, description="at shutdown, time for the frames already received")
-    http: Annotated[str, AfterValidator(_address)] = Field(
+    http: Annotated[str, AfterValidator(address)] = Field(
         default="",
         description="address of the live page, `/healthz`, `/readyz` and `/metrics`, as `127.0.0.1:8080`; default:"
         " none",
@@ -336,7 +361,7 @@ class Settings(BaseSettings):
     http_streams: int = Field(
         default=100, ge=0, le=10_000, description="streams with series of their own in the metrics, by name"
     )
-    grpc: Annotated[str, AfterValidator(_address)] = Field(
+    grpc: Annotated[str, AfterValidator(address)] = Field(
         default="", description="address of the gRPC server, as `127.0.0.1:50051`; default: none"
     )
     grpc_tls: Path | None = Field(
@@ -388,11 +413,9 @@ class Settings(BaseSettings):
             return None
         if self.store:
             return Path(self.store).expanduser()
-        state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-        home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
         # Instances on one network share the state, other networks of the same host have their own.
         where = re.sub(r"[^A-Za-z0-9_.]+", "-", f"{self.prefix} {(*self.connect, *self.endpoints)[0]}")
-        return Path(state or Path(home) / "optipmb") / where
+        return state_home() / where
 
     @classmethod
     def settings_customise_sources(

@@ -4,78 +4,24 @@ from __future__ import annotations
 
 import resource
 import time
-from functools import cache
 from typing import TYPE_CHECKING
 
 import pytest
-from fleet import PROFILE, Fleet, freeze, thaw
+from fleet import Fleet, freeze, thaw
 from optipmb_client import Publisher
-from optipmb_schemas import Keys, ServiceStatus, SessionState, Tracks, decode
-from optipmb_service.session.checkpoint import digest_of
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Tracked
-from router import Node, Sensor, plain, until
+from optipmb_schemas import ServiceStatus
+from router import Node, until
+from takeovers import KEYS, SENSOR, check, outage_s, published_by, send
 
 import optipmb
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-KEYS = Keys()
-SENSOR = Sensor()
-STATE = KEYS.query(SENSOR.stream, "state")
-
 
 @pytest.fixture(scope="module", autouse=True)
 def _compiled() -> None:
     optipmb.warm_up()
-
-
-def expected(frames: int) -> tuple[list[bytes], str]:
-    """Tracks and the digest of the state of a session that nothing happens to."""
-    session = Session(SENSOR.stream, optipmb.load_profile(PROFILE))
-    outputs = [output for seq in range(frames) for output in session.on_detections(SENSOR.detections(seq), 0)]
-    return [plain(one.tracks) for one in outputs if isinstance(one, Tracked)], digest_of(session.snapshot())
-
-
-def distinct(node: Node) -> dict[int, set[bytes]]:
-    """What was published for each frame, repetitions set aside."""
-    found: dict[int, set[bytes]] = {}
-    key = KEYS.tracks(SENSOR.stream)
-    for payload in [payload for at, payload, _ in node.tracks_seen.items if at == key]:
-        seq, content = content_of(payload)
-        found.setdefault(seq, set()).add(content)
-    return found
-
-
-@cache  # asked again and again while more is waited for
-def content_of(payload: bytes) -> tuple[int, bytes]:
-    """The number of a frame and its tracks without how they were delivered."""
-    message = decode(payload, Tracks)
-    return message.seq, plain(message)
-
-
-def send(node: Node, first: int, last: int, pace_s: float = 0.05) -> None:
-    """Publish frames at the rate of a sensor."""
-    for seq in range(first, last):
-        node.send(SENSOR.detections(seq))
-        time.sleep(pace_s)  # the rate of a sensor, not a wait for anything
-
-
-def check(node: Node, frames: int, *, owner: str) -> SessionState:
-    """All frames have been tracked as if nothing had happened, and one instance says that it owns the stream."""
-    tracks, digest = expected(frames)
-    until(lambda: len(distinct(node)) == frames, f"the tracks of {frames} frames", 30.0)
-    assert distinct(node) == {seq: {one} for seq, one in enumerate(tracks)}
-    until(lambda: node.alive(KEYS.owners(SENSOR.stream)) == [KEYS.owner(SENSOR.stream, owner)], f"{owner} owns it")
-    state = node.ask(STATE, SessionState)
-    assert (state.digest, state.frames, state.gaps) == (digest, frames, 0)
-    return state
-
-
-def published_by(node: Node, instance: str) -> list[Tracks]:
-    """What an instance has published."""
-    return [one for one in node.tracks(SENSOR.stream, 1) if one.delivery and one.delivery.instance == instance]
 
 
 @pytest.mark.timeout(300)
@@ -95,14 +41,14 @@ def test_who_stands_by_takes_over(tmp_path: Path, capsys: pytest.CaptureFixture[
         killed_ns = time.monotonic_ns()
         send(node, 20, 40)
         check(node, 40, owner="b")
-        at_once_s = _outage(node, killed_ns)
+        at_once_s = outage_s(node, killed_ns)
         fleet.service("c")
         send(node, 40, 45)
         freeze(frozen)
         frozen_ns = time.monotonic_ns()
         send(node, 45, 100, 0.1)
         check(node, 100, owner="c")
-        lease_s = _outage(node, frozen_ns)
+        lease_s = outage_s(node, frozen_ns)
         before = len(published_by(node, "b"))
         thaw(frozen)
         frozen.wait_log("superseded")
@@ -187,13 +133,3 @@ def test_a_full_disk(tmp_path: Path) -> None:
         fleet.service("a")
         send(node, 20, 30)
         check(node, 30, owner="a")
-
-
-def _outage(node: Node, since_ns: int) -> float:
-    key = KEYS.tracks(SENSOR.stream)
-    later = [
-        at
-        for at, (where, _, _) in zip(node.tracks_seen.times_ns, node.tracks_seen.items, strict=True)
-        if where == key and at > since_ns + 100_000_000
-    ]
-    return (min(later) - since_ns) / 1e9

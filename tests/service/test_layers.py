@@ -66,11 +66,12 @@ def test_arrows_run_one_way(source: Path) -> None:
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_libraries_of_an_edge_stay_there(source: Path) -> None:
-    """Zenoh is imported by its folder alone, the libraries of HTTP and gRPC by theirs; nobody imports the client."""
+    """Zenoh is imported by its folder alone, and so are HTTP, gRPC and NATS by theirs; nobody imports the client."""
     first = {name.partition(".")[0] for name in imported(source.read_text())}
     place = place_of(source)
     assert "optipmb_client" not in first
     assert place == "zenoh" or "zenoh" not in first
+    assert place == "cluster" or "nats" not in first
     assert place == "http" or not first & {"starlette", "uvicorn"}
     assert place == "grpc" or not first & {"grpc", "google", "grpc_health", "grpc_reflection", "grpc_status"}
 

@@ -28,16 +28,21 @@ _ROUTER = """
 import sys, threading
 sys.path.insert(0, sys.argv[1])
 from routers import open_router
-session = open_router(sys.argv[2])
+session = open_router(*sys.argv[2:])
 print("up", flush=True)
 threading.Event().wait()
 """
 
 
 class RouterProcess:
-    """A Zenoh router in a process of its own; it can be killed and started again at the same endpoint."""
+    """A Zenoh router in a process of its own; it can be killed and started again at the same endpoint.
 
-    def __init__(self) -> None:
+    Args:
+        others: endpoints of routers that it is linked to.
+    """
+
+    def __init__(self, *others: str) -> None:
+        self._others = others
         self.endpoint = free_endpoint()
         self._process: subprocess.Popen[str] | None = None
 
@@ -53,7 +58,7 @@ class RouterProcess:
     def start(self) -> None:
         """Start it, and wait until it listens."""
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _ROUTER, os.path.dirname(__file__), self.endpoint],  # noqa: PTH120 - a text is needed
+            [sys.executable, "-c", _ROUTER, os.path.dirname(__file__), self.endpoint, *self._others],  # noqa: PTH120 - a text is needed
             stdout=subprocess.PIPE,
             text=True,
         )
@@ -104,11 +109,11 @@ class Fleet:
         """Where the router listens."""
         return self.router.endpoint
 
-    def service(self, instance: str, *, wait: bool = True, **environment: object) -> ServiceProcess:
-        """Start a service; it is killed at the end, if it still runs."""
+    def service(self, instance: str, *, wait: bool = True, endpoint: str = "", **environment: object) -> ServiceProcess:
+        """Start a service, at another router's endpoint if one is given; it is killed at the end, if it still runs."""
         extra = {f"OPTIPMB_{name.upper()}": str(value) for name, value in environment.items()}
         process = ServiceProcess(
-            *("--connect", self.endpoint, "--instance", instance),
+            *("--connect", endpoint or self.endpoint, "--instance", instance),
             environment=self._environment | extra,
             listen=False,
         )

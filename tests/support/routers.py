@@ -35,9 +35,9 @@ def free_endpoint() -> str:
     raise AssertionError("no port is free")
 
 
-def open_router(endpoint: str) -> zenoh.Session:
-    """A router that listens at `endpoint`; close it (it is a context manager)."""
-    return _open({"mode": "router", "listen/endpoints": [endpoint]})
+def open_router(endpoint: str, *others: str) -> zenoh.Session:
+    """A router that listens at `endpoint`, linked to others; close it (it is a context manager)."""
+    return _open({"mode": "router", "listen/endpoints": [endpoint], "connect/endpoints": list(others)})
 
 
 def open_client(endpoint: str) -> zenoh.Session:

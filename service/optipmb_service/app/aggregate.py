@@ -82,6 +82,7 @@ class AggregateView:
 
     def __init__(self, settings: Settings, workers: Workers, network: Network, loop: asyncio.AbstractEventLoop) -> None:
         self._instance = settings.instance
+        self._clustered = bool(settings.cluster)
         self._keys = schemas.Keys(settings.prefix)
         self._limits = settings.limits.limits()
         self._workers = workers
@@ -206,6 +207,9 @@ class AggregateView:
         asked = schemas.decode(
             request.payload or b"", schemas.MoveRequest, encoding=request.encoding, limits=self._limits
         )
+        if self._clustered:
+            expected = "a service without `cluster`, whose members share the streams evenly"
+            raise schemas.MessageError("invalid_value", "worker", expected, str(asked.worker))
         if asked.worker >= self._workers.count:
             expected = f"a worker from 0 to {self._workers.count - 1}"
             raise schemas.MessageError("invalid_value", "worker", expected, str(asked.worker))

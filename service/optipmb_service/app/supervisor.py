@@ -185,7 +185,9 @@ class Supervisor:
             self._set(index, "starting")
             self._was_ready[index] = False
             began = time.monotonic()
-            status = await child.run(settings, self.count, self._moved, self._lock)
+            # As a member of a cluster a worker is alone: of all streams it tracks those of its partitions.
+            count = 1 if settings.cluster else self.count
+            status = await child.run(settings, count, self._moved, self._lock)
             lived_s = time.monotonic() - began
             never_ready = not self._was_ready[index]
             self._set(index, "down")

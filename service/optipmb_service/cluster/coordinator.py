@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import structlog
 
-from optipmb_service.cluster.ownership import OwnershipTable, Role, RoleChange, WriteLease
+from optipmb_service.cluster.ownership import OwnershipTable
+from optipmb_service.cluster.port import Role, RoleChange, WriteLease
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -52,12 +53,15 @@ class Tokens(Protocol):
     def declare_owner(self, stream: str) -> Token | None:
         """Say that it tracks a stream; None at the end."""
 
+    def watch_owners(self, told: Callable[[str, str, bool], None]) -> None:
+        """Tell which instance claims which stream, or does so no longer (False), from now on."""
+
     def claimants(self, streams: Iterable[str] | None) -> Mapping[str, set[str]] | None:
         """Return who wants or has some streams, or any; None when it cannot be found out."""
 
 
 class Coordinator:
-    """The streams of one instance, for any thread.
+    """The streams of one instance among others on the same router; implements `port.Ownership`.
 
     Args:
         instance: its name.
@@ -84,6 +88,11 @@ class Coordinator:
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="coordinator", daemon=True)
 
+    @property
+    def failure(self) -> str:
+        """Nothing that is shared can fail: a router that is gone is waited for."""
+        return ""
+
     def start(self, changed: Callable[[str, RoleChange], None], resumed: Callable[[], None]) -> None:
         """Begin; before it, streams are only requested.
 
@@ -92,6 +101,9 @@ class Coordinator:
             resumed: called when a lapsed write lease holds again.
         """
         self._changed, self._resumed = changed, resumed
+        self._tokens.watch_owners(
+            lambda stream, instance, present: self.token_changed(stream, instance, present=present)
+        )
         self._turned_ns = time.monotonic_ns()
         self._write_lease.renew(self._turned_ns)
         self._thread.start()

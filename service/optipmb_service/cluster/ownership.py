@@ -19,34 +19,12 @@ the
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import StrEnum, unique
 from typing import TYPE_CHECKING
+
+from optipmb_service.cluster.port import Role, RoleChange
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-
-
-@unique
-class Role(StrEnum):
-    """What an instance is to a stream."""
-
-    NONE = "none"
-    """It has not asked for it."""
-    CLAIMING = "claiming"
-    """It wants it: its token is declared, or will be in a moment, and it looks for others."""
-    OWNER = "owner"
-    """It tracks the stream."""
-    STANDBY = "standby"
-    """Another one tracks it."""
-
-
-@unique
-class RoleChange(StrEnum):
-    """What becomes of a claim or an ownership."""
-
-    GRANTED = "granted"
-    DENIED = "denied"
-    LOST = "lost"
 
 
 @dataclass(slots=True)
@@ -57,30 +35,6 @@ class _Ownership:
     declared: bool = False
     denied: bool = False
     rival_since_ns: int | None = None
-
-
-class WriteLease:
-    """The time during which an owner may write without looking; read by any thread, written by one.
-
-    Args:
-        length_ns: how long a renewal holds, monotonic time.
-    """
-
-    def __init__(self, length_ns: int) -> None:
-        self._length_ns = length_ns
-        self._until_ns = 0
-
-    def valid(self, now_ns: int) -> bool:
-        """Whether the write lease holds."""
-        return now_ns < self._until_ns
-
-    def renew(self, now_ns: int) -> None:
-        """Let it hold from now."""
-        self._until_ns = now_ns + self._length_ns
-
-    def lapse(self) -> None:
-        """End it: writing has to wait until somebody has looked who else holds tokens."""
-        self._until_ns = 0
 
 
 @dataclass

@@ -38,6 +38,10 @@ class StoreError(Exception):
 class Store(Protocol):
     """What a session's state is written to. Any thread may call; every method may raise `StoreError`."""
 
+    @property
+    def max_bytes(self) -> int:
+        """Bytes that a checkpoint may have."""
+
     def claim(self, streams: Collection[str]) -> None:
         """Make streams this process's own, and no longer another's."""
 
@@ -51,17 +55,11 @@ class Store(Protocol):
     def load(self, stream: str) -> bytes | None:
         """Return the newest checkpoint of a stream, None without one."""
 
-    def streams(self) -> tuple[str, ...]:
-        """Return the streams that have a checkpoint, by name."""
-
     def expire(self, age_s: float) -> int:
         """Forget the streams of which nothing was saved for so long; returns how many."""
 
     def set_aside(self, stream: str, reason: str) -> None:
         """Move the newest checkpoint of a stream to those set aside; the one before it is the newest then."""
-
-    def delete(self, stream: str) -> None:
-        """Forget the checkpoints of a stream; those set aside stay."""
 
     def close(self) -> None:
         """Free what the store holds; may be called twice."""
@@ -97,6 +95,8 @@ class SqliteStore:
     Raises:
         StoreError: it cannot be opened, or is no such file.
     """
+
+    max_bytes: Final = 1_000_000_000  # SQLite's own limit
 
     def __init__(self, path: Path, owner: str = "", clock: Callable[[], float] = time.time) -> None:
         self._path = path
@@ -223,6 +223,8 @@ class MemoryStore:
         owner: who claims and saves; stores that share `shared` are those of several processes.
         shared: the contents.
     """
+
+    max_bytes: Final = 1_000_000_000
 
     def __init__(self, owner: str = "", shared: MemoryStore | None = None) -> None:
         self._owner = owner

@@ -1,7 +1,7 @@
 """How the process is, for those who ask from outside: from before the service exists until after its end.
 
 The control loop beats; whoever asks sees for how long it has not. States: `starting`, then what the service says
-(`ready`, or `degraded` when it works with a part missing), then `stopping`.
+(`ready`, `degraded` when it works with a part missing, or `paused` when it may not publish), then `stopping`.
 """
 
 from __future__ import annotations

@@ -50,6 +50,12 @@ EVENTS: Final = {
     "write_lease_lapsed": "This process was frozen, starved or cut off: nothing is published until it has checked"
     " whether another instance took over.",
     "write_lease_renewed": "The check is done; streams that it still owns continue.",
+    "partitions_held": "With `cluster`: how many partitions this member holds, and who the `members` are.",
+    "lease_lost": "With `cluster`: this member was frozen, starved or cut off for `lease_s`, and others continue its"
+    " streams. It joins again at once.",
+    "cluster_failed": "The servers of `cluster` cannot be used, for `error`: after half of `lease_s` nothing is"
+    " published, and the state is `paused`.",
+    "cluster_back": "The servers of `cluster` can be used again.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames arrive again.",
     "problem": "A message was refused or lost; `count` of this kind since the last line. See the table of problems.",

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     import optipmb
-    from optipmb_service.cluster.ownership import Role
+    from optipmb_service.cluster.port import Ownership
     from optipmb_service.observability.metrics import Metrics
     from optipmb_service.observability.problem_reporter import ProblemReporter
     from optipmb_service.runtime.byte_budget import ByteBudget
@@ -32,25 +32,6 @@ class Actor(Protocol):
 
     def work(self) -> bool:
         """Take some of what waits; True: come again."""
-
-
-class Ownership(Protocol):
-    """What an actor needs of the coordinator."""
-
-    def role(self, stream: str) -> Role:
-        """Return what this instance is to a stream."""
-
-    def may_write(self, stream: str) -> bool:
-        """Whether this instance may publish and store for a stream now."""
-
-    def elsewhere(self, stream: str) -> bool:
-        """Whether another instance tracks a stream."""
-
-    def request(self, stream: str) -> None:
-        """Ask for a stream."""
-
-    def release(self, stream: str) -> None:
-        """Give up a stream."""
 
 
 @dataclass(frozen=True)

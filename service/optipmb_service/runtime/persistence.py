@@ -85,6 +85,9 @@ class Persistence(Protocol):
         Both are called on another thread, soon: whoever tracks does not wait for the store.
         """
 
+    def forget(self, stream: str) -> None:
+        """Drop what is still to be written for a stream: another instance goes on from what it has."""
+
     def close(self, timeout: float) -> None:
         """Write what is pending and end."""
 
@@ -116,6 +119,9 @@ class NoPersistence:
         """Remember nothing."""
         del stream, restore
         then(None)
+
+    def forget(self, stream: str) -> None:
+        """Nothing is to be written."""
 
     def close(self, timeout: float) -> None:
         """Nothing is open."""
@@ -206,6 +212,11 @@ class CheckpointWriter:
 
         with contextlib.suppress(RuntimeError):  # at the end: it has closed
             self._reading.submit(read)
+
+    def forget(self, stream: str) -> None:
+        """Drop what is still to be written for a stream."""
+        with self._lock:
+            self._pending.pop(stream, None)
 
     def _recalled(self, stream: str, restore: Callable[[Checkpoint], _T]) -> _T | None:
         """Make a stream this process's own in the store; return what `restore` makes of its newest whole checkpoint.
@@ -309,9 +320,14 @@ class CheckpointWriter:
         encoded = {}
         for stream, one in checkpoints.items():
             try:
-                encoded[stream] = encode_checkpoint(one)
+                data = encode_checkpoint(one)
             except Exception as error:  # noqa: BLE001 - whatever is wrong with one stream, the others are written
                 self._fail(stream, f"{type(error).__name__}: {error}")
+            else:
+                if len(data) > (most := self._store.max_bytes):
+                    self._fail(stream, f"{len(data)} bytes, and the store takes {most} at once")
+                else:
+                    encoded[stream] = data
             if pause_s:
                 self._ended.wait(pause_s)
         return encoded
@@ -336,16 +352,21 @@ def open_persistence(
     may_write: Callable[[str], bool],
     report: Callable[[str, str], None],
     owns: Callable[[str], bool],
+    store: Store | None = None,
 ) -> Persistence:
-    """Return the checkpoint writer; where its store cannot be opened, one that keeps nothing and says why."""
+    """Return the checkpoint writer; where its store cannot be opened, one that keeps nothing and says why.
+
+    Without a store that all members of a cluster share, the store is a file in the folder of the state.
+    """
     folder = settings.folder
-    if folder is None:
-        return NoPersistence()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        store = SqliteStore(folder / STORE_FILE, settings.instance)
-    except (OSError, StoreError) as error:
-        # Tracking without memory is better than none; the status says that it is so.
-        log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
-        return NoPersistence(str(error))
+    if store is None:
+        if folder is None:
+            return NoPersistence()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            store = SqliteStore(folder / STORE_FILE, settings.instance)
+        except (OSError, StoreError) as error:
+            # Tracking without memory is better than none; the status says that it is so.
+            log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
+            return NoPersistence(str(error))
     return CheckpointWriter(store, settings.checkpoint_s, may_write, report, owns, settings.keep_days * DAY_S)

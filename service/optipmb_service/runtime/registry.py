@@ -16,10 +16,10 @@ import structlog
 
 import optipmb
 from optipmb_service.cluster.assignment import Assignment
-from optipmb_service.cluster.ownership import RoleChange
+from optipmb_service.cluster.port import RoleChange
 from optipmb_service.runtime import dumps
 from optipmb_service.runtime.byte_budget import ByteBudget
-from optipmb_service.runtime.context import Actor, ActorContext, Ownership
+from optipmb_service.runtime.context import Actor, ActorContext
 from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
 from optipmb_service.runtime.stream_actor import StreamActor
 from optipmb_service.session.problems import problem_of
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from optipmb_service.cluster.port import Ownership
     from optipmb_service.observability.metrics import Metrics
     from optipmb_service.observability.problem_reporter import ProblemReporter
     from optipmb_service.runtime.persistence import Persistence
@@ -64,6 +65,15 @@ PARTS: Final = 4
 
 MAX_KEYS: Final = 8192
 """Keys whose stream is remembered."""
+
+
+ON_CHANGE: Final = {
+    RoleChange.GRANTED: StreamActor.on_granted,
+    RoleChange.DENIED: StreamActor.on_lost,
+    RoleChange.LOST: StreamActor.on_lost,
+    RoleChange.RECALLED: StreamActor.on_recalled,
+}
+"""What a stream's worker does when its role changes."""
 
 
 class Registry:
@@ -256,9 +266,8 @@ class Registry:
             self.command(actor.stream, lambda one: one.close_session("memory"), urgent=False)
 
     def changed(self, stream: str, change: RoleChange) -> None:
-        """Tell a stream's worker that this instance owns the stream now, or does not."""
-        command = StreamActor.on_granted if change is RoleChange.GRANTED else StreamActor.on_lost
-        self.command(stream, command, urgent=True)
+        """Tell a stream's worker what this instance is to the stream now."""
+        self.command(stream, ON_CHANGE[change], urgent=True)
 
     def resume(self) -> None:
         """Send workers to all streams: they paused, and need not any longer."""

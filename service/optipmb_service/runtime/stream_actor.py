@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import optipmb_schemas as schemas
 import structlog
 
-from optipmb_service.cluster.ownership import Role
+from optipmb_service.cluster.port import Role
 from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.decoding import message_of
 from optipmb_service.runtime.mailbox import Mailbox
@@ -319,8 +319,18 @@ class StreamActor:
 
     def on_lost(self) -> None:
         """Another instance owns the stream: what is here is no longer the newest state."""
+        self._context.persistence.forget(self.stream)
+        if self.session is not None:
+            self._report("superseded", "", "an instance that is neither frozen nor cut off", "another one goes on")
         self._drop_session("superseded")
         self._answer()
+
+    def on_recalled(self) -> None:
+        """Another instance is to have the stream: leave it as soon as its state is kept."""
+        if self.session is None:
+            self.release_ownership()
+        else:
+            self.close_session("moved")
 
     def release_ownership(self) -> None:
         """The session has ended and its state is kept: whoever gets the next message of the stream may go on."""

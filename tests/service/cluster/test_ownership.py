@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.cluster.ownership import OwnershipTable, Role, RoleChange, WriteLease
+from optipmb_service.cluster.ownership import OwnershipTable
+from optipmb_service.cluster.port import Role, RoleChange, WriteLease
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.takeover_buffer import TakeoverBuffer

@@ -1,0 +1,185 @@
+"""Services that share nothing but a NATS server and a network: killed, frozen, ended, cut off from the server."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+from fleet import Fleet, RouterProcess, freeze, thaw
+from nats_process import NatsProcess
+from optipmb_schemas import MoveRequest, ServiceStatus
+from router import Node, Sensor, until
+from takeovers import KEYS, check, outage_s, published_by, send
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from optipmb_schemas import SessionState
+    from service_process import ServiceProcess
+
+SENSORS = [Sensor(stream=f"site/node-{number}/lidar") for number in range(6)]
+FREEZE_S = 8.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled() -> None:
+    optipmb.warm_up()
+
+
+class Cluster:
+    """A NATS server, two linked routers, and members that each have a folder of their own."""
+
+    def __init__(self, folder: Path, nats: NatsProcess, fleet: Fleet, beyond: str, node: Node) -> None:
+        self.nats = nats
+        self.node = node
+        self.beyond = beyond
+        """Where the router is that the node is not connected to."""
+        self._folder = folder
+        self._fleet = fleet
+
+    def member(self, instance: str, endpoint: str = "", **settings: object) -> ServiceProcess:
+        """Start a member, on the router of the node unless another one is named."""
+        own = {"cluster": self.nats.url, "store": self._folder / instance}
+        return self._fleet.service(instance, endpoint=endpoint, **own, **settings)
+
+    def owners(self) -> dict[str, str]:
+        """Which member tracks which stream, by what they announce."""
+        keys = self.node.alive(KEYS.all_owners())
+        return {KEYS.stream_of(key): KEYS.instance_of(key) for key in keys}
+
+    def settled(self, *instances: str) -> dict[str, str]:
+        """Wait until each stream has one owner of these, and return them."""
+
+        def reached() -> bool:
+            tokens = self.node.alive(KEYS.all_owners())
+            return len(tokens) == len(SENSORS) == len(self.owners()) and set(self.owners().values()) <= {*instances}
+
+        until(reached, f"every stream is owned by one of {instances}")
+        return self.owners()
+
+    def check(self, frames: int, *instances: str) -> dict[str, SessionState]:
+        """All frames of all streams have been tracked as if nothing had happened."""
+        owners = self.settled(*instances)
+        return {one.stream: check(self.node, frames, owner=owners[one.stream], sensor=one) for one in SENSORS}
+
+    def outage_s(self, since_ns: int) -> float:
+        """The longest time that a stream was silent for."""
+        return max(outage_s(self.node, since_ns, sensor) for sensor in SENSORS)
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    """A cluster without members."""
+    (tmp_path / "nats").mkdir()
+    with (
+        NatsProcess(tmp_path / "nats") as nats,
+        Fleet(tmp_path) as fleet,
+        RouterProcess(fleet.endpoint) as beyond,
+        Node(fleet.endpoint) as node,
+    ):
+        yield Cluster(tmp_path, nats, fleet, beyond.endpoint, node)
+
+
+def holds(member: ServiceProcess, partitions: int) -> None:
+    """Wait until a member says that it holds so many partitions."""
+    until(lambda: _held(member) == partitions, f"{partitions} partitions are held")
+
+
+def _held(member: ServiceProcess) -> int:
+    lines = [line for line in member.errors.splitlines() if "partitions_held" in line]
+    return int(lines[-1].partition("held=")[2].split()[0]) if lines else 0
+
+
+@pytest.mark.timeout(600)
+def test_members_without_a_common_folder_take_over(cluster: Cluster, capsys: pytest.CaptureFixture[str]) -> None:
+    """Fault 17: a member is killed, one on another router frozen and woken, a third ended: all goes on, to the byte.
+
+    The sessions stay the same ones, so no id is used twice. The frozen one publishes nothing of what it would have
+    tracked, says that it has lost its lease, and gets its share of the partitions again.
+    """
+    node = cluster.node
+    first = cluster.member("a")
+    send(node, 0, 10, sensors=SENSORS)
+    sessions = {stream: state.session for stream, state in cluster.check(10, "a").items()}
+    second = cluster.member("b", cluster.beyond)
+    for member in (first, second):
+        holds(member, 32)
+    send(node, 10, 20, sensors=SENSORS)
+    cluster.check(20, "a", "b")
+
+    first.process.kill()
+    killed_ns = time.monotonic_ns()
+    send(node, 20, 60, 0.1, sensors=SENSORS)
+    states = cluster.check(60, "b")
+    killed_s = cluster.outage_s(killed_ns)
+    assert {stream: state.session for stream, state in states.items()} == sessions
+
+    third = cluster.member("c")
+    for member in (second, third):
+        holds(member, 32)
+    send(node, 60, 70, sensors=SENSORS)
+    cluster.check(70, "b", "c")
+    freeze(second)
+    frozen_ns = time.monotonic_ns()
+    send(node, 70, 70 + round(FREEZE_S / 0.1), 0.1, sensors=SENSORS)
+    frames = 70 + round(FREEZE_S / 0.1)
+    cluster.check(frames, "c")
+    frozen_s = cluster.outage_s(frozen_ns)
+    before = [len(published_by(node, "b", sensor)) for sensor in SENSORS]
+    thaw(second)
+    second.wait_log("lease_lost")
+    for member in (second, third):
+        holds(member, 32)
+    cluster.settled("b", "c")
+    assert [len(published_by(node, "b", sensor)) for sensor in SENSORS] == before
+    send(node, frames, frames + 10, sensors=SENSORS)
+    cluster.check(frames + 10, "b", "c")
+
+    ended_ns = time.monotonic_ns()
+    assert third.end()[0] == 0
+    send(node, frames + 10, frames + 30, sensors=SENSORS)
+    states = cluster.check(frames + 30, "b")
+    ended_s = cluster.outage_s(ended_ns)
+    assert {stream: state.session for stream, state in states.items()} == sessions
+    with capsys.disabled():
+        print(f"\nsilent after a kill {killed_s:.2f} s, a freeze {frozen_s:.2f} s, SIGTERM {ended_s:.2f} s (lease 2 s)")  # noqa: T201 - the figures
+
+
+@pytest.mark.timeout(600)
+def test_the_server_is_gone_for_longer_than_a_lease(cluster: Cluster) -> None:
+    """Nothing is published without the server, and the service says so; when it is back all is tracked, to the byte.
+
+    The workers of a service are members like any other, each with its share; none can be moved to.
+    """
+    node = cluster.node
+    service = cluster.member("pair", workers=2)
+    send(node, 0, 10, sensors=SENSORS)
+    owners = cluster.settled("pair-w0", "pair-w1")
+    cluster.check(10, *owners.values())
+
+    def states() -> set[str]:
+        return {node.ask(KEYS.status(f"pair-w{index}"), ServiceStatus).state for index in range(2)}
+
+    def published() -> list[int]:
+        return [len(node.tracks(sensor.stream, 1)) for sensor in SENSORS]
+
+    until(lambda: states() == {"ready"}, "both are ready")
+    cluster.nats.kill()
+    until(lambda: states() == {"paused"}, "both are paused")
+    assert node.ask(KEYS.status("pair"), ServiceStatus).state == "degraded"
+    before = published()
+    send(node, 10, 20, sensors=SENSORS)
+    assert states() == {"paused"}
+    assert published() == before
+    cluster.nats.start()
+    until(lambda: states() == {"ready"}, "both are ready again")
+    send(node, 20, 30, sensors=SENSORS)
+    cluster.check(30, "pair-w0", "pair-w1")
+    assert "lease_lost" not in service.errors
+    problem = node.refused(KEYS.move("pair"), MoveRequest(stream=SENSORS[0].stream, worker=1))
+    assert (problem.path, problem.received) == ("worker", "1")
+    assert service.end()[0] == 0

@@ -1,0 +1,329 @@
+"""Leases of partitions, over a real NATS server and over the store in memory that the simulation below uses."""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lease_log import LEASE_S, SECOND, HandMember, MemoryLeases, Shared
+from nats_process import NatsProcess
+from optipmb_service.cluster.jetstream import JetStream
+from optipmb_service.cluster.leases import PARTITIONS, Fenced, Record, Write, partition_key, partition_of
+from optipmb_service.cluster.member import FencedStore
+from optipmb_service.cluster.port import Role, RoleChange
+from optipmb_service.cluster.store import StoreError
+from router import until
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from optipmb_service.cluster.leases import LeaseStore
+
+    Make = Callable[[], LeaseStore]
+
+STREAM = "a.b/c_d/e-f"
+TICK_S = LEASE_S / 20
+HOUR_S = 3600.0
+
+
+@pytest.fixture(scope="module")
+def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsProcess]:
+    """A NATS server."""
+    with NatsProcess(tmp_path_factory.mktemp("nats")) as server:
+        yield server
+
+
+@pytest.fixture(params=["memory", "nats"])
+def make(request: pytest.FixtureRequest) -> Iterator[Make]:
+    """Makes ways to one store, each as that of another process; every test has a store of its own."""
+    made: list[LeaseStore] = []
+    if request.param == "memory":
+        shared = Shared()
+        yield lambda: MemoryLeases(shared)
+        return
+    server: NatsProcess = request.getfixturevalue("nats")
+
+    def join() -> LeaseStore:
+        made.append(JetStream([server.url], f"test/{request.node.name}"))
+        connected(made[-1])
+        return made[-1]
+
+    yield join
+    for one in made:
+        one.close(5.0)
+
+
+def connected(store: LeaseStore) -> None:
+    """Wait until a store can be reached."""
+
+    def reached() -> bool:
+        try:
+            store.follow(0)
+        except StoreError:
+            return False
+        return True
+
+    until(reached, "the store is reached")
+
+
+def even(*members: HandMember) -> None:
+    """Let members have turns until each partition is held, by equal shares."""
+    for _ in range(20):
+        for one in members:
+            assert one.turn(TICK_S)
+    assert sum(len(one.held) for one in members) == PARTITIONS
+    assert set().union(*(one.held for one in members)) == set(range(PARTITIONS))
+    assert max(len(one.held) for one in members) - min(len(one.held) for one in members) <= 1
+
+
+def test_of_claims_at_once_one_wins(make: Make) -> None:
+    """Fault 17: thirty times, thirty write over one record at the same time: one is accepted and read."""
+    stores = [make() for _ in range(30)]
+    for number in range(30):
+        write = Write(partition_key(number), "", 0)
+        together = threading.Barrier(len(stores))
+        revisions: dict[int, int | None] = {}
+
+        def claim(index: int, write: Write = write, together: threading.Barrier = together) -> None:
+            together.wait()
+            revisions[index] = stores[index].put(write._replace(value=str(index)))  # noqa: B023 - joined below
+
+        threads = [threading.Thread(target=claim, args=(index,)) for index in range(len(stores))]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        ((winner, revision),) = [one for one in revisions.items() if one[1] is not None]
+        assert len(revisions) == len(stores)
+        assert stores[0].get(write.key) == (write.key, str(winner), revision)
+
+
+def test_what_changed_is_followed(make: Make) -> None:
+    """Whoever follows gets the newest record of each key that changed since, in the order of the revisions."""
+    one, other = make(), make()
+    first = one.put(Write("partition/1", "a/1", 0))
+    second = other.put(Write("member/a.b_c/1", "alive", 0))
+    assert first is not None
+    assert second is not None
+    third = one.put(Write("partition/1", "", first))
+    assert third is not None
+    assert first < second < third
+    records = [Record("member/a.b_c/1", "alive", second), Record("partition/1", "", third)]
+    assert other.follow(0) == records
+    assert other.follow(second) == records[1:]
+    assert other.follow(third) == []
+    assert other.get("partition/2") is None
+
+
+def test_a_checkpoint_is_refused_for_its_fence(make: Make) -> None:
+    """Who held a partition before saves nothing more; what is kept comes back to the byte, also the one before it."""
+    one, other = make(), make()
+    data = [random.Random(number).randbytes(200_000) for number in range(3)]
+    partition = partition_of(STREAM)
+    stale = one.put(Write(partition_key(partition), "a", 0))
+    assert stale is not None
+    assert one.load(STREAM) is None
+    assert one.save({STREAM: Fenced(partition, stale, data[0])}) == frozenset()
+    fence = other.put(Write(partition_key(partition), "b", stale))
+    assert fence is not None
+    assert one.save({STREAM: Fenced(partition, stale, b"stale")}) == {STREAM}
+    assert other.load(STREAM) == data[0]
+    for number in (1, 2):
+        assert other.save({STREAM: Fenced(partition, fence, data[number])}) == frozenset()
+    assert one.load(STREAM) == data[2]
+    other.set_aside(STREAM, "torn\nin the middle")
+    assert one.load(STREAM) == data[1]
+
+
+def test_a_store_saves_under_the_fences_that_are_held(make: Make) -> None:
+    """Checkpoints of partitions that a member does not hold are not written, and it says of which."""
+    one, other = HandMember("one", make()), HandMember("other", make())
+    even(one, other)
+    stores = [FencedStore(member.store, member.member.fence) for member in (one, other)]
+    streams = [f"site/node-{number}/lidar" for number in range(20)]
+    mine = {stream for stream in streams if partition_of(stream) in one.held}
+    assert 0 < len(mine) < len(streams)
+    assert stores[0].save(dict.fromkeys(streams, b"one")) == set(streams) - mine
+    assert stores[1].save(dict.fromkeys(streams, b"other")) == mine
+    loaded = {stream: stores[0].load(stream) for stream in streams}
+    assert loaded == {stream: b"one" if stream in mine else b"other" for stream in streams}
+
+
+def test_a_store_that_is_closed_or_cannot_be_reached_says_so(nats: NatsProcess) -> None:
+    """Every call ends in time with the one error, which names the server and no password."""
+    nowhere = JetStream(["nats://user:secret@127.0.0.1:9"], "test")
+    with pytest.raises(StoreError, match=r"^nats://127\.0\.0\.1:9: "):
+        nowhere.load(STREAM)
+    closed = JetStream([nats.url], "test")
+    connected(closed)
+    for store in (nowhere, closed):
+        store.close(5.0)
+        with pytest.raises(StoreError, match="closed"):
+            store.follow(0)
+
+
+def test_a_checkpoint_is_waited_for() -> None:
+    """While a stream is this member's, a store that is cut off is asked again; at the end it is not."""
+    store = MemoryLeases(Shared())
+    one = HandMember("one", store)
+    even(one)
+    fenced = FencedStore(store, one.member.fence)
+    fenced.save({STREAM: b"kept"})
+    store.reachable = False
+    with ThreadPoolExecutor(1) as thread:
+        loading = thread.submit(fenced.load, STREAM)
+        store.reachable = True
+        assert loading.result(60.0) == b"kept"
+        store.reachable = False
+        loading = thread.submit(fenced.load, STREAM)
+        fenced.close()
+        with pytest.raises(StoreError):
+            loading.result(60.0)
+
+
+def test_members_share_evenly_as_they_come_and_go(make: Make) -> None:
+    """With each member that joins, or ends in order, every one holds its share within one, and all are held."""
+    members: list[HandMember] = []
+    for name in "abc":
+        members.append(HandMember(name, make()))
+        even(*members)
+    while len(members) > 1:
+        members.pop(0).end()
+        even(*members)
+
+
+def test_who_is_silent_for_a_lease_loses_all(make: Make) -> None:
+    """Fault 17: with clocks an hour apart a silent member's partitions are taken after its lease, and not before.
+
+    It stops by itself before that, and when it wakes up it holds nothing, says so, and gets a share again.
+    """
+    sleeper, other = HandMember("z", make()), HandMember("a", make(), HOUR_S)
+    even(sleeper, other)
+    partitions = sleeper.held
+    stream = next(name for name in map(str, range(1000)) if partition_of(name) in partitions)
+    sleeper.member.request(stream)
+    assert sleeper.turn()
+    assert sleeper.member.role(stream) is Role.OWNER
+    passed_s = 0.0
+    while other.held.isdisjoint(partitions):
+        assert other.turn(TICK_S)
+        sleeper.clock.ns += round(TICK_S * SECOND)
+        passed_s += TICK_S
+        assert not sleeper.held & other.held
+        assert passed_s < 3 * LEASE_S
+    assert passed_s > LEASE_S * 0.9
+    assert other.held == set(range(PARTITIONS))
+    assert not sleeper.member.may_write(stream)
+    assert sleeper.turn()
+    assert sleeper.changes[-1] == (stream, RoleChange.LOST)
+    even(sleeper, other)
+
+
+def test_a_partition_is_left_when_the_state_of_its_streams_is_kept(make: Make) -> None:
+    """A stream that another member is to have is recalled; it may still be saved, and only then the other begins."""
+    one, other = HandMember("one", make()), HandMember("other", make())
+    even(one)
+    streams = [f"site/node-{number}/lidar" for number in range(12)]
+    for member in (one, other):
+        for stream in streams:
+            member.member.request(stream)
+    for _ in range(10):
+        assert one.turn(TICK_S)
+        assert other.turn(TICK_S)
+    recalled = {stream for stream, change in one.changes if change is RoleChange.RECALLED}
+    assert recalled
+    assert all(one.member.may_write(stream) and one.member.role(stream) is Role.STANDBY for stream in recalled)
+    assert not any(change is RoleChange.GRANTED for _, change in other.changes)
+    for stream in recalled:
+        one.member.release(stream)
+    even(one, other)
+    assert {stream for stream, change in other.changes if change is RoleChange.GRANTED} == recalled
+    assert all(other.member.role(stream) is Role.OWNER for stream in recalled)
+
+
+def test_a_server_that_is_killed(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The store is gone for an hour: leases lapse in time; when it is back all goes on with the same owners."""
+    with NatsProcess(tmp_path_factory.mktemp("nats")) as server:
+        stores = [JetStream([server.url], "test") for _ in range(2)]
+        for store in stores:
+            connected(store)
+        members = [HandMember(name, store) for name, store in zip("ab", stores, strict=True)]
+        even(*members)
+        held = [one.held for one in members]
+        fences = [dict(one.member._table.held) for one in members]
+        server.kill()
+        for one in members:
+            assert not one.turn(LEASE_S / 4)
+            assert one.held
+            assert not one.turn(LEASE_S / 4)
+            assert not one.held
+            assert one.member.failure
+            one.clock.ns += round(HOUR_S * SECOND)
+        server.start()
+        for store in stores:
+            connected(store)
+        for one in members:
+            resumed = one.resumed
+            assert one.turn()
+            assert one.resumed == resumed + 1
+            assert not one.member.failure
+        even(*members)
+        assert [one.held for one in members] == held
+        assert [one.member._table.held for one in members] == fences
+        for store in stores:
+            store.close(5.0)
+
+
+def disturbed(one: HandMember, chance: random.Random) -> HandMember:
+    """Let a member have a turn in which something may befall it; returns it, or its next run."""
+    store = one.store
+    assert isinstance(store, MemoryLeases)
+    fault = chance.randrange(60)
+    one.frozen = chance.randrange(60) if fault == 0 else max(0, one.frozen - 1)
+    store.reachable ^= fault == 1
+    store.answers ^= fault == 2
+    if one.frozen:
+        one.clock.ns += round(TICK_S * SECOND)
+    elif fault == 3 and store.reachable and store.answers:
+        one.end()
+        return HandMember(one.name, MemoryLeases(store.shared), chance.uniform(-HOUR_S, HOUR_S))
+    else:
+        one.turn(TICK_S)
+    return one
+
+
+@settings(max_examples=100, deadline=None)
+@given(count=st.integers(1, 5), seed=st.integers(0, 10**6))
+def test_no_partition_ever_has_two_owners(count: int, seed: int) -> None:
+    """Fault 17: members are frozen, cut off, left without answers and ended, in any order, their clocks apart.
+
+    At no time do two of them publish for one partition, and no fence is ever used by two; when all is well again every
+    partition has one owner, by equal shares.
+    """
+    chance = random.Random(seed)
+    shared = Shared()
+    members = [
+        HandMember(f"m{number}", MemoryLeases(shared), chance.uniform(-HOUR_S, HOUR_S)) for number in range(count)
+    ]
+    fences: dict[tuple[int, int], str] = {}
+    for _ in range(150):
+        for index in chance.sample(range(count), count):
+            members[index] = disturbed(members[index], chance)
+            owners = Counter(partition for one in members for partition in one.held)
+            assert not owners or max(owners.values()) == 1
+            for one in members:
+                for lease in one.member._table.held.items():
+                    assert fences.setdefault(lease, one.member._table.member) == one.member._table.member
+    for one in members:
+        assert isinstance(one.store, MemoryLeases)
+        one.store.reachable = one.store.answers = True
+    for _ in range(80):
+        for one in members:
+            one.turn(TICK_S)
+    even(*members)

@@ -1,0 +1,167 @@
+"""What all members share, in memory, and members that are moved by hand: no thread, and a clock that tests set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from optipmb_service.cluster.leases import Record, partition_key
+from optipmb_service.cluster.member import Member
+from optipmb_service.cluster.store import KEPT, StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from optipmb_service.cluster.leases import Fenced, LeaseStore, Write
+    from optipmb_service.cluster.port import RoleChange
+
+SECOND = 1_000_000_000
+LEASE_S = 2.0
+
+
+@dataclass
+class Shared:
+    """Records and checkpoints in one order of events."""
+
+    records: dict[str, Record] = field(default_factory=dict)
+    checkpoints: dict[str, list[bytes]] = field(default_factory=dict)
+    revision: int = 0
+
+
+class MemoryLeases:
+    """A member's way to what all share; implements `LeaseStore`.
+
+    Args:
+        shared: what all members share.
+    """
+
+    max_bytes = 2**20
+
+    def __init__(self, shared: Shared) -> None:
+        self.shared = shared
+        self.reachable = True
+        self.answers = True
+        """Whether answers arrive; without them what was asked is done nevertheless."""
+
+    def follow(self, after: int) -> list[Record]:
+        """Return what has changed."""
+        self._reach()
+        changed = [record for record in self.shared.records.values() if record.revision > after]
+        return sorted(changed, key=lambda record: record.revision)
+
+    def get(self, key: str) -> Record | None:
+        """Return a record."""
+        self._reach()
+        return self.shared.records.get(key)
+
+    def put(self, write: Write) -> int | None:
+        """Write over a revision."""
+        self._reach(after=False)
+        now = self.shared.records.get(write.key)
+        revision = None
+        if (now.revision if now else 0) == write.over:
+            revision = self.shared.revision = self.shared.revision + 1
+            self.shared.records[write.key] = Record(write.key, write.value, revision)
+        self._reach()
+        return revision
+
+    def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
+        """Keep what has the newest fence."""
+        self._reach()
+        refused = set()
+        for stream, one in checkpoints.items():
+            now = self.shared.records.get(partition_key(one.partition))
+            if now is None or now.revision != one.fence:
+                refused.add(stream)
+            else:
+                self.shared.checkpoints[stream] = [*self.shared.checkpoints.get(stream, []), one.data][-KEPT:]
+                self.shared.revision += 1
+        return frozenset(refused)
+
+    def load(self, stream: str) -> bytes | None:
+        """Return the newest."""
+        self._reach()
+        kept = self.shared.checkpoints.get(stream)
+        return kept[-1] if kept else None
+
+    def set_aside(self, stream: str, reason: str) -> None:
+        """Forget the newest."""
+        del reason
+        self._reach()
+        if kept := self.shared.checkpoints.get(stream):
+            kept.pop()
+
+    def close(self, timeout: float) -> None:
+        """Nothing is open."""
+
+    def _reach(self, *, after: bool = True) -> None:
+        if not self.reachable or (after and not self.answers):
+            raise StoreError("cut off")
+
+
+class NoNetwork:
+    """Where nobody listens."""
+
+    def declare_owner(self, stream: str) -> None:
+        """Say nothing."""
+
+
+class Clock:
+    """The clock of one member.
+
+    Args:
+        ahead_s: how far it is from the others' clocks.
+    """
+
+    def __init__(self, ahead_s: float = 0.0) -> None:
+        self.ns = round(ahead_s * SECOND)
+
+    def __call__(self) -> int:
+        """Return the time, ns."""
+        return self.ns
+
+
+class HandMember:
+    """A member that does one turn when it is asked to.
+
+    Args:
+        name: of the instance.
+        store: its way to what all share.
+        ahead_s: how far its clock is from the others'.
+    """
+
+    def __init__(self, name: str, store: LeaseStore, ahead_s: float = 0.0) -> None:
+        self.name = name
+        self.frozen = 0
+        """Turns that it is still to miss."""
+        self.clock = Clock(ahead_s)
+        self.store = store
+        self.member = Member(name, store, NoNetwork(), LEASE_S, self.clock)
+        self.changes: list[tuple[str, RoleChange]] = []
+        self.resumed = 0
+        self.member._changed = lambda stream, change: self.changes.append((stream, change))
+        self.member._resumed = self._resume
+
+    def turn(self, passed_s: float = 0.0) -> bool:
+        """Let time pass and do one turn; False when the store could not be reached."""
+        self.clock.ns += round(passed_s * SECOND)
+        try:
+            self.member._turn()
+            self.member._settle()
+        except StoreError as error:
+            self.member._failed(str(error))
+            return False
+        return True
+
+    @property
+    def held(self) -> set[int]:
+        """The partitions whose streams it would publish now."""
+        valid = self.member._write_lease.valid(self.clock.ns)
+        return set(self.member._table.held) if valid else set()
+
+    def end(self) -> None:
+        """End in order."""
+        self.member._end()
+
+    def _resume(self) -> None:
+        self.resumed += 1

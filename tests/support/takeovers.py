@@ -1,0 +1,83 @@
+"""A stream that several services take over from each other: what comes of it is that of a session left alone."""
+
+from __future__ import annotations
+
+import time
+from functools import cache
+from typing import TYPE_CHECKING
+
+from fleet import PROFILE
+from optipmb_schemas import Keys, SessionState, Tracks, decode
+from optipmb_service.session.checkpoint import digest_of
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Tracked
+from router import Sensor, plain, until
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from router import Node
+
+KEYS = Keys()
+SENSOR = Sensor()
+
+
+def expected(frames: int, sensor: Sensor = SENSOR) -> tuple[list[bytes], str]:
+    """Tracks and the digest of the state of a session that nothing happens to."""
+    session = Session(sensor.stream, optipmb.load_profile(PROFILE))
+    outputs = [output for seq in range(frames) for output in session.on_detections(sensor.detections(seq), 0)]
+    return [plain(one.tracks) for one in outputs if isinstance(one, Tracked)], digest_of(session.snapshot())
+
+
+def distinct(node: Node, sensor: Sensor = SENSOR) -> dict[int, set[bytes]]:
+    """What was published for each frame, repetitions set aside."""
+    found: dict[int, set[bytes]] = {}
+    key = KEYS.tracks(sensor.stream)
+    for payload in [payload for at, payload, _ in node.tracks_seen.items if at == key]:
+        seq, content = content_of(payload)
+        found.setdefault(seq, set()).add(content)
+    return found
+
+
+@cache  # asked again and again while more is waited for
+def content_of(payload: bytes) -> tuple[int, bytes]:
+    """The number of a frame and its tracks without how they were delivered."""
+    message = decode(payload, Tracks)
+    return message.seq, plain(message)
+
+
+def send(node: Node, first: int, last: int, pace_s: float = 0.05, sensors: Sequence[Sensor] = (SENSOR,)) -> None:
+    """Publish frames at the rate of a sensor."""
+    for seq in range(first, last):
+        node.send(*(sensor.detections(seq) for sensor in sensors))
+        time.sleep(pace_s)  # the rate of a sensor, not a wait for anything
+
+
+def check(node: Node, frames: int, *, owner: str, sensor: Sensor = SENSOR) -> SessionState:
+    """All frames have been tracked as if nothing had happened, and one instance says that it owns the stream."""
+    tracks, digest = expected(frames, sensor)
+    until(lambda: len(distinct(node, sensor)) == frames, f"the tracks of {frames} frames", 30.0)
+    assert distinct(node, sensor) == {seq: {one} for seq, one in enumerate(tracks)}
+    owned = [KEYS.owner(sensor.stream, owner)]
+    until(lambda: node.alive(KEYS.owners(sensor.stream)) == owned, f"{owner} owns it")
+    state = node.ask(KEYS.query(sensor.stream, "state"), SessionState)
+    assert (state.digest, state.frames, state.gaps) == (digest, frames, 0)
+    return state
+
+
+def published_by(node: Node, instance: str, sensor: Sensor = SENSOR) -> list[Tracks]:
+    """What an instance has published."""
+    return [one for one in node.tracks(sensor.stream, 1) if one.delivery and one.delivery.instance == instance]
+
+
+def outage_s(node: Node, since_ns: int, sensor: Sensor = SENSOR) -> float:
+    """Seconds from a fault until the next tracks."""
+    key = KEYS.tracks(sensor.stream)
+    later = [
+        at
+        for at, (where, _, _) in zip(node.tracks_seen.times_ns, node.tracks_seen.items, strict=True)
+        if where == key and at > since_ns + 100_000_000
+    ]
+    return (min(later) - since_ns) / 1e9
