@@ -12,7 +12,7 @@ KITTI = --dataset kitti --root $(DATA)/kitti --detections pointrcnn
 NUSCENES = --dataset nuscenes --root $(DATA)/nuscenes --detections centerpoint
 
 FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
-.PHONY: help kernels docs release demo test accuracy alone bounds bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check lowest paths pythons repeat schemas wheel clean tune ablate
+.PHONY: help kernels docs release demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
 	@echo "make test    lint, types, schemas, tests, wheel"
@@ -20,6 +20,7 @@ help:
 	@echo "make accuracy  hold the figures of accuracy on KITTI and nuScenes, where their data are"
 	@echo "make alone   run the tests that measure memory and latency, one after the other"
 	@echo "make bounds  call the tracker with every kernel compiled with bounds checks, which takes a minute"
+	@echo "make ray     track on Ray clusters, with workers and a node killed, which takes a minute"
 	@echo "make lowest  test the wheel with the oldest packages that it may be installed with"
 	@echo "make pythons test the wheel with every Python newer than 3.11 that this machine has"
 	@echo "make paths   go the first ten minutes of four users, from empty environments with the wheel, and print what they take"
@@ -81,7 +82,7 @@ kernels: install
 # With more JOBS than processors it takes about as long, and answers come late.
 JOBS ?= 2
 tests: kernels
-	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not accuracy and not alone and not bounds"
+	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not accuracy and not alone and not bounds and not ray"
 
 # The figures of accuracy that docs/tuning.md and docs/ablation.md give, on the KITTI and nuScenes data.
 accuracy: kernels
@@ -94,6 +95,10 @@ alone: kernels
 # Compiling all kernels a second time takes a minute; what is compiled is kept in .pytest_cache.
 bounds: install
 	$(BIN)/pytest tests/tracker -m bounds
+
+# Clusters on this machine, with the machine for themselves.
+ray: kernels
+	$(BIN)/pytest tests/clients -m ray
 
 # For a developer: style, types, and the tests nearest to what changed since SINCE (a commit; files not committed count).
 SINCE ?= main

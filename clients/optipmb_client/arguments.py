@@ -1,8 +1,23 @@
-"""Options that take several values after one flag, which the option parser does not know: `--sequences 0000 0002`."""
+"""What the option parser does not know: several values after one flag, and a value that may be left out.
 
+`--sequences 0000 0002` is the first, `--ray` the second.
+"""
+
+import re
 from collections.abc import Iterable, Sequence
 
-__all__ = ["spread"]
+__all__ = ["filled", "spread"]
+
+
+def filled(arguments: Sequence[str], option: str, values: re.Pattern[str], default: str) -> list[str]:
+    """Rewrite `--x` as `--x=DEFAULT` where none of the values that the option takes follows, and leave all else."""
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    return [
+        f"{one}={default}"
+        if one == option and place < end and not values.fullmatch("".join(arguments[place + 1 : place + 2]))
+        else one
+        for place, one in enumerate(arguments)
+    ]
 
 
 def spread(arguments: Sequence[str], options: Iterable[str]) -> list[str]:

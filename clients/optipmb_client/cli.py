@@ -12,13 +12,13 @@ import typer
 from optipmb_schemas import MessageError
 from typer.core import TyperCommand, TyperGroup
 
-from optipmb_client.arguments import spread
+from optipmb_client.arguments import filled, spread
 from optipmb_client.commands.ablate import ablate
 from optipmb_client.commands.demo import demo
 from optipmb_client.commands.evaluate import evaluate
 from optipmb_client.commands.load import load
 from optipmb_client.commands.move import move
-from optipmb_client.commands.options import MANY
+from optipmb_client.commands.options import MANY, RAY_ADDRESS
 from optipmb_client.commands.play import play
 from optipmb_client.commands.plot import plot
 from optipmb_client.commands.profiles import profiles
@@ -108,7 +108,8 @@ def _options(
 def run(arguments: Sequence[str]) -> int:
     """Run one command line, without the program's name; return the exit status."""
     try:
-        result = app(spread(arguments, MANY) or ["--help"], prog_name="optipmb", standalone_mode=False)
+        words = filled(spread(arguments, MANY), "--ray", RAY_ADDRESS, "local")
+        result = app(words or ["--help"], prog_name="optipmb", standalone_mode=False)
         return int(result or 0)
     except _OptionError as error:
         return _fail(WRONG, error.format_message())

@@ -15,6 +15,7 @@ _EXTRAS: Final[Mapping[str, str]] = {
     "tune": "optuna",
     "plot": "matplotlib",
     "table": "pyarrow",
+    "ray": "ray",
     "record": "mcap foxglove",
     "ros2": "rosbags",
     "watch": "rerun",

@@ -135,3 +135,14 @@ class AtomicText:
         if not self._file.closed:
             self._file.close()
             self._temporary.unlink(missing_ok=True)
+
+
+def remove_unfinished(paths: Iterable[Path]) -> None:
+    """Remove what writers of these files left in their folders when they were killed; nobody writes them any more."""
+    names: dict[Path, set[str]] = {}
+    for path in paths:
+        names.setdefault(path.parent, set()).add(path.name)
+    for folder, finished in names.items():
+        for entry in folder.glob(".*"):
+            if entry.name[1:].rpartition(".")[0] in finished:
+                entry.unlink(missing_ok=True)

@@ -1,16 +1,13 @@
-"""Tracking a dataset in this process, without a network: the one module of the client that imports the tracker.
+"""Tracking one sequence in this process, without a network, and the profiles for it.
 
 It gives the same bytes as replaying the dataset through the service (`optipmb_client.replay`).
 """
 
-import concurrent.futures.process
+import functools
 import itertools
-import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
@@ -38,22 +35,22 @@ from optipmb import (
     profiles,
     warm_up,
 )
-from optipmb_client.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame
-from optipmb_client.errors import ClientError, UsageError
+from optipmb_client.datasets import DataSequence, DetectionFrame
+from optipmb_client.errors import UsageError
 from optipmb_client.geometry import Floats, Ints
-from optipmb_client.recording import Latency, Results, horizons_for, latency, selected_frames
+from optipmb_client.recording import selected_frames
 from optipmb_client.smoothing import Smoother
 
 __all__ = [
     "AUTO",
     "NamedTracks",
-    "TrackedSequence",
+    "Tracked",
     "doubts",
     "profile_compared",
     "profile_for",
     "read_profile",
-    "track",
     "track_sequence",
+    "track_whole",
     "warm_up",
 ]
 
@@ -68,7 +65,6 @@ LOOKED_INTO: Final = 300
 """frames of each that tell rate and scores."""
 GLANCE: Final = 20
 """Frames of each that tell whether the rate is about that of a profile: clouds, if there are any, take long to read."""
-ATTEMPTS: Final = 3
 
 
 @dataclass(frozen=True)
@@ -79,7 +75,7 @@ class NamedTracks:
     labels: tuple[str, ...]
     paths: PredictedPaths | None = None
 
-    @cached_property
+    @functools.cached_property
     def _path_fields(self) -> dict[str, NDArray[Any]]:
         """The predicted paths as messages have them."""
         return {} if self.paths is None else path_fields(self.paths.horizons, self.paths.mean, self.paths.covariance)
@@ -176,36 +172,6 @@ class NamedTracks:
 
 
 @dataclass(frozen=True)
-class TrackedSequence:
-    """What tracking one sequence took and gave. `step` are the durations of the tracker's steps."""
-
-    name: str
-    file: Path
-    frames: int
-    clouds: int
-    detections: int
-    left_out: int
-    """Detections of classes that the profile lacks."""
-    tracks: int
-    confirmed: int
-    """Tracks that were confirmed in some frame."""
-    seconds: float
-    step: Latency | None
-
-
-@dataclass(frozen=True)
-class Job:
-    """One sequence and how it is tracked; can be sent to another process."""
-
-    data: DatasetArguments | None
-    sequence: str
-    parameters: Parameters
-    classes: tuple[str, ...] = ()
-    modules: Modules | None = None
-    smooth: bool = False
-
-
-@dataclass(frozen=True)
 class Tracked:
     """The tracks of one sequence by frame index, and what they took."""
 
@@ -213,6 +179,7 @@ class Tracked:
     clouds: int
     detections: int
     left_out: int
+    """Detections of classes that the profile lacks."""
     steps_ns: tuple[int, ...]
     seconds: float
 
@@ -389,26 +356,34 @@ def _steps(
         yield given, result, left_out, took
 
 
-def run(job: Job, sequence: DataSequence | None = None, on_frame: Callable[[], None] = lambda: None) -> Tracked:
-    """Track one sequence; it is opened where it is not given.
+_warm = functools.cache(warm_up)
+"""Once in each process."""
+
+
+def track_whole(
+    parameters: Parameters,
+    sequence: DataSequence,
+    classes: Sequence[str] = (),
+    modules: Modules | None = None,
+    *,
+    smooth: bool = False,
+    on_frame: Callable[[], None] = lambda: None,
+) -> Tracked:
+    """Track one sequence, with `smooth` so that states are given all frames of their track.
 
     Raises:
         UsageError: A frame holds values that the tracker refuses.
         DatasetError: The sequence cannot be read.
     """
-    warm_up()
-    if sequence is None:
-        if job.data is None:
-            raise UsageError("several processes need to know which data to open")
-        (sequence,) = job.data.open().sequences([job.sequence])
+    _warm()
     begun = time.monotonic()
-    results: dict[int, NamedTracks] = {}
+    found: dict[int, NamedTracks] = {}
     steps: list[int] = []
     clouds = detections = left_out = 0
-    names = tuple(job.parameters.classes)
-    smoother = Smoother(job.parameters) if job.smooth else None
-    for frame, result, missed, took in _steps(job.parameters, sequence, job.classes, job.modules):
-        results[frame.index] = NamedTracks(result.tracks, names, result.paths)
+    names = tuple(parameters.classes)
+    smoother = Smoother(parameters) if smooth else None
+    for frame, result, missed, took in _steps(parameters, sequence, classes, modules):
+        found[frame.index] = NamedTracks(result.tracks, names, result.paths)
         if smoother is not None:
             smoother.add(frame.index, result.density, result.tracks)
         steps.append(took)
@@ -417,101 +392,11 @@ def run(job: Job, sequence: DataSequence | None = None, on_frame: Callable[[], N
         left_out += missed
         on_frame()
     if smoother is not None:
-        results = {index: _with_paths(job.parameters, NamedTracks(one, names)) for index, one in smoother.tracks()}
-    return Tracked(results, clouds, detections, left_out, tuple(steps), time.monotonic() - begun)
+        found = {index: _with_paths(parameters, NamedTracks(one, names)) for index, one in smoother.tracks()}
+    return Tracked(found, clouds, detections, left_out, tuple(steps), time.monotonic() - begun)
 
 
 def _with_paths(parameters: Parameters, named: NamedTracks) -> NamedTracks:
     """Return tracks with the paths that the profile asks for."""
     horizons = parameters.horizons
     return replace(named, paths=predict_tracks(named.tracks, horizons, parameters)) if horizons else named
-
-
-def track(  # noqa: PLR0913  one argument per decision of the caller
-    dataset: Dataset,
-    sequences: Sequence[DataSequence],
-    out: Path,
-    *,
-    parameters: Parameters,
-    data: DatasetArguments | None = None,
-    classes: Sequence[str] = (),
-    modules: Modules | None = None,
-    full: bool = False,
-    smooth: bool = False,
-    jobs: int = 1,
-    on_frame: Callable[[], None] = lambda: None,
-) -> Iterator[TrackedSequence]:
-    """Track sequences in `jobs` processes and write their results into `out`, a folder or a table.
-
-    Yields each sequence when it is done and written, in their order. With `full`, all that is known of the tracks is
-    written too. With `smooth`, states are given all frames of their track (`optipmb_client.smoothing`). The results are
-    the same bytes with any number of processes.
-
-    Raises:
-        UsageError: No such class, or values that the tracker refuses.
-    """
-    results = Results(dataset, out, full=full)
-    if (horizons := horizons_for(out)) is not None:
-        parameters = parameters.model_copy(update={"horizons": horizons})
-    work = [Job(data, sequence.name, parameters, tuple(classes), modules, smooth) for sequence in sequences]
-    done = (
-        run_jobs(work, jobs)
-        if jobs > 1
-        else (run(job, one, on_frame) for job, one in zip(work, sequences, strict=True))
-    )
-    for sequence, tracked in zip(sequences, done, strict=True):
-        file = results.write(sequence, tracked.tracks)
-        identities = {int(number) for tracks in tracked.tracks.values() for number in tracks.id}
-        confirmed = {int(n) for one in tracked.tracks.values() for n in one.id[one.tracks.confirmed]}
-        if jobs > 1:
-            for _ in tracked.tracks:
-                on_frame()
-        yield TrackedSequence(
-            sequence.name,
-            file,
-            len(tracked.tracks),
-            tracked.clouds,
-            tracked.detections,
-            tracked.left_out,
-            len(identities),
-            len(confirmed),
-            tracked.seconds,
-            latency(tracked.steps_ns),
-        )
-    results.close()
-
-
-def run_jobs(work: Sequence[Job], jobs: int) -> Iterator[Tracked]:
-    """Run jobs in so many processes; yield what they gave, in their order.
-
-    A process that dies takes no result with it: what was not done is done again by new processes, three times at most.
-
-    Raises:
-        UsageError, DatasetError: as `run`.
-        ClientError: the processes died again and again.
-    """
-    done: dict[int, Tracked] = {}
-    following = 0
-    for _ in range(ATTEMPTS):
-        left = [place for place in range(following, len(work)) if place not in done]
-        context = multiprocessing.get_context("spawn")  # a fork would copy the threads' locks of the libraries here
-        with concurrent.futures.ProcessPoolExecutor(min(jobs, len(left)), context) as pool:
-            futures = {place: pool.submit(run, work[place]) for place in left}
-            try:
-                while following < len(work):
-                    if following not in done:
-                        done[following] = futures[following].result()
-                    yield done.pop(following)
-                    following += 1
-            except concurrent.futures.process.BrokenProcessPool:
-                for place, future in futures.items():
-                    if place >= following and future.done() and future.exception() is None:
-                        done[place] = future.result()
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-            else:
-                return
-    raise ClientError(
-        f"sequence {work[following].sequence}: its process died {ATTEMPTS} times; it may need more memory"
-    )

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame, Truth
+from optipmb_client.datasets.nuscenes import NuScenesDataset
 from optipmb_client.errors import UsageError
 from optipmb_client.results.full import FullRows, full_path, write_full
 from optipmb_client.results.table import TrackColumns, join
@@ -97,6 +98,8 @@ def horizons_for(out: Path) -> tuple[float, ...] | None:
 class Results:
     """Where the tracks of a run go: a result file for each sequence in a folder, or one table of all of them.
 
+    `write` may be called in another process than `take` and `close`, on an object made of the same arguments.
+
     Args:
         dataset: What was tracked; it knows the format of its result files.
         out: The folder, or a file with the suffix of a table.
@@ -108,16 +111,16 @@ class Results:
         self._dataset = dataset
         self._out = out
         self._full = full
-        self._parts: dict[str, Columns] | None = {} if is_table(out) and not out.is_dir() else None
+        self._table = is_table(out) and not out.is_dir()
+        self._taken: dict[str, Path | Columns] = {}
 
-    def write(self, sequence: DataSequence, tracks: Mapping[int, FullRows]) -> Path:
-        """Take the tracks of a sequence by frame index; return the file that they are written into."""
-        if self._parts is not None:
+    def write(self, sequence: DataSequence, tracks: Mapping[int, FullRows]) -> Path | Columns:
+        """Write the tracks of a sequence by frame index; return the file, or its rows of the table of all."""
+        if self._table:
             columns = TrackColumns(sequence, full=self._full)
             for index, one in tracks.items():
                 columns.add(index, one)
-            self._parts[sequence.name] = columns.columns()
-            return self._out
+            return columns.columns()
         with self._dataset.writer(self._out, sequence) as writer:
             for index in sorted(tracks):
                 writer.add(index, sequence.poses[index], tracks[index])
@@ -127,7 +130,25 @@ class Results:
             full_path(writer.path).unlink(missing_ok=True)
         return writer.path
 
-    def close(self) -> None:
-        """Write the table, in the order of the names of the sequences."""
-        if self._parts:
-            write_table(self._out, join([self._parts[name] for name in sorted(self._parts)]))
+    def take(self, sequence: DataSequence, written: Path | Columns) -> bool:
+        """Keep what `write` returned; return whether it is here: another machine may have written it elsewhere."""
+        here = not isinstance(written, Path) or written.is_file()
+        if here:
+            self._taken[sequence.name] = written
+        return here
+
+    @property
+    def files(self) -> list[Path]:
+        """The result files so far."""
+        return [written for written in self._taken.values() if isinstance(written, Path)]
+
+    def close(self, sequences: Sequence[DataSequence]) -> None:
+        """Write what holds all sequences: the table in the order of their names, or the file of the benchmark.
+
+        Sequences that were not taken are missing in the table; a file of the benchmark is written of all or not at all.
+        """
+        parts = {name: written for name, written in self._taken.items() if not isinstance(written, Path)}
+        if parts:
+            write_table(self._out, join([parts[name] for name in sorted(parts)]))
+        elif isinstance(self._dataset, NuScenesDataset) and all(one.name in self._taken for one in sequences):
+            self._dataset.join(self._out, sequences)

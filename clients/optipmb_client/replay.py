@@ -104,7 +104,7 @@ def replay(  # noqa: PLR0913  one argument per decision of the caller
     """
     run = f"{dataset.name}-{secrets.token_hex(3)}"
     results = Results(dataset, out, full=full)
-    task = _Task(connection, results, profile, horizons_for(out), pace, classes, prefix, on_frame)
+    task = _Task(connection, out, results, profile, horizons_for(out), pace, classes, prefix, on_frame)
     work = [_Replay(task, sequence, f"replay/{run}/{sequence.name}") for sequence in sequences]
     with concurrent.futures.ThreadPoolExecutor(max_workers=streams, thread_name_prefix="replay") as pool:
         try:
@@ -118,7 +118,7 @@ def replay(  # noqa: PLR0913  one argument per decision of the caller
             task.stop.set()
             pool.shutdown(cancel_futures=True)
             raise
-    results.close()
+    results.close(sequences)
     return [future.result() for future in futures]
 
 
@@ -128,11 +128,12 @@ def _replay_and_write(one: "_Replay") -> ReplayedSequence:
     if one.task.stop.is_set():
         raise concurrent.futures.CancelledError
     seconds = time.monotonic() - begun
-    file = one.task.results.write(one.sequence, one.results)
+    written = one.task.results.write(one.sequence, one.results)
+    one.task.results.take(one.sequence, written)
     return ReplayedSequence(
         name=one.sequence.name,
         stream=one.stream,
-        file=file,
+        file=written if isinstance(written, Path) else one.task.out,
         frames=len(one.sequence),
         sent=one.sent,
         returned=len(one.results),
@@ -152,6 +153,7 @@ class _Task:
     """What the sequences of one replay share."""
 
     connection: Link
+    out: Path
     results: Results
     profile: str
     horizons: Sequence[float] | None

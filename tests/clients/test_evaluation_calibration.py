@@ -10,8 +10,8 @@ from optipmb_client.evaluation.calibration import CalibrationResult, calibration
 from optipmb_client.evaluation.cases import Rules
 from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
 from optipmb_client.geometry import Floats
-from optipmb_client.offline import track
 from optipmb_client.results.full import FullTable, full_path, read_full, write_full
+from optipmb_client.tracking import track
 
 import optipmb
 

@@ -13,10 +13,12 @@ from nuscenes_cases import Rows, disturbed_tracks, truth_tracks, write
 from nuscenes_tables import box, crowd, write_detections, write_root
 from optipmb_client import Connection
 from optipmb_client.datasets import DatasetError
-from optipmb_client.datasets.nuscenes import NuScenesDataset
-from optipmb_client.offline import read_profile, track
+from optipmb_client.datasets.nuscenes import NuScenesDataset, NuScenesSequence
+from optipmb_client.offline import read_profile
+from optipmb_client.recording import Results
 from optipmb_client.replay import Pace, replay
 from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES, read_nuscenes_results, result_table
+from optipmb_client.tracking import track
 
 SCENES = [crowd("scene-0103", 1, 6), crowd("scene-0916", 2, 5, 1_538_984_233_000_000)]
 FILE = "tracking_results.json"
@@ -73,6 +75,7 @@ def test_every_sample_is_there(root: Path, tmp_path: Path) -> None:
     with dataset.writer(tmp_path, sequence) as writer:
         writer.add(2, sequence.poses[2], rows(3))
         writer.add(3, sequence.poses[3], rows(0))
+    dataset.join(tmp_path, [sequence])
     content = json.loads((tmp_path / FILE).read_text())
     assert {token: len(boxes) for token, boxes in content["results"].items()} == {
         token: 3 if i == 2 else 0 for i, token in enumerate(sequence.samples)
@@ -121,18 +124,21 @@ def test_bytes_do_not_depend_on_the_order_of_closing(root: Path, tmp_path: Path)
     for number in range(3):
         dataset = NuScenesDataset(root)
         sequences = dataset.sequences(["all"])
-        tracks = [truth_tracks(sequence) for sequence in sequences]
-        out = tmp_path / str(number)
-        work = [
-            threading.Thread(target=write, args=(dataset, *one, out)) for one in zip(sequences, tracks, strict=True)
-        ]
+        tracks = [dict(enumerate(truth_tracks(sequence))) for sequence in sequences]
+        results = Results(dataset, tmp_path / str(number))
+
+        def end(sequence: NuScenesSequence, found: dict[int, Any], results: Results = results) -> None:
+            results.take(sequence, results.write(sequence, found))
+
+        work = [threading.Thread(target=end, args=one) for one in zip(sequences, tracks, strict=True)]
         for thread in work[:: -1 if number == 1 else 1]:
             thread.start()
             if number != 2:
                 thread.join()
         for thread in work:
             thread.join()
-        written.append((out / FILE).read_bytes())
+        results.close(sequences)
+        written.append((tmp_path / str(number) / FILE).read_bytes())
     assert written[0] == written[1] == written[2]
     tokens = list(json.loads(written[0])["results"])
     assert tokens == [scene.token(frame) for scene in SCENES for frame in range(len(scene.ego))]
@@ -142,12 +148,14 @@ def test_the_file_of_all_scenes_comes_with_the_last(root: Path, tmp_path: Path) 
     """Before all scenes are done there are only their own files; a scene that fails leaves neither."""
     dataset = NuScenesDataset(root)
     first, second = dataset.sequences(["all"])
-    write(dataset, first, [rows(2)], tmp_path)
-    assert [path.name for path in tmp_path.rglob("*.json")] == ["scene-0103.json"]
+    results = Results(dataset, tmp_path)
+    results.take(first, results.write(first, {0: rows(2)}))
     with pytest.raises(IndexError):  # there is no such frame
-        write(dataset, second, [rows(1)] * (len(second) + 1), tmp_path)
+        results.write(second, dict.fromkeys(range(len(second) + 1), rows(1)))
+    results.close([first, second])
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["scene-0103.json"]
-    write(dataset, second, [rows(1)], tmp_path)
+    results.take(second, results.write(second, {0: rows(1)}))
+    results.close([first, second])
     assert sorted(path.name for path in tmp_path.rglob("*.json")) == ["scene-0103.json", "scene-0916.json", FILE]
     part = read_nuscenes_results(tmp_path / "scenes" / "scene-0103.json")
     assert list(part.rows) == list(first.samples)

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from optipmb_client.datasets import Dataset, open_dataset
 from optipmb_client.errors import UsageError
-from optipmb_client.offline import read_profile, track, track_sequence
+from optipmb_client.offline import read_profile, track_sequence
 from optipmb_client.recording import Preloaded, latency, selected_frames
+from optipmb_client.tracking import track
 from optipmb_schemas import PATHS
 
 

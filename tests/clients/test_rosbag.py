@@ -15,8 +15,9 @@ from mcap_ros2.decoder import DecoderFactory
 from optipmb_client.cli import run
 from optipmb_client.datasets import DataSequence, dataset_at, open_dataset
 from optipmb_client.files import DatasetError
-from optipmb_client.offline import read_profile, track
+from optipmb_client.offline import read_profile
 from optipmb_client.results.full import FullTable, full_path, read_full
+from optipmb_client.tracking import track
 from real_data import kitti_root
 
 DETECTIONS = "/detector/boxes/tracks/detections"

@@ -12,7 +12,7 @@ from commands import run_here
 from numpy.typing import NDArray
 from optipmb_client.datasets import DataSequence, open_dataset
 from optipmb_client.geometry import wrap_angle
-from optipmb_client.offline import Job, NamedTracks, read_profile, run
+from optipmb_client.offline import NamedTracks, read_profile, track_whole
 from optipmb_client.recording import Preloaded
 from optipmb_client.smoothing import smooth
 
@@ -61,7 +61,7 @@ def test_states_are_smoothed_as_the_article_has_it(*, turned: bool) -> None:
 
 def tracked(sequence: DataSequence, *, smooth: bool) -> dict[int, NamedTracks]:
     """Track the sequence."""
-    return run(Job(None, sequence.name, read_profile("kitti"), smooth=smooth), sequence).tracks
+    return track_whole(read_profile("kitti"), sequence, smooth=smooth).tracks
 
 
 def errors(sequence: DataSequence, tracks: dict[int, NamedTracks]) -> Iterator[tuple[float, float]]:

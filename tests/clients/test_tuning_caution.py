@@ -1,6 +1,5 @@
 """What tuning keeps and takes back: changes weighed over recordings."""
 
-from collections.abc import Iterator
 from functools import partial
 
 import pytest
@@ -17,13 +16,12 @@ import optipmb
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
+def bench() -> Bench:
     """Three recordings of cars."""
     whole, rules = optipmb.load_profile("kitti-paper"), rules_of("scene")
     sequences = [recorded(Habits(), seed, frames=25, objects=10, name=f"{seed:04d}") for seed in range(3)]
     clips = [of_class(load(one, whole, rules), "Car", rules) for one in sequences]
-    with Bench([clips], scorer_of("scene", "Car", sequences), "mota") as made:
-        yield made
+    return Bench([clips], scorer_of("scene", "Car", sequences), "mota")
 
 
 def test_a_change_that_does_not_pay_is_taken_back(bench: Bench) -> None:

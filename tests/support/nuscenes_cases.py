@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from optipmb_client.datasets import DetectionFrame
 from optipmb_client.datasets.nuscenes import NuScenesDataset, NuScenesSequence
+from optipmb_client.results.nuscenes import scene_file
 from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
 
 Floats = NDArray[np.float64]
@@ -43,10 +44,11 @@ class Rows:
 
 
 def write(dataset: NuScenesDataset, sequence: NuScenesSequence, frames: Sequence[Rows], out: Path) -> Path:
-    """Write the tracks of one scene; give the path of the file that holds all scenes once the last is written."""
+    """Write the tracks of one scene; give the path of the file that holds all scenes written so far."""
     with dataset.writer(out, sequence) as writer:
         for index, rows in enumerate(frames):
             writer.add(index, sequence.poses[index], rows)
+    dataset.join(out, [one for one in dataset.sequences(["all"]) if scene_file(out, one.name).is_file()])
     return out / "tracking_results.json"
 
 

@@ -7,20 +7,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from optipmb_client.bulk import Executor, values
 from optipmb_client.commands.options import (
     AsJson,
     DatasetName,
     Detections,
     Options,
+    Ray,
     Root,
     Sequences,
     Source,
     Truth,
     asked_for,
-    jobs_for,
+    executor_of,
     open_sequences,
     print_json,
     print_table,
+    warn,
 )
 from optipmb_client.datasets import DataSequence, DatasetArguments
 from optipmb_client.errors import UsageError
@@ -63,8 +66,9 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     order: Annotated[float, typer.Option(min=1.0, help="Order of GOSPA and OSPA.")] = 2.0,
     jobs: Annotated[
         int | None,
-        typer.Option(min=1, help="Processes that evaluate; default: one for each processor.", show_default=False),
+        typer.Option(min=1, help="Classes at once; default: one for each processor.", show_default=False),
     ] = None,
+    ray: Ray = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare result files with the truth, per class.
@@ -82,8 +86,9 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     asked = asked_for(data, dataset, root, detections, option, truth)
     _, chosen = open_sequences(asked, sequences)
     names = tuple(classes or labels_of(chosen))
-    how = _How(iou, distance, cutoff, order, jobs_for(jobs, chosen))
-    reports = {str(one): _judge(asked, chosen, one, names, how) for one in tracks}
+    how = _How(iou, distance, cutoff, order)
+    with executor_of(jobs, ray, chosen, max(1, len(names))) as executor:
+        reports = {str(one): _judge(asked, chosen, one, names, how, executor) for one in tracks}
     report = {"command": "evaluate", "dataset": asked.name, "sequences": [sequence.name for sequence in chosen]}
     (first, *others) = reports.values()
     if as_json and others:
@@ -104,7 +109,6 @@ class _How:
     distance: float | None
     cutoff: float
     order: float
-    jobs: int
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,12 @@ class _Judgement:
 
 
 def _judge(
-    asked: DatasetArguments, chosen: "Many[DataSequence]", tracks: Path, names: tuple[str, ...], how: _How
+    asked: DatasetArguments,
+    chosen: "Many[DataSequence]",
+    tracks: Path,
+    names: tuple[str, ...],
+    how: _How,
+    executor: Executor,
 ) -> _Judgement:
     from optipmb_client.commands.tables import (  # noqa: PLC0415  loads the solvers of scipy
         clear_table,
@@ -125,12 +134,8 @@ def _judge(
         nuscenes_table,
     )
     from optipmb_client.evaluation import evaluate_files  # noqa: PLC0415  as above
-    from optipmb_client.evaluation.figures import (  # noqa: PLC0415  as above
-        Settings,
-        evaluate_figures,
-        load_recordings,
-    )
-    from optipmb_client.evaluation.jobs import FiguresJob, run_jobs  # noqa: PLC0415  as above
+    from optipmb_client.evaluation.figures import Settings  # noqa: PLC0415  as above
+    from optipmb_client.evaluation.jobs import Evaluation, FiguresTask, figures_of  # noqa: PLC0415  as above
     from optipmb_client.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
 
     head: list[RenderableType] = []
@@ -150,12 +155,10 @@ def _judge(
         best = {} if asked.name == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
         if asked.name != "kitti" or how.distance is not None:  # AB3DMOT's protocol gives them at its own threshold
             head = [clear_table(results, metres=how.iou is None)]
-    if how.jobs > 1 and len(names) > 1:
-        recordings = tuple(sequence.name for sequence in chosen)
-        work = [FiguresJob(asked, recordings, tracks, name, settings, best.get(name)) for name in names]
-        figures = [one for found in run_jobs(work, how.jobs) for one in found]
-    else:
-        figures = evaluate_figures(asked.name, load_recordings(asked.name, chosen, tracks), names, settings, best)
+    recordings = tuple(sequence.name for sequence in chosen)
+    executor.start(figures_of, Evaluation(asked, recordings, settings, chosen if executor.here else None))
+    tasks = [FiguresTask(tracks, name, best.get(name)) for name in names]
+    figures = [one for found in values(executor, tasks, str, warn) for one in found]
     if not figures:
         raise UsageError(f"{tracks}: neither the truth nor the tracks have objects of these classes")
     by_class = {one.name: {**parts.get(one.name, {}), **one.summary()} for one in figures}

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ import typer
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
 
+from optipmb_client.bulk import Executor, executor_for
 from optipmb_client.columns import parts
 from optipmb_client.datasets import DATASETS, DataSequence, Dataset, DatasetArguments, dataset_at
 from optipmb_client.errors import ClientError, UsageError
@@ -20,6 +22,7 @@ from optipmb_client.transport import DEFAULT_ENDPOINT
 
 __all__ = [
     "MANY",
+    "RAY_ADDRESS",
     "AsJson",
     "Classes",
     "Config",
@@ -32,6 +35,7 @@ __all__ = [
     "Patience",
     "Prefix",
     "Profile",
+    "Ray",
     "Root",
     "Sequences",
     "Source",
@@ -41,7 +45,7 @@ __all__ = [
     "Wait",
     "Window",
     "asked_for",
-    "jobs_for",
+    "executor_of",
     "mcap_needed",
     "open_sequences",
     "print_json",
@@ -124,6 +128,18 @@ Window = Annotated[int, typer.Option("--window", min=1, help="Frames under way a
 Wait = Annotated[float, typer.Option("--wait", min=0.0, help="Seconds to wait for a service at the start.")]
 Patience = Annotated[float, typer.Option("--patience", min=1.0, help="End when no tracks come for so many seconds.")]
 Prefix = Annotated[str, typer.Option("--prefix", help="First part of all keys, as the service has it.")]
+RAY_ADDRESS: Final = re.compile(r"auto|local|(ray://)?[^\s/]+:\d+")
+"""What may follow --ray."""
+Ray = Annotated[
+    str | None,
+    typer.Option(
+        "--ray",
+        metavar="[ADDRESS]",
+        help="Work on a Ray cluster: HOST:PORT of its head, auto for the one of this machine; default: one that is "
+        "started here and ends with the command.",
+        show_default=False,
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
@@ -168,11 +184,17 @@ def open_sequences(asked: DatasetArguments, sequences: list[str] | None) -> tupl
     return opened, chosen
 
 
-def jobs_for(asked: int | None, sequences: Sequence[DataSequence]) -> int:
-    """Return how many processes share the work: by default one for each processor, and for little data just one."""
-    if asked is not None:
-        return asked
-    return len(os.sched_getaffinity(0)) if sum(map(len, sequences)) > WORTH_PROCESSES else 1
+def executor_of(jobs: int | None, ray: str | None, sequences: Sequence[DataSequence], tasks: int) -> Executor:
+    """Return what runs so many tasks, or more: by default a process for each processor, for little data this one.
+
+    Raises:
+        ClientError: Ray is not installed, or no cluster answers.
+    """
+    if ray is not None:
+        return executor_for(jobs or 0, ray)
+    if jobs is None:
+        jobs = len(os.sched_getaffinity(0)) if sum(map(len, sequences)) > WORTH_PROCESSES else 1
+    return executor_for(min(jobs, tasks))
 
 
 def warn(text: str) -> None:

@@ -90,15 +90,15 @@ def play(  # noqa: PLR0913  these are the command's options
     if out is not None:
         dataset = open_dataset("mcap", file)
         files = Results(dataset, out, full=full)
-        for result in results:
-            (sequence,) = dataset.sequences([result.name])
+        sequences = dataset.sequences([result.name for result in results])
+        for result, sequence in zip(results, sequences, strict=True):
             indexed = {
                 index: result.tracks[frame]
                 for index, frame in enumerate(plans[result.name].frames)
                 if frame in result.tracks
             }
-            files.write(sequence, indexed)
-        files.close()
+            files.take(sequence, files.write(sequence, indexed))
+        files.close(sequences)
     if as_json:
         print_json({"command": "play", "cut": recording.cut, "out": out, "streams": [_summary(one) for one in results]})
     else:

@@ -15,11 +15,12 @@ from optipmb_client.commands.options import (
     Options,
     Out,
     Profile,
+    Ray,
     Root,
     Sequences,
     Source,
     asked_for,
-    jobs_for,
+    executor_of,
     open_sequences,
     print_json,
     say,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence as Many
 
     from optipmb_client.datasets import DataSequence
-    from optipmb_client.offline import TrackedSequence
+    from optipmb_client.tracking import TrackedSequence
 
 
 def track(  # noqa: PLR0913  these are the command's options
@@ -56,8 +57,9 @@ def track(  # noqa: PLR0913  these are the command's options
     ] = False,
     jobs: Annotated[
         int | None,
-        typer.Option(min=1, help="Processes that track; default: one for each processor.", show_default=False),
+        typer.Option(min=1, help="Recordings at once; default: one for each processor.", show_default=False),
     ] = None,
+    ray: Ray = None,
     dump: Annotated[
         Path | None, typer.Option("--dump", help="What a service saved of a stream when tracking it failed.")
     ] = None,
@@ -77,7 +79,7 @@ def track(  # noqa: PLR0913  these are the command's options
     if dump is not None:
         _replay_dump(dump, trace=trace, as_json=as_json)
         return
-    from optipmb_client import offline  # noqa: PLC0415  loads the tracker and its compiler
+    from optipmb_client import offline, tracking  # noqa: PLC0415  loads the tracker and its compiler
 
     if keep_input:
         option = [*(option or ()), "keep_input=1"]
@@ -91,31 +93,47 @@ def track(  # noqa: PLR0913  these are the command's options
     if name == offline.AUTO:
         warn(f"profile auto: {parameters.provenance}")
     results = []
-    with FrameProgress("tracking", sum(map(len, chosen))) as progress:
-        for result in offline.track(
-            opened,
-            chosen,
-            out,
-            data=asked,
-            parameters=parameters,
-            classes=classes or (),
-            full=full,
-            smooth=smooth,
-            jobs=min(jobs_for(jobs, chosen), len(chosen)),
-            on_frame=progress.advance,
+    failed = None
+    try:
+        with (
+            FrameProgress("tracking", sum(map(len, chosen))) as progress,
+            executor_of(jobs, ray, chosen, len(chosen)) as executor,
         ):
-            results.append(result)
-            if not as_json:
-                rate = result.frames / max(result.seconds, 1e-9)
-                step = f", step p50 {result.step.p50_ms:.2f} ms p99 {result.step.p99_ms:.2f} ms" if result.step else ""
-                others = result.tracks - result.confirmed
-                told = f"{result.confirmed} tracks" + (f" and {others} never confirmed" if others else "")
-                say(f"{result.name}: {result.frames} frames, {told}, {rate:.0f} frames/s{step}")
+            for result in tracking.track(
+                opened,
+                chosen,
+                out,
+                data=asked,
+                parameters=parameters,
+                classes=classes or (),
+                full=full,
+                smooth=smooth,
+                executor=executor,
+                on_frame=progress.advance,
+                note=lambda text: progress.note(f"optipmb: {text}"),
+            ):
+                results.append(result)
+                if not as_json:
+                    _say_result(result)
+    except tracking.RecordingsFailed as error:
+        failed = error
     if as_json:
-        print_json({"command": "track", "dataset": asked.name, "profile": name, "out": out, "sequences": results})
+        report = {"command": "track", "dataset": asked.name, "profile": name, "out": out, "sequences": results}
+        reasons = {} if failed is None else {name: one.reason for name, one in failed.failures.items()}
+        print_json({**report, "failed": reasons})
     else:
         say(f"results in {out}")
+    if failed is not None:
+        raise failed
     _complain(results, parameters.name)
+
+
+def _say_result(result: "TrackedSequence") -> None:
+    rate = result.frames / max(result.seconds, 1e-9)
+    step = f", step p50 {result.step.p50_ms:.2f} ms p99 {result.step.p99_ms:.2f} ms" if result.step else ""
+    others = result.tracks - result.confirmed
+    told = f"{result.confirmed} tracks" + (f" and {others} never confirmed" if others else "")
+    say(f"{result.name}: {result.frames} frames, {told}, {rate:.0f} frames/s{step}")
 
 
 def _complain(results: "list[TrackedSequence]", profile: str) -> None:

@@ -16,11 +16,13 @@ from optipmb_client.commands.options import (
     Options,
     Out,
     Profile,
+    Ray,
     Root,
     Sequences,
     Source,
     Truth,
     asked_for,
+    executor_of,
     open_sequences,
     print_json,
     print_table,
@@ -71,7 +73,8 @@ def tune(  # noqa: PLR0913  these are the command's options
     degrade: Annotated[int, typer.Option(min=0, help="Degraded copies of the detections beside the plain ones.")] = 1,
     everything: Annotated[bool, typer.Option("--all", help="Search the parameters of the paper's table too.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of every random choice.")] = 0,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that track.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Sequences tracked at once.")] = 1,
+    ray: Ray = None,
     as_json: AsJson = False,
 ) -> None:
     """Estimate the parameters of each class from labelled data, then refine them by tracking.
@@ -109,10 +112,9 @@ def tune(  # noqa: PLR0913  these are the command's options
         copies=degrade,
         seed=seed,
         everything=everything,
-        jobs=jobs,
     )
-    with tuning.TrialDisplay() as display:
-        tuned = tuning.tune_all(source, parameters, plan, out, display, name)
+    with executor_of(jobs, ray, chosen, jobs) as executor, tuning.TrialDisplay() as display:
+        tuned = tuning.tune_all(source, parameters, plan, out, display, name, executor)
     if as_json:
         results: Mapping[str, Any] = {name: one.to_json() for name, one in tuned.classes.items()}
         print_json({"command": "tune", "profile": tuned.profile, "classes": results})

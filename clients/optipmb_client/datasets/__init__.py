@@ -134,20 +134,25 @@ def dataset_at(path: Path) -> str:
     if (path / "metadata.yaml").is_file() or path.suffix == ".db3":
         return "rosbag"
     if path.suffix == ".mcap" and path.is_file():
-        with path.open("rb") as file:
-            return "rosbag" if _ROS2_MCAP in file.read(_HEAD) else "mcap"
+        return "rosbag" if _is_ros2(path) else "mcap"
     if path.is_dir():
         if any(path.glob("v1.0-*")):
             return "nuscenes"
         if (path / "training").is_dir() or (path / "testing").is_dir():
             return "kitti"
-        if any(is_table(file) for file in path.iterdir()):
-            return "table"
+        tables, recordings = any(is_table(file) for file in path.iterdir()), list(path.glob("*.mcap"))
+        if tables or (recordings and not any(map(_is_ros2, recordings))):
+            return "table" if tables else "mcap"
     expected = (
         "a table (.csv, .parquet, .jsonl, .feather), a bag of ROS 2 (with metadata.yaml, or .mcap or .db3), a "
-        "recording (.mcap), or a folder of KITTI or nuScenes"
+        "recording (.mcap) or a folder of them, or a folder of KITTI or nuScenes"
     )
     raise DatasetError(path, expected, "another file or folder" if path.exists() else "nothing")
+
+
+def _is_ros2(path: Path) -> bool:
+    with path.open("rb") as file:
+        return _ROS2_MCAP in file.read(_HEAD)
 
 
 def _known(options: Mapping[str, object], known: set[str]) -> None:

@@ -1,5 +1,7 @@
 """Recordings as a dataset: each stream is a sequence, named by its stream with dots, `garage.robot-1.lidar`.
 
+Of a folder of recordings the name of the file comes first: `monday.garage.robot-1.lidar` is in `monday.mcap`.
+
 What is tracked are the frames that the service would track from the recording: each once, with the clouds that took
 part. Frames must be in the order of their stamps here; a recording in which they are not needs a service that is there
 when they come late (`optipmb play`). There is no truth.
@@ -7,6 +9,7 @@ when they come late (`optipmb play`). There is no truth.
 
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -34,11 +37,11 @@ class RecordedSequence:
 
     has_clouds: bool
 
-    def __init__(self, recording: RecordingFile, plan_: StreamPlan) -> None:
-        self.name = plan_.stream.replace("/", ".")
+    def __init__(self, name: str, recording: RecordingFile, plan_: StreamPlan) -> None:
+        self.name = name
         self.has_clouds = bool(plan_.with_cloud)
         self._recording = recording
-        self._plan = plan_
+        self._plan = replace(plan_, tracks={})  # they are large, and not needed for tracking
         stamps = list(plan_.frames.values())
         for number, (before, after) in enumerate(itertools.pairwise(stamps), start=1):
             if after < before:
@@ -94,27 +97,28 @@ class RecordedSequence:
 
 
 class RecordedDataset:
-    """The streams of one recording.
+    """The streams of one recording, or of all recordings of a folder.
 
     Args:
-        path: The MCAP file.
+        path: The MCAP file, or the folder: then the name of a stream follows that of its file, with a dot.
 
     Raises:
-        DatasetError: It cannot be read.
+        DatasetError: There is none, or it cannot be read.
     """
 
     name = "mcap"
 
     def __init__(self, path: Path) -> None:
-        self._recording = RecordingFile(path)
-        self._plans = {stream.replace("/", "."): one for stream, one in plan(self._recording).items()}
-        if not self._plans:
-            raise DatasetError(path, "a recording with detections", "one without")
+        files = sorted(file for file in path.iterdir() if _is_recording(file)) if path.is_dir() else [path]
+        if not files:
+            raise DatasetError(path, "a folder with recordings (.mcap)", "none in it")
+        self._files = {f"{file.stem}." if path.is_dir() else "": RecordingFile(file) for file in files}
+        self._planned: tuple[str, dict[str, StreamPlan]] | None = None
 
     @property
     def profile(self) -> str:
         """The profile that was in force when it was recorded, of the first stream that tells."""
-        for one in self._plans.values():
+        for one in (one for prefix in self._files for one in self._plans(prefix).values()):
             names = [one.parameters.profile] if one.parameters else []
             names += [tracks.profile for tracks in one.tracks.values()]
             if names and names[0] is not None:
@@ -125,15 +129,38 @@ class RecordedDataset:
         """Return the streams of these names, with dots or slashes, or `all`."""
         chosen: dict[str, DataSequence] = {}
         for name in names:
-            for dotted in self._plans if name == "all" else (name.replace("/", "."),):
-                if dotted not in self._plans:
-                    raise DatasetError("--sequences", f"streams of the recording: {', '.join(self._plans)}", name)
-                chosen[dotted] = RecordedSequence(self._recording, self._plans[dotted])
+            wanted = name.replace("/", ".")
+            found = {
+                full: (recording, one)
+                for prefix, recording in self._files.items()
+                if name == "all" or wanted.startswith(prefix)
+                for full, one in self._plans(prefix).items()
+                if name == "all" or full == wanted
+            }
+            if not found:
+                known = ", ".join(full for prefix in self._files for full in self._plans(prefix))
+                raise DatasetError("--sequences", f"streams of the recording: {known}", name)
+            for full, (recording, one) in found.items():
+                chosen[full] = RecordedSequence(full, recording, one)
         return list(chosen.values())
+
+    def _plans(self, prefix: str) -> dict[str, StreamPlan]:
+        """Return what one file holds, by the full names of its streams; that of the last one is kept."""
+        if self._planned is None or self._planned[0] != prefix:
+            recording = self._files[prefix]
+            plans = {prefix + stream.replace("/", "."): one for stream, one in plan(recording).items()}
+            if not plans:
+                raise DatasetError(recording.path, "a recording with detections", "one without")
+            self._planned = prefix, plans
+        return self._planned[1]
 
     def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
         """Return a writer of `out/NAME.txt` in the format of KITTI, for a camera in the sensor's place."""
         return KittiResultWriter(out / f"{sequence.name}.txt", synthetic_camera())
+
+
+def _is_recording(file: Path) -> bool:
+    return file.suffix == ".mcap" and not file.name.startswith(".")
 
 
 def _pose(message: Detections | Points) -> Pose:

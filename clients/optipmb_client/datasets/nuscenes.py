@@ -12,11 +12,11 @@ The height of a detection is that of the box's centre, as the layout says. Some 
 bottom instead: they say so by `"z_origin": "bottom"` in their `meta`, or the caller does by the option `z_bottom`.
 """
 
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from optipmb_client.datasets.nuscenes_tables import Annotations, Keyframe, NuSce
 from optipmb_client.files import DatasetError, read_points
 from optipmb_client.geometry import Bools, Floats, Ints, Pose
 from optipmb_client.results import ResultWriter
-from optipmb_client.results.nuscenes import NuScenesRun
+from optipmb_client.results.nuscenes import NuScenesResultWriter, join_scenes
 from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES, Submission, quaternion_yaw, read_submission
 
 VERSIONS = ("v1.0-trainval", "v1.0-mini", "v1.0-test")
@@ -267,9 +267,6 @@ class NuScenesDataset:
         detector = _find_detector(base, detections)
         found = None if detector is None else NuScenesDetections(detector, z_bottom=z_bottom)
         self._source = _Source(base, NuScenesTables(folder), found, clouds)
-        self._chosen: tuple[str, ...] = ()
-        self._runs: dict[Path, NuScenesRun] = {}
-        self._lock = threading.Lock()
 
     @property
     def tables(self) -> NuScenesTables:
@@ -303,21 +300,20 @@ class NuScenesDataset:
                 raise DatasetError(self.tables.folder, f"a scene or a split ({known}{more})", repr(name))
         if not wanted:
             raise DatasetError(self.tables.folder, f"scenes of {' '.join(names) or 'some name'}", "none")
-        self._chosen = tuple(dict.fromkeys(wanted))
-        return [NuScenesSequence(scenes[name], self._source) for name in self._chosen]
+        return [NuScenesSequence(scenes[name], self._source) for name in dict.fromkeys(wanted)]
 
     def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
-        """Return a writer of `out/scenes/NAME.json`.
+        """Return a writer of `out/scenes/NAME.json`."""
+        return NuScenesResultWriter(out, sequence.name, self.tables.scenes[sequence.name].tokens, self._meta)
 
-        When the writers of all scenes that were last asked for are closed, `out/tracking_results.json` holds them all.
-        """
-        with self._lock:  # several scenes may end at the same time
-            run = self._runs.get(out)
-            if run is None or run.complete:
-                detections = self._source.detections
-                meta = {} if detections is None else detections.submission.meta
-                run = self._runs[out] = NuScenesRun(out, self._chosen, meta)
-        return run.writer(sequence.name, self.tables.scenes[sequence.name].tokens)
+    def join(self, out: Path, sequences: Sequence[DataSequence]) -> None:
+        """Write `out/tracking_results.json` from the files of these scenes."""
+        join_scenes(out, [sequence.name for sequence in sequences], self._meta)
+
+    @property
+    def _meta(self) -> Mapping[str, Any]:
+        detections = self._source.detections
+        return {} if detections is None else detections.submission.meta
 
     def _detected(self) -> list[str]:
         detections = self._source.detections

@@ -1,43 +1,60 @@
-"""Figures of several trackers and classes in several processes; the results are those of one process."""
+"""Figures of several trackers and classes, one task for each class of each tracker."""
 
-import multiprocessing
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
-from optipmb_client.datasets import DatasetArguments
-from optipmb_client.evaluation.figures import ClassFigures, Settings, evaluate_figures, load_recordings
+from optipmb_client.datasets import DataSequence, DatasetArguments
+from optipmb_client.evaluation.figures import ClassFigures, Recording, Settings, evaluate_figures, load_recordings
 
-__all__ = ["FiguresJob", "run_jobs"]
+__all__ = ["Evaluation", "FiguresTask", "figures_of"]
 
 
 @dataclass(frozen=True)
-class FiguresJob:
-    """The figures of one class of one tracker, in words that another process understands."""
+class Evaluation:
+    """What all tasks share; can be sent to another process without `here`."""
 
     data: DatasetArguments
-    sequences: tuple[str, ...]
+    names: tuple[str, ...]
+    """Of the sequences."""
+    settings: Settings
+    here: Sequence[DataSequence] | None = None
+    """The sequences, where this process has opened them."""
+    _loaded: dict[Path, Sequence[Recording]] = field(default_factory=dict)
+
+    @cached_property
+    def sequences(self) -> Sequence[DataSequence]:
+        """The sequences; a process opens them once."""
+        return self.here or self.data.open().sequences(self.names)
+
+    def recordings(self, tracks: Path) -> Sequence[Recording]:
+        """Return truth and tracks; those of the last tracker are kept."""
+        if tracks not in self._loaded:
+            self._loaded.clear()
+            self._loaded[tracks] = load_recordings(self.data.name, self.sequences, tracks)
+        return self._loaded[tracks]
+
+
+@dataclass(frozen=True)
+class FiguresTask:
+    """One class of one tracker."""
+
     tracks: Path
     name: str
-    settings: Settings
     threshold: float | None
     """Of the tracks that are also evaluated without the others; None: as `evaluate_figures` chooses it."""
 
+    def __str__(self) -> str:
+        return f"{self.name} of {self.tracks}"
 
-def run_jobs(work: Sequence[FiguresJob], processes: int) -> Iterator[list[ClassFigures]]:
-    """Yield the figures of each job, none for a class that neither truth nor tracks have, in their order.
+
+def figures_of(shared: Evaluation, task: FiguresTask) -> list[ClassFigures]:
+    """Return the figures of one class of one tracker; none for a class that neither truth nor tracks have.
 
     Raises:
         DatasetError: as `load_recordings`.
     """
-    context = multiprocessing.get_context("spawn")  # a fork would copy the locks of numba's threads
-    with ProcessPoolExecutor(min(processes, len(work)), context) as pool:
-        yield from pool.map(_run, work)
-
-
-def _run(job: FiguresJob) -> list[ClassFigures]:
-    sequences = list(job.data.open().sequences(list(job.sequences)))
-    recordings = load_recordings(job.data.name, sequences, job.tracks)
-    thresholds = {} if job.threshold is None else {job.name: job.threshold}
-    return evaluate_figures(job.data.name, recordings, (job.name,), job.settings, thresholds)
+    thresholds: Mapping[str, float] = {} if task.threshold is None else {task.name: task.threshold}
+    recordings = shared.recordings(task.tracks)
+    return evaluate_figures(shared.data.name, recordings, (task.name,), shared.settings, thresholds)

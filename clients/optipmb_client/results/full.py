@@ -6,7 +6,6 @@ file; where tracks have predicted paths, these too, named as in messages. The sa
 """
 
 import io
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from optipmb_schemas import PATHS
 
-from optipmb_client.files import DatasetError
+from optipmb_client.files import AtomicText, DatasetError
 from optipmb_client.geometry import Floats, Ints
 from optipmb_client.results.rows import TrackRows
 
@@ -129,10 +128,12 @@ def write_full(path: Path, tracks: Mapping[int, FullRows]) -> None:
         for name, column in columns.items():
             with archive.open(f"{name}.npy", "w") as entry:
                 np.lib.format.write_array(entry, column, allow_pickle=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_bytes(content.getvalue())
-    temporary.replace(path)
+    file = AtomicText(path)
+    try:
+        file.write_bytes(content.getvalue())
+        file.close()
+    finally:
+        file.discard()
 
 
 def read_full(path: Path) -> FullTable:

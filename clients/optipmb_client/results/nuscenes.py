@@ -5,13 +5,12 @@ the track, so that no two scenes share one. Numbers have six decimals, samples a
 order of the tracks, so the same tracks always give the same bytes. A sample holds at most 500 boxes, as the benchmark
 demands: of more, those with the highest scores are written.
 
-Each scene is first a file of its own, `scenes/NAME.json`, in the same layout; when the last scene of a run is closed,
-they are joined in `tracking_results.json`. A run that is interrupted leaves the scenes that it finished.
+Each scene is first a file of its own, `scenes/NAME.json`, in the same layout; at the end of a run they are joined in
+`tracking_results.json`. A run that is interrupted leaves the scenes that it finished.
 """
 
 import json
-import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -31,60 +30,52 @@ _DIGITS = 18
 _END = "\n}}\n"
 
 
-class NuScenesRun:
-    """The scenes that are tracked together, and the file that holds them all; may be used by several threads."""
+def scene_file(out: Path, scene: str) -> Path:
+    """Return the path of the file of one scene."""
+    return out / "scenes" / f"{scene}.json"
 
-    def __init__(self, out: Path, scenes: Sequence[str], meta: Mapping[str, Any]) -> None:
-        self.path = out / NUSCENES_FILE
-        self._scenes = tuple(dict.fromkeys(scenes))
-        self._open = set(scenes)
-        self._lock = threading.Lock()
-        used = {name: bool(meta.get(name, name == "use_lidar")) for name in NUSCENES_META}
-        self._head = f'{{"meta": {json.dumps(used)}, "results": {{\n'
 
-    @property
-    def complete(self) -> bool:
-        """Whether the file is written."""
-        return not self._open
+def join_scenes(out: Path, scenes: Sequence[str], meta: Mapping[str, Any]) -> None:
+    """Write `tracking_results.json` from the files of these scenes, in their order; `meta` is that of the writers.
 
-    def writer(self, scene: str, samples: Sequence[str]) -> "NuScenesResultWriter":
-        """Return the writer of one scene with these sample tokens, in order of time."""
-        return NuScenesResultWriter(self.part(scene), scene, samples, self._head, self.done)
+    Raises:
+        DatasetError: the file of a scene cannot be read.
 
-    def part(self, scene: str) -> Path:
-        """Return the path of the file of one scene."""
-        return self.path.parent / "scenes" / f"{scene}.json"
+    """
+    head = _head(meta)
+    whole = AtomicText(out / NUSCENES_FILE)
+    try:
+        whole.write(head)
+        for i, name in enumerate(scenes):
+            text = read_text(scene_file(out, name), "the results of a scene")
+            whole.write((",\n" if i else "") + text[len(head) : -len(_END)])
+        whole.write(_END)
+        whole.close()
+    finally:
+        whole.discard()
 
-    def done(self, scene: str) -> None:
-        """Note that the file of a scene is in its place; the last one joins them all."""
-        with self._lock:
-            if scene not in self._open:
-                return
-            self._open.discard(scene)
-            if self._open:
-                return
-            whole = AtomicText(self.path)
-            try:
-                whole.write(self._head)
-                for i, name in enumerate(self._scenes):
-                    text = read_text(self.part(name), "the results of a scene")
-                    whole.write((",\n" if i else "") + text[len(self._head) : -len(_END)])
-                whole.write(_END)
-                whole.close()
-            finally:
-                whole.discard()
+
+def _head(meta: Mapping[str, Any]) -> str:
+    used = {name: bool(meta.get(name, name == "use_lidar")) for name in NUSCENES_META}
+    return f'{{"meta": {json.dumps(used)}, "results": {{\n'
 
 
 class NuScenesResultWriter:
-    """Writes the tracks of one scene; use it as a context manager, or call `close` at the end."""
+    """Writes the tracks of one scene; use it as a context manager, or call `close` at the end.
 
-    def __init__(self, path: Path, scene: str, samples: Sequence[str], head: str, done: Callable[[str], None]) -> None:
+    Args:
+        out: the folder of all scenes.
+        scene: its name.
+        samples: the tokens of its samples, in order of time.
+        meta: the meta of the detections.
+    """
+
+    def __init__(self, out: Path, scene: str, samples: Sequence[str], meta: Mapping[str, Any]) -> None:
         self._scene = scene
         self._samples = samples
-        self._head = head
-        self._done = done
+        self._head = _head(meta)
         self._lines: dict[int, str] = {}
-        self._file = AtomicText(path)
+        self._file = AtomicText(scene_file(out, scene))
 
     @property
     def path(self) -> Path:
@@ -138,7 +129,6 @@ class NuScenesResultWriter:
         lines = (f"{json.dumps(token)}: {self._lines.get(i, '[]')}" for i, token in enumerate(self._samples))
         self._file.write(self._head + ",\n".join(lines) + _END)
         self._file.close()
-        self._done(self._scene)
 
     def discard(self) -> None:
         """Drop what was written."""

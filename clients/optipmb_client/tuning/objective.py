@@ -1,17 +1,14 @@
 """What is maximised: one figure of tracks over some sequences, of the detections as they are and of worse ones.
 
-Everything is tracked in this process or in a pool of processes, one sequence at a time; the same parameters give the
-same figure whatever the number of processes.
+Tracking one sequence is a task; the same parameters give the same figure with any executor.
 """
 
-import multiprocessing
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from types import TracebackType
-from typing import Self
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 from optipmb import Parameters, warm_up
+from optipmb_client.bulk import Executor, Here, values
 from optipmb_client.datasets import Truth
 from optipmb_client.tuning.figures import Figures
 from optipmb_client.tuning.material import Clip, track_clip
@@ -48,37 +45,34 @@ def _defined(value: float) -> float:
 
 
 class Bench:
-    """Sequences of one class, in one or more variants of their detections, and processes to track them.
+    """Sequences of one class, in one or more variants of their detections, and what tracks them.
 
     Args:
         variants: the same sequences once or several times: plain, degraded.
         scorer: what compares tracks with the truth.
         metric: one of `METRICS`.
-        jobs: number of processes; with one, all is done in this one.
+        executor: where they are tracked; by default in this process.
+        note: hears of processes that died.
     """
 
-    def __init__(self, variants: Sequence[Sequence[Clip]], scorer: Scorer, metric: str, jobs: int = 1) -> None:
+    def __init__(
+        self,
+        variants: Sequence[Sequence[Clip]],
+        scorer: Scorer,
+        metric: str,
+        executor: Executor | None = None,
+        note: Callable[[str], None] = lambda _: None,
+    ) -> None:
         self.variants = variants
         self.scorer = scorer
         self.metric = metric
         self.names = tuple(clip.name for clip in variants[0])
         self.frames = sum(len(clip.frames) for clips in variants for clip in clips)
         self._known: OrderedDict[tuple[str, int, int], Measured] = OrderedDict()
-        self._pool: ProcessPoolExecutor | None = None
-        if jobs > 1:
-            context = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
-            self._pool = ProcessPoolExecutor(jobs, context, _begin, (variants, scorer))
-        else:
-            warm_up()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        self._note = note
+        self._executor = executor or Here()
+        self._executor.start(_measure, (variants, scorer))
+        warm_up()
 
     def objects(self, clips: Sequence[int] | None = None) -> int:
         """Return how many objects the truth of some sequences has."""
@@ -101,11 +95,8 @@ class Bench:
         chosen = range(len(self.variants)) if variants is None else variants
         wanted = [(key, variant, clip) for variant in chosen for clip in clips]
         missing = [place for place in wanted if place not in self._known]
-        if self._pool is None:
-            found = [_measure(self.variants[v][c], self.scorer, parameters) for _, v, c in missing]
-        else:
-            tasks = [self._pool.submit(_measure_held, v, c, parameters) for _, v, c in missing]
-            found = [task.result() for task in tasks]
+        tasks = [_Measurement(self.names[clip], variant, clip, parameters) for _, variant, clip in missing]
+        found: list[Measured] = values(self._executor, tasks, lambda task: f"sequence {task.name}", self._note)
         self._known.update(zip(missing, found, strict=True))
         for place in wanted:
             self._known.move_to_end(place)
@@ -124,20 +115,17 @@ class Bench:
         return sum(metric(self.metric, one, objects) for one in figures) / len(figures)
 
 
-def _measure(clip: Clip, scorer: Scorer, parameters: Parameters) -> Measured:
-    return scorer.measure(clip, track_clip(clip, parameters))
+@dataclass(frozen=True)
+class _Measurement:
+    """A task: one sequence in one variant, with some parameters."""
+
+    name: str
+    variant: int
+    clip: int
+    parameters: Parameters
 
 
-_held: tuple[Sequence[Sequence[Clip]], Scorer] | None = None
-
-
-def _begin(variants: Sequence[Sequence[Clip]], scorer: Scorer) -> None:
-    """Keep in a process of the pool what all its tasks need."""
-    global _held  # noqa: PLW0603  a process of a pool has no other place to keep anything
-    _held = (variants, scorer)
-    warm_up()
-
-
-def _measure_held(variant: int, clip: int, parameters: Parameters) -> Measured:
-    assert _held is not None  # noqa: S101  the pool has called _begin
-    return _measure(_held[0][variant][clip], _held[1], parameters)
+def _measure(shared: tuple[Sequence[Sequence[Clip]], Scorer], task: _Measurement) -> Measured:
+    variants, scorer = shared
+    clip = variants[task.variant][task.clip]
+    return scorer.measure(clip, track_clip(clip, task.parameters))

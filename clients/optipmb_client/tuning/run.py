@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from optipmb import Parameters, ScoreCalibration
+from optipmb_client.bulk import Executor
 from optipmb_client.datasets import DataSequence, DatasetArguments
 from optipmb_client.errors import UsageError
 from optipmb_client.files import AtomicText
@@ -162,7 +163,13 @@ def calibrate_scores(
 
 
 def tune_all(
-    source: Source, parameters: Parameters, plan: Plan, out: Path, watch: Watch, name: str | None = None
+    source: Source,
+    parameters: Parameters,
+    plan: Plan,
+    out: Path,
+    watch: Watch,
+    name: str | None = None,
+    executor: Executor | None = None,
 ) -> Tuned:
     """Tune every class, and write `report.json` and `tuned.toml`, a profile with a name of one's own or the old one's.
 
@@ -180,7 +187,8 @@ def tune_all(
             "detections": source.detections,
             "detected": _sum(source.of_class(label)),
         }
-        results[label] = refine(source.of_class(label), scorer, parameters, plan, out / "trials.db", context, watch)
+        clips = source.of_class(label)
+        results[label] = refine(clips, scorer, parameters, plan, out / "trials.db", context, watch, executor)
     _write_json(out / "report.json", {name: one.to_json() for name, one in results.items()})
     scope = "all parameters" if plan.everything else "noise, birth spread, area, forgetting"
     judged = f"{plan.folds} groups left out in turn" if any(one.folds for one in results.values()) else "none left out"

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from optipmb import Parameters
+from optipmb_client.bulk import Executor
 from optipmb_client.evaluation.calibration import CalibrationResult
 from optipmb_client.tuning.calibrate import calibrate, cross_calibration
 from optipmb_client.tuning.caution import Jury
@@ -55,7 +56,6 @@ class Plan:
     """What a value costs when it is a whole range away from where it began."""
     caution: float = 1.0
     """Standard errors that are taken off a gain before it counts."""
-    jobs: int = 1
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Refined:
 
         return {
             "class": self.name,
-            "plan": {key: value for key, value in asdict(self.plan).items() if key != "jobs"},
+            "plan": asdict(self.plan),
             "sequences": list(self.sequences),
             "trials": self.trials,
             "objective": {
@@ -152,6 +152,7 @@ def refine(
     storage: Path,
     context: Mapping[str, Any],
     watch: Watch | None = None,
+    executor: Executor | None = None,
 ) -> Refined:
     """Tune one class.
 
@@ -163,6 +164,7 @@ def refine(
         storage: the file that keeps the trials.
         context: what else the trials depend on, such as the names of the data.
         watch: told how far it has come.
+        executor: where sequences are tracked; by default in this process.
 
     Raises:
         UsageError: the storage holds trials of another session.
@@ -172,46 +174,46 @@ def refine(
     base = only(parameters, name)
     variants = [clips, *([degrade(clip, plan.degradation, plan.seed, i) for clip in clips] for i in range(plan.copies))]
     everyone = tuple(range(len(clips)))
-    with Bench(variants, scorer, plan.metric, plan.jobs) as bench:
-        groups = deal([bench.boxes(i) for i in everyone], plan.folds)
-        trials = len(groups) * plan.fold_trials + plan.trials
-        watch.begin(name, trials)
-        watch.note(f"calibrating {name}")
-        first = calibrate(clips, scorer, base)
-        work = _Work(bench, base, plan, storage, dict(context), watch, first.memory if first else None)
-        told = work.told(base, everyone).classes[name].calibration
-        work = replace(work, by_evidence=told is not None and told.score_of_evidence)
-        folds: list[FoldResult] = []
-        crossed: dict[int, list[Measured]] = {}
-        for number, group in enumerate(groups):
-            title = f"{name} without group {number + 1} of {len(groups)}"
-            rest = tuple(i for i in everyone if i not in group)
-            folds.append(work.judge(work.choose(title, rest, plan.fold_trials).parameters, group, crossed))
-        chosen = work.choose(f"{name} all", everyone, plan.trials)
-        evidence = weigh(chosen.jury, chosen.made, chosen.start, chosen.values, watch)
-        found = chosen.parameters
-        before, value_before = work.figures(base, everyone)
-        after, value_after = work.figures(found, everyone)
-        together = work.together(crossed, everyone) if crossed else ()
-        watch.note(f"calibrating {name}")
-        known = value_of(found, name, "calibration") is not None
-        return Refined(
-            name=name,
-            plan=plan,
-            sequences=bench.names,
-            parameters=found,
-            evidence=evidence,
-            before=before,
-            after=after,
-            folds=tuple(folds),
-            crossed=together,
-            value_before=value_before,
-            value_after=value_after,
-            value_crossed=bench.value(together, everyone) if together else None,
-            calibration=cross_calibration(clips, scorer, found),
-            ranking=rank(clips, scorer, found, plan.metric) if known else (),
-            trials=trials,
-        )
+    bench = Bench(variants, scorer, plan.metric, executor, watch.note)
+    groups = deal([bench.boxes(i) for i in everyone], plan.folds)
+    trials = len(groups) * plan.fold_trials + plan.trials
+    watch.begin(name, trials)
+    watch.note(f"calibrating {name}")
+    first = calibrate(clips, scorer, base)
+    work = _Work(bench, base, plan, storage, dict(context), watch, first.memory if first else None)
+    told = work.told(base, everyone).classes[name].calibration
+    work = replace(work, by_evidence=told is not None and told.score_of_evidence)
+    folds: list[FoldResult] = []
+    crossed: dict[int, list[Measured]] = {}
+    for number, group in enumerate(groups):
+        title = f"{name} without group {number + 1} of {len(groups)}"
+        rest = tuple(i for i in everyone if i not in group)
+        folds.append(work.judge(work.choose(title, rest, plan.fold_trials).parameters, group, crossed))
+    chosen = work.choose(f"{name} all", everyone, plan.trials)
+    evidence = weigh(chosen.jury, chosen.made, chosen.start, chosen.values, watch)
+    found = chosen.parameters
+    before, value_before = work.figures(base, everyone)
+    after, value_after = work.figures(found, everyone)
+    together = work.together(crossed, everyone) if crossed else ()
+    watch.note(f"calibrating {name}")
+    known = value_of(found, name, "calibration") is not None
+    return Refined(
+        name=name,
+        plan=plan,
+        sequences=bench.names,
+        parameters=found,
+        evidence=evidence,
+        before=before,
+        after=after,
+        folds=tuple(folds),
+        crossed=together,
+        value_before=value_before,
+        value_after=value_after,
+        value_crossed=bench.value(together, everyone) if together else None,
+        calibration=cross_calibration(clips, scorer, found),
+        ranking=rank(clips, scorer, found, plan.metric) if known else (),
+        trials=trials,
+    )
 
 
 def _starts(

@@ -1,0 +1,184 @@
+"""Where tasks run: this process, or several processes of this machine. Ray has a module of its own."""
+
+import multiprocessing
+import os
+import pickle
+import shutil
+import signal
+import tempfile
+import threading
+import uuid
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Protocol, Self
+
+from optipmb_client.bulk.task import Done, Failed, Function, WorkerDied, attempt
+
+__all__ = ["ATTEMPTS", "Executor", "Here", "Processes"]
+
+ATTEMPTS: Final = 3
+"""How often a task is started whose process dies."""
+
+
+class Executor(Protocol):
+    """Runs tasks. Use it as a context manager: at its end nothing of it is left, whatever was under way."""
+
+    @property
+    def width(self) -> int: ...  # noqa: D102 - tasks that are to be under way at once
+
+    @property
+    def attempts(self) -> int: ...  # noqa: D102 - how often the loop starts a task whose process dies
+
+    @property
+    def here(self) -> bool: ...  # noqa: D102 - whether tasks run in this process, and share its objects
+
+    def start(self, function: Function, shared: Any) -> None:
+        """Make ready to call `function(shared, task)`; a second call changes what is called."""
+
+    def submit(self, task: Any) -> Future[Any]:
+        """Start a task."""
+
+    def take(self, future: Future[Any]) -> Done[Any] | Failed:
+        """Return what a task gave; called once for each that has ended.
+
+        Raises:
+            WorkerDied: nothing came back.
+        """
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+
+class Here:
+    """One task after the other, in this process."""
+
+    width = attempts = 1
+    here = True
+
+    def start(self, function: Function, shared: Any) -> None:
+        """Keep what is called."""
+        self._call = function, shared
+
+    def submit(self, task: Any) -> Future[Any]:
+        """Run the task."""
+        future: Future[Any] = Future()
+        future.set_result(attempt(*self._call, task))
+        return future
+
+    def take(self, future: Future[Any]) -> Done[Any] | Failed:
+        """Return what it gave."""
+        result: Done[Any] | Failed = future.result()
+        return result
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing is held."""
+
+
+class Processes:
+    """So many processes of this machine; each is a pool of its own, so that one that dies takes no other task with it.
+
+    Results come back as files: a process that is killed while it sends a large one through a pipe would leave the
+    reader waiting for the rest. The processes end with this one, however it ends: they hold one end of a pipe.
+    """
+
+    attempts = ATTEMPTS
+    here = False
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        self._context = multiprocessing.get_context("spawn")  # a fork would copy the locks of libraries' threads
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._idle: list[ProcessPoolExecutor] = []
+        self._busy: dict[Future[Any], ProcessPoolExecutor] = {}
+
+    def start(self, function: Function, shared: Any) -> None:
+        """Write down what is called; processes are started with the first tasks."""
+        self._close()
+        self._folder = tempfile.TemporaryDirectory(prefix="optipmb-bulk-", ignore_cleanup_errors=True)
+        self._call = Path(self._folder.name, "call")
+        self._call.write_bytes(pickle.dumps((function, shared), pickle.HIGHEST_PROTOCOL))
+        self._theirs, self._ours = self._context.Pipe(duplex=False)
+
+    def submit(self, task: Any) -> Future[Any]:
+        """Give the task to a process that waits, or to a new one."""
+        pool = self._idle.pop() if self._idle else self._new()
+        try:
+            future = pool.submit(_run, task)
+        except BrokenProcessPool:  # it was killed while it waited
+            pool.shutdown()
+            pool = self._new()
+            future = pool.submit(_run, task)
+        self._busy[future] = pool
+        return future
+
+    def take(self, future: Future[Any]) -> Done[Any] | Failed:
+        """Read what the task gave."""
+        pool = self._busy.pop(future)
+        try:
+            file = Path(future.result())
+        except BrokenProcessPool as error:
+            pool.shutdown()
+            raise WorkerDied("its process died (killed, or out of memory)") from error
+        self._idle.append(pool)
+        result: Done[Any] | Failed = pickle.loads(file.read_bytes())  # noqa: S301  our own process wrote it
+        file.unlink()
+        return result
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def _new(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(1, self._context, _begin, (self._theirs, str(self._call)))
+
+    def _close(self) -> None:
+        if self._folder is None:
+            return
+        self._ours.close()  # ends the processes, also those at work
+        for pool in (*self._idle, *self._busy.values()):
+            pool.shutdown(cancel_futures=True)
+        self._theirs.close()
+        self._idle, self._busy = [], {}
+        self._folder.cleanup()
+        self._folder = None
+
+
+_held: tuple[Function, Any] | None = None
+
+
+def _begin(end: Connection, call: str) -> None:
+    """Make a process ready: it keeps what is called, and ends when the other end of the pipe is closed."""
+    global _held  # noqa: PLW0603  a process of a pool has no other place to keep anything
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its processes
+    threading.Thread(target=_end_with, args=(end, Path(call).parent), daemon=True).start()
+    tempfile.tempdir = str(Path(call).parent)  # what a killed process leaves goes with the folder
+    _held = pickle.loads(Path(call).read_bytes())  # noqa: S301  the parent wrote it
+
+
+def _end_with(end: Connection, folder: Path) -> None:
+    end.poll(None)
+    shutil.rmtree(folder, ignore_errors=True)  # the parent does it, if it was not killed
+    os._exit(0)  # the task at work is not waited for
+
+
+def _run(task: Any) -> str:
+    """Run a task in a process of the pool; return the file with what it gave."""
+    assert _held is not None  # noqa: S101  the pool has called _begin
+    file = Path(tempfile.gettempdir(), uuid.uuid4().hex)
+    file.write_bytes(pickle.dumps(attempt(*_held, task), pickle.HIGHEST_PROTOCOL))
+    return str(file)
