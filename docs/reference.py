@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
     from pydantic.fields import FieldInfo
 
+MOST_ALLOWED: Final = 60
+"""Characters of allowed values beyond which they are in the column of the meaning, which is wider."""
+
 _TABLE: Final = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -72,6 +75,8 @@ def _setting(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
         allowed = ", ".join(f"`{choice}`" for choice in get_args(field.annotation))
     if bool in (field.annotation, *get_args(field.annotation)):
         allowed = "`true`, `false`"
+    if len(allowed) > MOST_ALLOWED:
+        return f"`{name}`", "", "", f"{field.description}: {allowed}; default: {shown}"
     return f"`{name}`", shown, allowed, field.description or ""
 
 
