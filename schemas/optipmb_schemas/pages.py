@@ -12,10 +12,10 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 
 from optipmb_schemas.codec import MESSAGES
-from optipmb_schemas.control import SessionSummary
+from optipmb_schemas.control import SessionState, SessionSummary
 from optipmb_schemas.errors import CODES
 from optipmb_schemas.limits import DEFAULT
-from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Pose
+from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Pose, Tracks
 from optipmb_schemas.model import Message
 
 _TABLE: Final = re.compile(r"(<!-- table: ([A-Za-z]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -39,12 +39,17 @@ def table(name: str) -> str:
 
 
 def _rows(kind: type[Message]) -> Iterable[tuple[str, ...]]:
-    """Yield a row per field; those that are as in `Detections` share one."""
-    first = set() if kind is Detections else set(_fields(Detections))
+    """Yield a row per field; those that are as in a message described before share one."""
     rows = list(_fields(kind))
-    if same := [row[0] for row in rows if row in first]:
-        yield ", ".join(same), "", "", "As in `Detections`."
-    yield from (row for row in rows if row not in first)
+    for first in (Detections, Tracks, SessionState):
+        if kind is first:
+            break
+        known = set(_fields(first))
+        same = [row for row in rows if row in known]
+        if len(same) > 1:
+            yield ", ".join(name for name, *_ in same), "", "", f"As in `{first.__name__}`."
+            rows = [row for row in rows if row not in known]
+    yield from rows
 
 
 def _fields(kind: type[Message]) -> Iterable[tuple[str, ...]]:
