@@ -18,6 +18,7 @@ from optipmb.compiled import kernel
 from optipmb.density import PHI, STATE, copy_state
 from optipmb.hypotheses import FROM_POISSON
 from optipmb.motion import wrap
+from optipmb.position_noise import PLAIN
 from optipmb.update import ukf_updates
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def birth_states(
 
     Args:
         rows: (K,) measurements.
-        position: (M, 2) z_xy.
+        position: (M, 2) z_xy, or (M, 5) with rho of `optipmb.position_noise`: P^0_xy is that of the class times rho.
         yaw: (M,) z_phi.
         velocity: (M, 2) z_v, NaN where unknown.
         label: (M,) z_c.
@@ -57,8 +58,9 @@ def birth_states(
         known: (C, 6) standard deviations of P^0 with a velocity.
         unknown: (C, 6) without.
         mean_out: (K, 6) receives the means.
-        covariance_out: (K, 6, 6) receives the diagonal covariances.
+        covariance_out: (K, 6, 6) receives the covariances, diagonal but for x and y.
     """
+    own_noise = position.shape[1] > PLAIN
     for k in range(rows.shape[0]):
         m = rows[k]
         speed, heading = 0.0, yaw[m]
@@ -80,6 +82,10 @@ def birth_states(
         covariance_out[k] = 0.0
         for s in range(STATE):
             covariance_out[k, s, s] = spread[s] * spread[s]
+        if own_noise:
+            covariance_out[k, 0, 0] *= position[m, 2]
+            covariance_out[k, 1, 1] *= position[m, 4]
+            covariance_out[k, 0, 1] = covariance_out[k, 1, 0] = spread[0] * spread[1] * position[m, 3]
 
 
 def first_detected_states(

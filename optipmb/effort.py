@@ -46,7 +46,7 @@ def check_effort(
     count = len(measurements)
     if (len(bernoulli) + len(poisson) + count) * count <= most:
         return
-    positions = np.concatenate((bernoulli.mean[:, :2], poisson.mean[:, :2], measurements.position))
+    positions = np.concatenate((bernoulli.mean[:, :2], poisson.mean[:, :2], measurements.position[:, :2]))
     labels = np.concatenate((bernoulli.label, poisson.label, measurements.label))
     gates = table.period, table.gate, table.gate_growth, table.gate_deviations
     radius = np.concatenate(

@@ -11,6 +11,7 @@ from optipmb.calibration import calibrate_rows
 from optipmb.compiled import kernel
 from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, copy_state, whole_periods
 from optipmb.heading import doubt, sign_probability
+from optipmb.position_noise import PLAIN
 from optipmb.records import FLAG, INDEX, record
 from optipmb.reported import follow_box
 
@@ -298,7 +299,10 @@ def read_tracks(
         m = measurement[n]
         if m >= 0 and reported_position[c] + reported_heading[c] > 0.0:
             x, y, z_phi = position[m, 0], position[m, 1], measured_yaw[m]
-            follow_box(x, y, z_phi, reported_position[c], reported_heading[c], state[k], covariance_out[k])
+            r_x = r_y = reported_position[c]
+            if position.shape[1] > PLAIN:
+                r_x, r_y = r_x * position[m, 2], r_y * position[m, 4]
+            follow_box(x, y, z_phi, r_x, r_y, reported_heading[c], state[k], covariance_out[k])
         v, phi = state[k, V], state[k, PHI]
         center[k, 0], center[k, 1], center[k, 2] = state[k, X], state[k, Y], auxiliary[n, 3]
         for s in range(3):

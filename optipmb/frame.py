@@ -18,6 +18,7 @@ from optipmb.class_names import class_indices
 from optipmb.compiled import kernel
 from optipmb.errors import FrameError
 from optipmb.field_of_view import FieldOfView, check_view
+from optipmb.position_noise import horizontal_covariance, semidefinite
 from optipmb.score_calibration import calibrate_scores
 
 if TYPE_CHECKING:
@@ -132,6 +133,8 @@ class Frame:
         labels: names of the classes that `label` points into, those of the parameters.
         cloud: the scan of the same stamp, or None.
         field_of_view: of the sensor, with its pose; None: it sees everything.
+        position_covariance: (M, 3) R_xx, R_xy and R_yy of each position, m^2; NaN, or None: those of the class.
+        pose: world from sensor; None: the sensor stands at the origin of the world.
 
     The arrays are copied and cannot be written to, so that what was checked stays as it was.
 
@@ -150,6 +153,8 @@ class Frame:
     labels: tuple[str, ...]
     cloud: PointCloud | None = None
     field_of_view: FieldOfView | None = None
+    position_covariance: NDArray[np.float64] | None = None
+    pose: Pose | None = None
 
     def __post_init__(self) -> None:
         count = np.shape(self.score)[0] if np.ndim(self.score) == 1 else 0
@@ -161,6 +166,10 @@ class Frame:
             if index.shape != (count,):
                 raise FrameError(name, f"shape ({count},)", str(index.shape))
             object.__setattr__(self, name, _sealed(index))
+        if self.position_covariance is not None:
+            column = _shaped("position_covariance", self.position_covariance, (count, 3))
+            _all("position_covariance", semidefinite(column), "a covariance R_xx, R_xy, R_yy, or NaN alone", column)
+            object.__setattr__(self, "position_covariance", _sealed(column))
         if not 0 <= self.stamp_ns < 2**63:
             raise FrameError("stamp_ns", "whole nanoseconds in [0, 2^63)", repr(self.stamp_ns))
         check_view(self.field_of_view)
@@ -192,6 +201,7 @@ def make_frame(
     pose: Pose | None = None,
     cloud: PointCloud | None = None,
     field_of_view: FieldOfView | None = None,
+    position_covariance: ArrayLike | None = None,
 ) -> tuple[Frame, int]:
     """Check the detections of one stamp and bring them to the world frame and to the classes of the parameters.
 
@@ -212,6 +222,8 @@ def make_frame(
         cloud: the scan of the same stamp.
         field_of_view: where the sensor detects objects, in the frame of its own `pose`, else of `pose`. Outside it
             objects are neither detected nor missed. None: it sees everything.
+        position_covariance: (M, 3, 3) of the errors of the centres along the axes of the same frame, m^2, in place of R
+            of the class; a matrix of NaN, or None, where the detector gives none.
 
     Returns:
         The frame, and how many objects were left out: their class is not in the parameters, or their score is 0.
@@ -232,6 +244,7 @@ def make_frame(
     if not allowed(which, len(labels), center, size, yaw, scored, velocity):
         _refuse(which, len(labels), center, size, yaw, scored, velocity)
 
+    rotation = None
     if pose is not None and not pose.is_identity:
         rotation = pose.rotation
         center = center @ rotation.T + pose.translation
@@ -241,20 +254,27 @@ def make_frame(
         yaw = np.arctan2(heading[:, 1], heading[:, 0])
         velocity = velocity @ rotation[:2, :2].T
 
+    spread = None
+    if position_covariance is not None:
+        spread = horizontal_covariance(_shaped("position_covariance", position_covariance, (m, 3, 3)), rotation)
+
     known = class_indices(tuple(labels), parameters.labels)[which] if m else which
     calibrate_scores(parameters, known, score)
     source = ((known >= 0) & (score > 0.0)).nonzero()[0]
     if source.shape[0] < m:
         center, size, yaw, velocity = center[source], size[source], yaw[source], velocity[source]
         score, known = score[source], known[source]
+        spread = None if spread is None else spread[source]
     columns = center, size, yaw, velocity, score, known, source
     view = field_of_view
     if view is not None and view.pose is None and pose is not None:
         view = replace(view, pose=pose)
+    sensor = pose if pose is not None or view is None else view.pose
+    rest = parameters.labels, cloud, view, spread, sensor
     if pose is not None and not allowed(known, len(parameters.labels), center, size, yaw, score, velocity):
         # What is too far only in the world: the constructor names it.
-        return Frame(int(stamp_ns), *columns, parameters.labels, cloud, view), m - source.shape[0]
-    return _checked(int(stamp_ns), columns, parameters.labels, cloud, view), m - source.shape[0]
+        return Frame(int(stamp_ns), *columns, *rest), m - source.shape[0]
+    return _checked(int(stamp_ns), columns, *rest), m - source.shape[0]
 
 
 def _checked(
@@ -263,6 +283,8 @@ def _checked(
     labels: tuple[str, ...],
     cloud: PointCloud | None,
     view: FieldOfView | None,
+    position_covariance: NDArray[np.float64] | None,
+    pose: Pose | None,
 ) -> Frame:
     """Return the frame of arrays that nobody else has and that were checked, from `center` to `source`."""
     frame = object.__new__(Frame)
@@ -271,7 +293,8 @@ def _checked(
     for name, column in zip(_ARRAYS, columns, strict=True):
         values[name] = _sealed(np.ascontiguousarray(column))
     values["labels"] = labels
-    values["cloud"], values["field_of_view"] = cloud, view
+    values["cloud"], values["field_of_view"], values["pose"] = cloud, view, pose
+    values["position_covariance"] = None if position_covariance is None else _sealed(position_covariance)
     return frame
 
 

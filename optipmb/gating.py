@@ -10,6 +10,7 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.density import V
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
+from optipmb.position_noise import PLAIN
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -80,9 +81,9 @@ def gate(
         covariance: (N, 6, 6) predicted covariances.
         label: (N,) classes.
         radius: (N,) gating distances, m; nothing lies in a negative one.
-        position: (M, 2) z_xy.
+        position: (M, 2) z_xy, or (M, 5) with rho.
         measured_label: (M,) z_c.
-        noise_position: (C,) standard deviation of z_x and z_y; R_xy = sigma^2 I.
+        noise_position: (C,) standard deviation of z_x and z_y; R_xy = sigma^2 rho, and rho = I without one.
 
     Returns:
         Objects, measurements and log-likelihoods ln N(z_xy; z_hat, S) of the pairs (eq. Predicted Measurement),
@@ -93,14 +94,19 @@ def gate(
     else:
         row, measurement = pairs_of_many(mean, label, radius, position, measured_label, noise_position.shape[0])
     log_likelihood = np.empty(row.shape[0])
+    own_noise = position.shape[1] > PLAIN
+    rho_xx, rho_xy, rho_yy = 1.0, 0.0, 1.0
     before = -1
     s_xx = s_xy = s_yy = determinant = constant = 0.0
     for k in range(row.shape[0]):
         n, m = row[k], measurement[k]
-        if n != before:  # what the pairs of an object share
+        if n != before or own_noise:  # what the pairs of an object share
             before = n
-            r_xy = noise_position[label[n]] ** 2
-            s_xx, s_xy, s_yy = covariance[n, 0, 0] + r_xy, covariance[n, 0, 1], covariance[n, 1, 1] + r_xy
+            variance = noise_position[label[n]] ** 2
+            if own_noise:
+                rho_xx, rho_xy, rho_yy = position[m, 2], position[m, 3], position[m, 4]
+            s_xx, s_yy = covariance[n, 0, 0] + variance * rho_xx, covariance[n, 1, 1] + variance * rho_yy
+            s_xy = covariance[n, 0, 1] + variance * rho_xy
             determinant = s_xx * s_yy - s_xy * s_xy
             constant = -math.log(2.0 * math.pi) - 0.5 * math.log(determinant)
         dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]

@@ -169,7 +169,8 @@ class OnlineTracker:
             boxes: columns by name: a dictionary, or a data frame of pandas, polars or pyarrow. `center` (M, 3) or `x`,
                 `y`, `z`; `size` (M, 3) length, width, height, or `l`, `w`, `h`; `yaw` (M,) rad; `score` (M,) in (0, 1];
                 `class`, `label` or `name` (M,): class names, or their places in the profile; `velocity` (M, 2) or
-                `vx`, `vy`, m/s, NaN where unknown. None: nothing was detected.
+                `vx`, `vy`, m/s, NaN where unknown; `position_covariance` (M, 3, 3), m^2, likewise. None: nothing was
+                detected.
             t: time of the frame, s; or
             stamp_ns: nanoseconds.
             pose: world from sensor, or None when the boxes are in the world frame.
@@ -241,7 +242,7 @@ def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
             columns[name] = given[name]
         elif all(part in given for part in parts):
             columns[name] = np.column_stack([np.asarray(given[part], dtype=np.float64) for part in parts])
-    columns |= {name: given[name] for name in ("yaw", "score") if name in given}
+    columns |= {name: given[name] for name in ("yaw", "score", "position_covariance") if name in given}
     label = next((given[name] for name in CLASSES if name in given), None)
     columns |= {} if label is None else {"label": label}
     missing = [name for name in BOXES if name not in columns]

@@ -16,6 +16,7 @@ from optipmb.effort import UNLIMITED
 from optipmb.errors import EffortError
 from optipmb.geometry import iou_exceeds
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
+from optipmb.position_noise import PLAIN, relative_noise
 from optipmb.records import INDEX, record
 
 if TYPE_CHECKING:
@@ -33,7 +34,8 @@ class Measurements:
     """The measurement set Z_k, best score first.
 
     Attributes:
-        position: (M, 2) z_xy, m.
+        position: (M, 2) z_xy, m; (M, 5) with rho_xx, rho_xy and rho_yy of `optipmb.position_noise` behind, where some
+            detection of the frame has another R than its class.
         yaw: (M,) z_phi, rad.
         velocity: (M, 2) z_v, m/s, NaN where unknown.
         auxiliary: (M, 4) z_A = [length, width, height, z].
@@ -82,8 +84,9 @@ def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[
     )
     if kept < 0:
         raise EffortError("center", f"at most {most} pairs of detections that may overlap", "more")
+    own_noise = frame.position_covariance is not None or table.noise_grows
     measurements = Measurements(
-        np.empty((kept, 2)),  # position
+        np.empty((kept, PLAIN + 3 if own_noise else PLAIN)),  # position
         np.empty(kept),  # yaw
         np.empty((kept, 2)),  # velocity
         np.empty((kept, 4)),  # auxiliary
@@ -108,6 +111,8 @@ def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[
         measurements.label,
         measurements.source,
     )
+    if own_noise:
+        measurements.position[:, PLAIN:] = relative_noise(frame, chosen[:kept], table)
     return measurements, count - above, above - kept
 
 

@@ -31,7 +31,16 @@ BOX: Final = (X, Y, PHI)
 
 
 @kernel
-def follow_box(x: float, y: float, yaw: float, position: float, heading: float, mean: Array, covariance: Array) -> None:
+def follow_box(
+    x: float,
+    y: float,
+    yaw: float,
+    variance_x: float,
+    variance_y: float,
+    heading: float,
+    mean: Array,
+    covariance: Array,
+) -> None:
     """Update the box of a state, in place, with its detection once more.
 
     R_x is diagonal, so that the entries of z can be taken one after the other, each with a scalar innovation variance.
@@ -40,7 +49,8 @@ def follow_box(x: float, y: float, yaw: float, position: float, heading: float, 
         x: z_x, m.
         y: z_y, m.
         yaw: z_phi, rad.
-        position: variance that R_x leaves for z_x and z_y, m^2; zero leaves the state as it is.
+        variance_x: variance that R_x leaves for z_x, m^2; zero leaves the state as it is.
+        variance_y: for z_y, m^2; likewise.
         heading: for z_phi, rad^2; likewise.
         mean: (6,) posterior mean m.
         covariance: (6, 6) posterior covariance P.
@@ -51,7 +61,7 @@ def follow_box(x: float, y: float, yaw: float, position: float, heading: float, 
             variance = heading
             innovation = yaw - mean[PHI]
         else:
-            variance = position
+            variance = variance_x if s == X else variance_y
             innovation = (x if s == X else y) - mean[s]
         if variance == 0.0:
             continue

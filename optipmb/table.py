@@ -28,6 +28,7 @@ class ClassTable:
         birth_intensity: mu_b0 / A, 1/m^2.
         process_noise: (C, 6) standard deviations in state order, per square root of a second.
         noise_position: (C,) standard deviation of z_x and z_y.
+        noise_growth: (C,) g of `optipmb.position_noise`; noise_grows: whether any is above zero.
         noise_velocity: (C,) of z_vx and z_vy.
         noise_heading: (C,) of z_phi.
         acceleration_time: (C,) time constant of the acceleration, s, infinite where it is constant.
@@ -80,6 +81,8 @@ class ClassTable:
     confirm_until: Array
     process_noise: Array
     noise_position: Array
+    noise_growth: Array
+    noise_grows: bool
     noise_velocity: Array
     noise_heading: Array
     linearisations: NDArray[np.int64]
@@ -174,6 +177,8 @@ class ClassTable:
                 [[q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration] for q in noise]
             ),
             noise_position=column(lambda p: p.measurement_noise.position),
+            noise_growth=column(lambda p: p.measurement_noise.position_growth),
+            noise_grows=any(p.measurement_noise.position_growth > 0.0 for p in rows),
             noise_velocity=column(lambda p: p.measurement_noise.velocity),
             noise_heading=column(lambda p: p.measurement_noise.heading),
             linearisations=count(lambda p: p.linearisations),

@@ -18,6 +18,7 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.density import PHI, STATE, V, X, Y, copy_state
 from optipmb.motion import ORDER, SPREAD, WEIGHT, square_root, wrap
+from optipmb.position_noise import PLAIN
 from optipmb.prune import NEW
 
 if TYPE_CHECKING:
@@ -112,11 +113,11 @@ def ukf_updates(
         measurement: (K,) index of the associated measurement, or negative.
         mean: (N, 6) predicted means.
         covariance: (N, 6, 6) predicted covariances.
-        position: (M, 2) z_xy.
+        position: (M, 2) z_xy, or (M, 5) with rho of `optipmb.position_noise`.
         velocity: (M, 2) z_v.
         yaw: (M,) z_phi.
         label: (M,) z_c.
-        noise_position: (C,) standard deviations of z_x and z_y.
+        noise_position: (C,) standard deviations of z_x and z_y where rho is I.
         noise_velocity: (C,) of z_vx and z_vy.
         noise_heading: (C,) of z_phi.
         linearisations: (C,) how often measured velocities are linearised; zero for the UKF.
@@ -128,8 +129,9 @@ def ukf_updates(
     """
     repaired = 0
     z = np.empty(MEASURED)
-    sigma = np.empty(MEASURED)
+    sigma = np.empty(MEASURED + 1)
     buffers = workspace()
+    own_noise = position.shape[1] > PLAIN
     for k in range(row.shape[0]):
         n, m = row[k], measurement[k]
         if n == NEW:
@@ -141,6 +143,11 @@ def ukf_updates(
         z[0], z[1], z[4] = position[m, 0], position[m, 1], yaw[m]
         z[2], z[3] = velocity[m, 0], velocity[m, 1]
         sigma[0] = sigma[1] = noise_position[c]
+        sigma[MEASURED] = 0.0
+        if own_noise:
+            variance = noise_position[c] * noise_position[c]
+            sigma[0], sigma[1] = math.sqrt(variance * position[m, 2]), math.sqrt(variance * position[m, 4])
+            sigma[MEASURED] = variance * position[m, 3]
         sigma[2] = sigma[3] = noise_velocity[c]
         sigma[4] = noise_heading[c]
         if linearisations[c] > 0 and not (math.isnan(z[2]) or math.isnan(z[3])):
@@ -171,7 +178,8 @@ def ukf_update(
         mean: (6,) m_+.
         covariance: (6, 6) P_+.
         z: (5,) z_M; NaN at 2 and 3 where the velocity is unknown.
-        sigma: (5,) standard deviations of the measurement noise, ``R = diag(sigma^2)``.
+        sigma: (6,) standard deviations of the measurement noise, ``R = diag(sigma^2)``, and last the covariance of z_x
+            and z_y in R.
         buffers: of `workspace`; what they hold does not matter.
         mean_out: (6,) receives m.
         covariance_out: (6, 6) receives P.
@@ -226,6 +234,8 @@ def ukf_update(
             if r == s:
                 deviation = sigma[r] if r < size - 1 else sigma[4]
                 value += deviation * deviation
+            elif r == 1 and sigma[MEASURED] != 0.0:
+                value += sigma[MEASURED]
             for k in range(s):
                 value -= factor[r, k] * factor[s, k]
             factor[r, s] = math.sqrt(value) if r == s else value / factor[s, s]
@@ -283,7 +293,7 @@ def linearised_update(
         mean: (6,) m_+.
         covariance: (6, 6) P_+.
         z: (5,) z_M.
-        sigma: (5,) standard deviations of the measurement noise.
+        sigma: (6,) as in `ukf_update`.
         iterations: how often, at least once.
         buffers: of `workspace`; what they hold does not matter.
         mean_out: (6,) receives m.
@@ -329,6 +339,8 @@ def linearised_update(
         factor[2, 2] += omega_xx
         factor[3, 3] += omega_yy
         factor[3, 2] += omega_xy
+        if sigma[MEASURED] != 0.0:
+            factor[1, 0] += sigma[MEASURED]
         for r in range(MEASURED):
             for q in range(r + 1):
                 value = factor[r, q]

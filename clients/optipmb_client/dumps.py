@@ -108,6 +108,7 @@ def _step(
         field_of_view=optipmb.FieldOfView.of(
             message.field_of_view, None if message.pose is None else _place(message.pose)
         ),
+        position_covariance=message.position_covariance,
         cloud=None if given.points is None else optipmb.PointCloud(given.points.xyz, _pose(given.points)),
     )
     found = steps.step(density, frame)

@@ -346,6 +346,7 @@ def _steps(
                 pose=Pose(given.pose.translation, given.pose.quaternion),
                 cloud=None if cloud is None else PointCloud(cloud.xyz, Pose(cloud.translation, cloud.quaternion)),
                 field_of_view=FieldOfView.of(given.field_of_view, None),
+                position_covariance=given.position_covariance,
             )
         except OptipmbError as error:
             raise UsageError(f"sequence {sequence.name}, frame {given.index}: {error}") from error

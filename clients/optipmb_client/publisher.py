@@ -118,6 +118,7 @@ class Publisher:
         points_pose: PoseLike | None = None,
         has_points: bool | None = None,
         field_of_view: FieldOfView | None = None,
+        position_covariance: ArrayLike | None = None,
     ) -> int:
         """Publish the detections of one sensor frame, and its point cloud where there is one.
 
@@ -140,6 +141,8 @@ class Publisher:
                 them in any case.
             field_of_view: Where the sensor detects objects, in the axes of `pose`; objects outside are neither detected
                 nor missed. None: it sees everything.
+            position_covariance: (M, 3, 3), of the errors of the centres; NaN for an object for which the noise of the
+                profile holds. None: it holds for all.
 
         Returns:
             The sequence number of the frame.
@@ -171,6 +174,7 @@ class Publisher:
                 score=_array(score),
                 has_points=has_points,
                 field_of_view=field_of_view,
+                position_covariance=None if position_covariance is None else _array(position_covariance, 3, 3),
             )
             payload = self._detections.pack(message)
             if cloud is not None:
@@ -227,11 +231,11 @@ def _labelled(label: Any, labels: Sequence[str] | None) -> tuple[tuple[str, ...]
     return tuple(index), np.array([index[name] for name in names], dtype=np.int64)
 
 
-def _array(values: Any, columns: int | None = None) -> Any:
-    """Return lists as they are (errors then name the element), all else as arrays; without rows: (0, columns)."""
+def _array(values: Any, *columns: int) -> Any:
+    """Return lists as they are (errors then name the element), all else as arrays; without rows: (0, *columns)."""
     array = values if isinstance(values, list | tuple) else np.asarray(values)
     empty = array.shape == (0,) if isinstance(array, np.ndarray) else not array
-    return np.zeros((0, columns)) if empty and columns is not None else array
+    return np.zeros((0, *columns)) if empty and columns else array
 
 
 def _finite(points: ArrayLike) -> Any:

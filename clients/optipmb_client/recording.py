@@ -83,6 +83,7 @@ def selected_frames(sequence: DataSequence, classes: Sequence[str]) -> Iterator[
             yaw=frame.yaw[rows],
             score=frame.score[rows],
             velocity=None if frame.velocity is None else frame.velocity[rows],
+            position_covariance=None if frame.position_covariance is None else frame.position_covariance[rows],
         )
 
 

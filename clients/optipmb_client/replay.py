@@ -245,6 +245,7 @@ class _Replay:
             points_pose=None if cloud is None else (cloud.translation, cloud.quaternion),
             has_points=cloud is not None,
             field_of_view=frame.field_of_view,
+            position_covariance=frame.position_covariance,
         )
         if self._newest == self.sent - 1:
             self._progress = time.monotonic()  # nothing was under way: patience begins now

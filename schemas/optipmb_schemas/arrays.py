@@ -175,9 +175,7 @@ class Array:
     def to_lists(self, array: NDArray[Any]) -> list[Any]:
         """Return the array as nested lists for JSON, an unknown number as None."""
         lists: list[Any] = array.tolist()
-        if self.unknown:  # two dimensions: rows of numbers
-            lists = [[None if number != number else number for number in row] for row in lists]  # noqa: PLR0124 - NaN
-        return lists
+        return _with_nulls(lists) if self.unknown else lists
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Tell pydantic to hand the value to `validate`."""
@@ -199,6 +197,13 @@ class Array:
         if self.wider:
             item["items"]["maxItems"] = MAX_COLUMNS
         return {**item, "x-dtype": self.dtype, "x-shape": list(self.shape)}
+
+
+def _with_nulls(value: Any) -> Any:
+    """Return nested lists with None in place of NaN."""
+    if isinstance(value, list):
+        return [_with_nulls(item) for item in value]
+    return None if value != value else value  # noqa: PLR0124 - NaN
 
 
 def unit_quaternion(array: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -26,6 +26,10 @@ QUARTER = 0.25 * FULL + 1e-6
 """Limits of angles; float32 rounds them up."""
 NARROWEST = 1e-3
 """Least width of a field of view, rad."""
+LEAST_VARIANCE = 1e-8
+"""Least variance of a position along any axis, m^2."""
+SYMMETRY = 1e-6
+"""Share of the largest variance by which opposite entries of a covariance may differ: those of float32 do."""
 
 
 class Pose(Message):
@@ -133,10 +137,21 @@ class Detections(SensorMessage):
         "Objects outside are neither detected nor missed. Absent: the sensor sees everything.",
     )
 
+    position_covariance: Annotated[NDArray[np.float64], Array("f8", ("M", 3, 3), -1e8, 1e8, unknown=True)] | None = (
+        Field(
+            default=None,
+            description="Covariance of the errors of each centre's x, y and z in m^2, along the axes of `frame`: "
+            "symmetric, the variance along every axis from 1e-8 to 1e8. A matrix of NaN (JSON: null) is an object for "
+            "which the profile's noise holds. Absent: it holds for all.",
+        )
+    )
+
     def check(self) -> None:
-        """Every label must be in the list."""
+        """Every label must be in the list, every covariance must be one."""
         super().check()
         _check_labels(self.label, self.labels)
+        if self.position_covariance is not None:
+            _check_covariances(self.position_covariance)
 
 
 class Points(SensorMessage):
@@ -322,3 +337,19 @@ def _check_labels(label: NDArray[np.int64], labels: tuple[str, ...]) -> None:
     if label.size and label.max() >= len(labels):
         at = int(label.argmax())
         raise MessageError("invalid_value", f"label[{at}]", f"an index into the {len(labels)} labels", show(label[at]))
+
+
+def _check_covariances(covariance: NDArray[np.float64]) -> None:
+    given: NDArray[np.bool_] = ~np.all(np.isnan(covariance), axis=(1, 2))
+    known = np.where(given[:, None, None], covariance, np.eye(3))
+    good: NDArray[np.bool_] = np.all(np.isfinite(known), axis=(1, 2))
+    known[~good] = 0.0
+    difference = np.abs(known - known.transpose(0, 2, 1)).max(axis=(1, 2))
+    known = 0.5 * (known + known.transpose(0, 2, 1))
+    variance = np.linalg.eigvalsh(known)
+    good &= (difference <= SYMMETRY * known.max(axis=(1, 2))) & (variance[:, 0] >= LEAST_VARIANCE)
+    good &= variance[:, 2] <= FAR
+    if not good.all():
+        at = int(np.argmin(good))
+        expected = "a symmetric covariance with variances from 1e-8 to 1e8 along every axis, or NaN alone"
+        raise invalid(f"position_covariance[{at}]", expected, covariance[at].tolist())

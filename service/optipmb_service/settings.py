@@ -144,6 +144,9 @@ class Ros2Stream(BaseModel):
         default="", description="topic of the tracks; default: `/tracks` below that of the detections"
     )
     classes: dict[str, str] = Field(default_factory=dict, description="class names by those in the messages")
+    covariance: bool = Field(
+        default=False, description="take the covariances of positions in the detections for their accuracy"
+    )
     fixed: bool = Field(default=False, description="the sensor does not move and has no tf: its frame is the world")
 
     @property

@@ -106,7 +106,8 @@ def test_detections_arrive_as_published(link: Connection) -> None:
     inbox = listen(link, "detections")
     with Publisher(STREAM, connection=link) as publisher:
         for stamp in (5, 6):
-            publisher.publish(stamp_ns=stamp, velocity=[[np.nan, np.nan]], pose=POSE, **ONE)
+            spread = [np.diag([0.5, 0.2, 1.0]).tolist()]
+            publisher.publish(stamp_ns=stamp, velocity=[[np.nan, np.nan]], position_covariance=spread, pose=POSE, **ONE)
         arrivals = [inbox.get(10.0), inbox.get(10.0)]
     first, second = (decode(a.payload, Detections, encoding=a.encoding) for a in arrivals if a)
     assert (first.seq, second.seq, first.stamp_ns, second.stamp_ns) == (0, 1, 5, 6)
@@ -119,6 +120,8 @@ def test_detections_arrive_as_published(link: Connection) -> None:
     assert (first.yaw.tolist(), first.score.tolist(), first.label.tolist()) == ([0.1], [0.9], [0])
     assert first.velocity is not None
     assert np.isnan(first.velocity).all()
+    assert first.position_covariance is not None
+    assert first.position_covariance.tolist() == spread
     assert first.has_points is None
 
 
@@ -285,7 +288,8 @@ def test_arrays_of_other_kinds_are_taken() -> None:
 
     sent: list[bytes] = []
     with offline_publisher(sent, "world") as publisher:
-        publisher.publish(stamp_ns=np.int64(3), label=[], center=[], size=[], yaw=[], score=[], velocity=[])
+        none: Any = {"velocity": [], "position_covariance": []}
+        publisher.publish(stamp_ns=np.int64(3), label=[], center=[], size=[], yaw=[], score=[], **none)
         publisher.publish(stamp_ns=4, label=["Car"], center=Tensor(), size=Tensor(), yaw=np.zeros(1, "f4"), score=[1])
     assert decode(sent[0], Detections).center.shape == (0, 3)
     assert decode(sent[1], Detections).center.tolist() == [[1.0, 1.0, 1.0]]

@@ -20,6 +20,8 @@ from router import Sensor
 from optipmb import load_profile
 
 SCENE = ("--dataset", "scene", "--option", "frames=25")
+SPREADS = np.array([[[0.5, 0.2, 0.0], [0.2, 0.3, 0.0], [0.0, 0.0, 1.0]], np.full((3, 3), np.nan)] * 4)
+"""Covariances of eight positions, every other unknown."""
 WITHOUT_CLOUDS = (*SCENE, "--option", "clouds=0")
 
 
@@ -104,7 +106,7 @@ def test_a_recording_of_a_publisher_of_the_world_frame(
 ) -> None:
     """Boxes in the world frame, recorded and tracked offline, give the bytes of a session: no heading is turned.
 
-    So do the predicted paths where the profile asks for them.
+    So do the predicted paths where the profile asks for them, and detections with covariances.
     """
     sensor, path, chance = Sensor("site/world/lidar"), tmp_path / "world.mcap", np.random.default_rng(7)
     parameters = load_profile("nuscenes").model_copy(update={"horizons": horizons})
@@ -118,6 +120,7 @@ def test_a_recording_of_a_publisher_of_the_world_frame(
                 center=np.c_[20 * np.arange(8) + 5 * np.cos(angle), 5 * np.sin(angle), np.ones(8)]
                 + chance.normal(0, 0.05, (8, 3)),
                 yaw=angle + np.pi / 2 + chance.normal(0, 0.02, 8),  # beyond pi too
+                position_covariance=SPREADS if seq % 2 else None,
                 has_points=False,
             )
             if posed:

@@ -80,6 +80,8 @@ def test_what_our_encoder_writes_needs_no_models(examples: dict[str, Message]) -
     example = examples["Detections"]
     many = {"label": np.zeros(700, int), "center": np.ones((700, 3)), "size": np.ones((700, 3)), "velocity": None}
     larger = dict(example.present()) | many | {"yaw": np.ones(700), "score": np.ones(700)}
+    spread = np.broadcast_to(np.eye(3), (3, 3, 3))
+    assert not check(encode(Detections(**(dict(example.present()) | {"position_covariance": spread}))))
     for changes in ({}, {"velocity": None}, {"has_points": None}, {"frame": "world", "pose": None}, {"frame": "world"}):
         message = example.model_copy(update=changes)
         assert check(encode(message))

@@ -77,6 +77,17 @@ def test_messages_survive(kind: type[Message], example_of: Any) -> None:
     assert encode(back) == encode(message) or kind is SessionParameters
 
 
+def test_covariances_survive(example_of: Any) -> None:
+    """Detections with covariances of their positions, unknown ones among them, come back byte-equal; others do not."""
+    spread = np.array([np.eye(3), np.full((3, 3), np.nan), np.diag([0.5, 2.0, 1.0])])
+    message = Detections(**(dict(example_of(Detections).present()) | {"position_covariance": spread}))
+    assert encode(convert.from_proto(proto_of(message), Detections)) == encode(message)
+    proto = proto_of(message)
+    proto.position_covariance.data = np.array([np.eye(3), np.eye(3), -np.eye(3)]).tobytes()
+    with pytest.raises(MessageError, match=r"position_covariance\[2\]"):
+        convert.from_proto(proto, Detections)
+
+
 @pytest.mark.parametrize("rows", [0, 1, 5000])
 def test_columns_of_any_length_survive(rows: int) -> None:
     """A frame without objects and the largest one are no exceptions."""

@@ -269,6 +269,37 @@ def test_an_object_of_autoware_is_read_whole() -> None:
     assert boxes_of(autoware(), {"truck": "Lorry"}).labels == ("Lorry",)
 
 
+def test_covariances_of_positions_are_read_where_asked_for() -> None:
+    """Those of a pose's x, y and z, if the message says that it has them; zeros are unknown."""
+    types, spread = own_types(), np.arange(36.0)
+    message = autoware()
+    kinematics = message.objects[0].kinematics
+    kinematics.pose_with_covariance.covariance[:] = spread
+    assert boxes_of(message, covariance=True).position_covariance is None
+    kinematics.has_position_covariance = True
+    assert boxes_of(message).position_covariance is None
+    found = boxes_of(message, covariance=True).position_covariance
+    assert found is not None
+    assert found.tolist() == [[[0, 1, 2], [6, 7, 8], [12, 13, 14]]]
+    pose = kinematics.pose_with_covariance
+    package = "vision_msgs/msg"
+    results = [
+        [types.new(f"{package}/ObjectHypothesisWithPose", pose=of,
+                   hypothesis=types.new(f"{package}/ObjectHypothesis", class_id="car", score=0.5))]
+        for of in (pose, types.new("geometry_msgs/msg/PoseWithCovariance", pose=pose.pose, covariance=np.zeros(36)))
+    ]  # fmt: skip
+    size = types.new("geometry_msgs/msg/Vector3", x=1.0, y=1.0, z=1.0)
+    box = types.new(f"{package}/BoundingBox3D", center=pose.pose, size=size)
+    detections = [
+        types.new(f"{package}/Detection3D", header=message.header, results=one, bbox=box, id="") for one in results
+    ]
+    array = types.new(f"{package}/Detection3DArray", header=message.header, detections=detections)
+    both = boxes_of(types.read(DETECTIONS[0], types.write(array)), covariance=True).position_covariance
+    assert both is not None
+    assert both[0].tolist() == found[0].tolist()
+    assert np.isnan(both[1]).all()
+
+
 def test_a_score_of_zero_refuses_no_message() -> None:
     """An object of score 0 is read, to be left out and counted as in every other message; one below 0 is refused."""
     types = own_types()

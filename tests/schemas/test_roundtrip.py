@@ -60,6 +60,15 @@ def whole(size: int, low: int, high: int) -> st.SearchStrategy[Any]:
 
 
 @st.composite
+def covariances(draw: st.DrawFn, m: int) -> Any:
+    """Return covariances of positions, some of them unknown."""
+    root = draw(rows((m, 3, 3), -1e3, 1e3))
+    covariance = root @ root.transpose(0, 2, 1) + np.eye(3)
+    covariance[draw(arrays(np.bool_, m))] = np.nan
+    return covariance
+
+
+@st.composite
 def poses(draw: st.DrawFn) -> Pose:
     """Return poses."""
     quaternion = draw(rows((4,), -1, 1).filter(lambda q: np.linalg.norm(q) > 0.1))
@@ -97,6 +106,7 @@ def detections(draw: st.DrawFn) -> Detections:
         score=draw(rows((m,), 0, 1, above=True)),
         velocity=velocity,
         has_points=draw(st.none() | st.booleans()),
+        position_covariance=draw(st.none() | covariances(m)),
     )
 
 

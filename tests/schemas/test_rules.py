@@ -24,6 +24,7 @@ from optipmb_schemas import (
 NAN = float("nan")
 INF = float("inf")
 HUGE = 10**30
+SPREAD = [[0.5, 0.1, 0], [0.1, 0.25, 0], [0, 0, 1]]
 
 # type, field, value, path of the error
 RULES: list[tuple[str, str, Any, str]] = [
@@ -72,6 +73,20 @@ RULES: list[tuple[str, str, Any, str]] = [
             ({"range": [-1, 5]}, "field_of_view.range[0]"),
         )
     ),
+    *(
+        ("Detections", "position_covariance", [SPREAD, SPREAD, wrong], path)
+        for wrong, path in (
+            ([[1, 0, 0], [0, 1, 0]], "position_covariance[2]"),
+            ([[1, 0.5, 0], [0.4, 1, 0], [0, 0, 1]], "position_covariance[2]"),
+            ([[1, 1, 0], [1, 1, 0], [0, 0, 1]], "position_covariance[2]"),
+            ([[1, 0, 0], [0, -1, 0], [0, 0, 1]], "position_covariance[2]"),
+            ([[1, 0, 0], [0, 1e-9, 0], [0, 0, 1]], "position_covariance[2]"),
+            ([[1, 0, 0], [0, 1.1e8, 0], [0, 0, 1]], "position_covariance[2][1][1]"),
+            ([[1, 0, 0], [None] * 3, [0, 0, 1]], "position_covariance[2]"),
+            ([[1, 0, 0], [0, 1, None], [0, 0, 1]], "position_covariance[2][1][2]"),
+        )
+    ),
+    ("Detections", "position_covariance", [SPREAD] * 2, "position_covariance"),
     ("Points", "pose", {"translation": [0, "x", 0], "quaternion": [1, 0, 0, 0]}, "pose.translation[1]"),
     # labels
     ("Detections", "labels", "car", "labels"),
@@ -220,6 +235,23 @@ def test_integers_where_numbers_are_wanted(examples: dict[str, Message]) -> None
     assert decode(json.dumps(fields).encode(), Detections).yaw.dtype == np.float64
     status = {**plain(examples["ServiceStatus"]), "uptime_s": 5}
     assert decode(json.dumps(status).encode(), type(examples["ServiceStatus"])).uptime_s == 5.0
+
+
+def test_covariances_of_some_objects_survive(detections: Detections) -> None:
+    """A matrix of NaN is an object without one, null in JSON; single precision is symmetric enough."""
+    spread = np.array([SPREAD, np.full((3, 3), NAN), np.eye(3)])
+    message = Detections(**(dict(detections.present()) | {"position_covariance": spread}))
+    for payload in (encode(message), encode_json(message)):
+        assert decode(payload, Detections) == message
+        assert decode(payload, Detections).position_covariance is not None
+    assert json.loads(encode_json(message))["position_covariance"][1] == [[None] * 3] * 3
+    columns = {name: value[:0] for name, value in message.present() if name in message.arrays}
+    none = Detections(**(dict(message.present()) | columns))
+    for payload in (encode(none), encode_json(none)):
+        assert decode(payload, Detections) == none
+    root = np.random.default_rng(0).normal(0, 1, (3, 3, 3))
+    single = (root @ root.transpose(0, 2, 1) + 0.01 * np.eye(3)).astype("f4")
+    Detections(**(dict(detections.present()) | {"position_covariance": single}))
 
 
 def test_paths_of_no_tracks_are_a_message(examples: dict[str, Message]) -> None:

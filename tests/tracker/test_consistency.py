@@ -25,7 +25,7 @@ def nees(label: str, missed: float, linearisations: int, seed: int = 0) -> float
     rng = np.random.default_rng(seed)
     drift = table.process_noise[c]
     spread = [table.noise_position[c]] * 2 + [table.noise_velocity[c]] * 2 + [table.noise_heading[c]]
-    sigma = np.array(spread)
+    sigma = np.array([*spread, 0.0])
     motion: Any = table.acceleration_time[c], table.constant_velocity[c], np.empty((6, 6)), np.empty((12, 6))
     found = []
     for _ in range(DRIVES):
@@ -40,7 +40,7 @@ def nees(label: str, missed: float, linearisations: int, seed: int = 0) -> float
             predict_state(mean, covariance, dt, drift, *motion, m, p)
             mean, covariance = m, p
             if rng.random() >= missed:
-                z = textbook.measure(x, with_velocity=True) + sigma * rng.normal(size=5)
+                z = textbook.measure(x, with_velocity=True) + sigma[:5] * rng.normal(size=5)
                 m, p = np.empty(6), np.empty((6, 6))
                 if linearisations:
                     linearised_update(mean, covariance, z, sigma, linearisations, workspace(), m, p)

@@ -46,7 +46,7 @@ def updated(mean: Array, covariance: Array, z: textbook.Measurement, c: SimpleNa
     """One update by the kernel."""
     velocity = z.velocity if z.velocity is not None else [np.nan, np.nan]
     r = c.measurement_noise
-    sigma = np.array([r.position, r.position, r.velocity, r.velocity, r.heading])
+    sigma = np.array([r.position, r.position, r.velocity, r.velocity, r.heading, 0.0])
     vector = np.array([*z.xy, *velocity, z.yaw])
     out, spread = np.full(6, np.nan), np.full((6, 6), np.nan)
     buffers = workspace()
@@ -113,7 +113,7 @@ def test_the_linearised_update_is_the_textbook_one(seed: int, iterations: int) -
     z, c = measurement(rng, mean, velocity=True), noise(rng)
     c.linearisations = iterations
     r = c.measurement_noise
-    sigma = np.array([r.position, r.position, r.velocity, r.velocity, r.heading])
+    sigma = np.array([r.position, r.position, r.velocity, r.velocity, r.heading, 0.0])
     out, spread = np.full(6, np.nan), np.full((6, 6), np.nan)
     vector = np.array([*z.xy, *np.asarray(z.velocity), z.yaw])
     linearised_update(mean, covariance, vector, sigma, iterations, workspace(), out, spread)

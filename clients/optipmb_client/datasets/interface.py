@@ -69,6 +69,8 @@ class DetectionFrame:
     cloud: Cloud | None = None
     field_of_view: FieldOfView | None = None
     """Where the sensor detects objects, in the axes of `pose`; None: everywhere."""
+    position_covariance: Floats | None = None
+    """(M, 3, 3) along the axes of the sensor, NaN where unknown; None where the detector gives none."""
 
     def __len__(self) -> int:
         return len(self.label)

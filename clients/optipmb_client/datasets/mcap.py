@@ -68,7 +68,7 @@ class RecordedSequence:
         """Yield every frame in order."""
         for index, (message, cloud) in enumerate(self._messages(clouds=True)):
             row_of = np.array([self.labels.index(name) for name in message.labels], dtype=np.int64)
-            pose, center, yaw, velocity = _placed(message)
+            pose, center, yaw, velocity, covariance = _placed(message)
             yield DetectionFrame(
                 index=index,
                 stamp_ns=message.stamp_ns,
@@ -82,6 +82,7 @@ class RecordedSequence:
                 velocity=velocity,
                 cloud=None if cloud is None else _cloud(cloud),
                 field_of_view=message.field_of_view,
+                position_covariance=covariance,
             )
 
     def truth(self) -> Truth | None:
@@ -169,15 +170,19 @@ def _pose(message: Detections | Points) -> Pose:
     return Pose(message.pose.translation, message.pose.quaternion)
 
 
-def _placed(message: Detections) -> tuple[Pose, Floats, Floats, Floats | None]:
-    """Return pose, centres, yaws and velocities; those of the world are carried to a sensor with a field of view."""
-    center, yaw, velocity = message.center, message.yaw, message.velocity
+def _placed(message: Detections) -> tuple[Pose, Floats, Floats, Floats | None, Floats | None]:
+    """Return pose, centres, yaws, velocities and covariances of the centres.
+
+    Those of the world are carried to a sensor with a field of view.
+    """
+    center, yaw, velocity, covariance = message.center, message.yaw, message.velocity, message.position_covariance
     if message.frame == "sensor" or message.pose is None or message.field_of_view is None:
-        return _pose(message), center, yaw, velocity
+        return _pose(message), center, yaw, velocity, covariance
     pose = Pose(message.pose.translation, message.pose.quaternion)
     rotation = rotation_of(pose.quaternion)
     center, yaw = to_sensor(rotation, pose.translation, center, yaw)
-    return pose, center, yaw, None if velocity is None else velocity @ rotation[:2, :2]
+    velocity = None if velocity is None else velocity @ rotation[:2, :2]
+    return pose, center, yaw, velocity, None if covariance is None else rotation.T @ covariance @ rotation
 
 
 def _cloud(recorded: Recorded) -> Cloud:

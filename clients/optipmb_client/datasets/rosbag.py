@@ -31,11 +31,12 @@ _CLASS = "class."
 class RosbagSequence:
     """One topic of detections."""
 
-    def __init__(self, bag: Bag, plan_: Plan, classes: Mapping[str, str]) -> None:
+    def __init__(self, bag: Bag, plan_: Plan, classes: Mapping[str, str], *, covariance: bool) -> None:
         self.name = plan_.topic.strip("/").replace("/", ".")
         self.plan = plan_
         self.bag = bag
         self._classes = classes
+        self._covariance = covariance
 
     def __len__(self) -> int:
         return len(self.plan.frames)
@@ -107,12 +108,13 @@ class RosbagSequence:
             yaw=boxes.yaw,
             score=boxes.score,
             velocity=boxes.velocity,
+            position_covariance=boxes.position_covariance,
             cloud=None if cloud is None or pose is None else Cloud(partial(self._points, cloud), *pose),
         )
 
     def _boxes(self, raw: Raw) -> Boxes:
         try:
-            return boxes_of(self.bag.read(raw), self._classes)
+            return boxes_of(self.bag.read(raw), self._classes, covariance=self._covariance)
         except MessageError as error:
             raise self.bag.wrong(raw, error) from error
 
@@ -128,7 +130,8 @@ class RosbagDataset:
 
     Args:
         path: the folder or file.
-        options: `points`, `odometry`, `fixed_frame`, `class.NAME`, and `keep_input`.
+        options: `points`, `odometry`, `fixed_frame`, `class.NAME`, `keep_input`, and `covariance`: whether the
+            covariances of positions in the detections are taken for their accuracy.
 
     Raises:
         DatasetError: it cannot be read, has no detections, or an option is not known.
@@ -141,10 +144,11 @@ class RosbagDataset:
         texts = {name: str(value) for name, value in options.items()}
         self._classes = {name.removeprefix(_CLASS): texts.pop(name) for name in list(texts) if name.startswith(_CLASS)}
         self._keep_input = texts.pop("keep_input", "0") not in {"0", "False"}
+        self._covariance = texts.pop("covariance", "0") not in {"0", "False"}
         known = set(Choice.__dataclass_fields__)
         for name in texts:
             if name not in known:
-                allowed = f"one of {', '.join(sorted(known))}, keep_input, class.NAME"
+                allowed = f"one of {', '.join(sorted(known))}, keep_input, covariance, class.NAME"
                 raise DatasetError(f"option {name}", allowed, "an unknown option")
         self._bag = Bag(path)
         self._choice = Choice(**texts)
@@ -167,7 +171,7 @@ class RosbagDataset:
             transforms = read_transforms(self._bag, self._choice)
             for name in new:
                 made = plan(self._bag, self._topics[name], transforms, self._choice)
-                self._sequences[name] = RosbagSequence(self._bag, made, self._classes)
+                self._sequences[name] = RosbagSequence(self._bag, made, self._classes, covariance=self._covariance)
         return [self._sequences[name] for name in wanted]
 
     def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:

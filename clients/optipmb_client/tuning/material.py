@@ -101,6 +101,7 @@ def prepare_frames(name: str, given: Sequence[DetectionFrame], parameters: Param
                 pose=Pose(frame.pose.translation, frame.pose.quaternion),
                 cloud=None if cloud is None else PointCloud(cloud.xyz, Pose(cloud.translation, cloud.quaternion)),
                 field_of_view=FieldOfView.of(frame.field_of_view, None),
+                position_covariance=frame.position_covariance,
             )
         except OptipmbError as error:
             raise UsageError(f"sequence {name}, frame {frame.index}: {error}") from error
@@ -114,14 +115,14 @@ def of_class(clip: Clip, name: str, rules: Rules) -> Clip:
     frames = []
     for frame in clip.frames:
         chosen = np.flatnonzero(frame.label == index)
-        columns = {key: getattr(frame, key)[chosen] for key in _COLUMNS}
+        columns = {key: column[chosen] for key in _COLUMNS if (column := getattr(frame, key)) is not None}
         frames.append(replace(frame, label=np.zeros(len(chosen), dtype=np.int64), labels=(name,), **columns))
     alike = (name, *rules.neighbours.get(name, ()))
     rows = np.isin(clip.truth.names, alike)
     return replace(clip, labels=(name,), frames=tuple(frames), truth=clip.truth.take(rows), world=clip.world.take(rows))
 
 
-_COLUMNS = ("center", "size", "yaw", "velocity", "score", "source")
+_COLUMNS = ("center", "size", "yaw", "velocity", "score", "source", "position_covariance")
 
 
 def track_clip(

@@ -72,7 +72,7 @@ class FieldOfView(_message.Message):
     def __init__(self, azimuth: _Optional[_Iterable[float]] = ..., elevation: _Optional[_Iterable[float]] = ..., range: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Detections(_message.Message):
-    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "labels", "label", "center", "size", "yaw", "score", "velocity", "has_points", "field_of_view")
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "labels", "label", "center", "size", "yaw", "score", "velocity", "has_points", "field_of_view", "position_covariance")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -88,6 +88,7 @@ class Detections(_message.Message):
     VELOCITY_FIELD_NUMBER: _ClassVar[int]
     HAS_POINTS_FIELD_NUMBER: _ClassVar[int]
     FIELD_OF_VIEW_FIELD_NUMBER: _ClassVar[int]
+    POSITION_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     stream: str
     epoch: bytes
     seq: int
@@ -103,7 +104,8 @@ class Detections(_message.Message):
     velocity: Array
     has_points: bool
     field_of_view: FieldOfView
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame: _Optional[_Union[Frame, str]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., labels: _Optional[_Iterable[str]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., has_points: _Optional[bool] = ..., field_of_view: _Optional[_Union[FieldOfView, _Mapping]] = ...) -> None: ...
+    position_covariance: Array
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame: _Optional[_Union[Frame, str]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., labels: _Optional[_Iterable[str]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., has_points: _Optional[bool] = ..., field_of_view: _Optional[_Union[FieldOfView, _Mapping]] = ..., position_covariance: _Optional[_Union[Array, _Mapping]] = ...) -> None: ...
 
 class Points(_message.Message):
     __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "xyz")

@@ -28,6 +28,8 @@ _BOX, _CYLINDER, _POLYGON = 0, 1, 2
 _NORM: Final = 1e-2
 """How far the norm of a quaternion may be from one: some detectors write 32-bit numbers."""
 _SECOND: Final = 10**9
+_UNKNOWN: Final = (0.0,) * 36
+"""The covariance of a pose that nobody knows, row by row."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class Boxes:
     """(M,) in [0, 1]; an object of score 0 is left out and counted by the service."""
     velocity: NDArray[np.float64] | None
     """(M, 2) over ground along x and y of the frame, m/s; rows of NaN, or None for all, where unknown."""
+    position_covariance: NDArray[np.float64] | None = None
+    """(M, 3, 3) m^2; matrices of NaN, or None for all, where it is unknown or was not asked for."""
 
 
 def stamp_of(header: Any) -> int:
@@ -66,7 +70,7 @@ def frame_of(header: Any) -> str:
     return str(header.frame_id).removeprefix("/")
 
 
-def boxes_of(message: Any, classes: Mapping[str, str] | None = None) -> Boxes:
+def boxes_of(message: Any, classes: Mapping[str, str] | None = None, *, covariance: bool = False) -> Boxes:
     """Return the objects of a message of one of the types `DETECTIONS`.
 
     Of several classes of an object the likeliest counts. The score is `hypothesis.score`, or, in Autoware's messages,
@@ -75,6 +79,8 @@ def boxes_of(message: Any, classes: Mapping[str, str] | None = None) -> Boxes:
     Args:
         message: the message.
         classes: names of classes by those in the message; others stay as they are.
+        covariance: whether the covariances of positions are read. One of zeros is unknown, and so is one that a message
+            of Autoware says it does not have.
 
     Raises:
         MessageError: a value is not allowed; the path names it.
@@ -85,6 +91,8 @@ def boxes_of(message: Any, classes: Mapping[str, str] | None = None) -> Boxes:
     names = [(classes or {}).get(row.label, row.label) for row in rows]
     labels = tuple(dict.fromkeys(names))
     velocity = np.array([row.velocity for row in rows], dtype=np.float64).reshape(-1, 2)
+    spread = np.array([row.covariance for row in rows], dtype=np.float64).reshape(-1, 6, 6)[:, :3, :3].copy()
+    spread[~spread.any(axis=(1, 2))] = np.nan
     return Boxes(
         labels=labels,
         label=np.array([labels.index(name) for name in names], dtype=np.int64),
@@ -93,6 +101,7 @@ def boxes_of(message: Any, classes: Mapping[str, str] | None = None) -> Boxes:
         yaw=np.array([row.yaw for row in rows], dtype=np.float64),
         score=np.array([row.score for row in rows], dtype=np.float64),
         velocity=None if np.isnan(velocity).all() else velocity,
+        position_covariance=spread if covariance and not np.isnan(spread).all() else None,
     )
 
 
@@ -135,6 +144,7 @@ class _Row:
     size: Sequence[float]
     yaw: float
     score: float
+    covariance: Sequence[float]
     velocity: Sequence[float] = (math.nan, math.nan)
 
 
@@ -142,9 +152,8 @@ def _of_vision(number: int, detection: Any) -> _Row:
     path = f"detections[{number}]"
     if not detection.results:
         raise invalid(f"{path}.results", "at least one hypothesis", "none")
-    # Versions before 4 of vision_msgs hold class and score without a hypothesis around them.
-    hypotheses = [getattr(one, "hypothesis", one) for one in detection.results]
-    best = max(hypotheses, key=lambda one: float(one.score))
+    result: Any = max(detection.results, key=lambda one: float(_hypothesis(one).score))
+    best = _hypothesis(result)
     box = detection.bbox
     return _Row(
         label=str(best.class_id if hasattr(best, "class_id") else best.id),
@@ -152,7 +161,13 @@ def _of_vision(number: int, detection: Any) -> _Row:
         size=_size(f"{path}.bbox.size", box.size),
         yaw=_yaw(f"{path}.bbox.center.orientation", box.center.orientation),
         score=_score(f"{path}.results.hypothesis.score", float(best.score)),
+        covariance=_covariance(f"{path}.results.pose.covariance", result.pose.covariance),
     )
+
+
+def _hypothesis(result: Any) -> Any:
+    """Return what has class and score: versions before 4 of vision_msgs have no hypothesis around them."""
+    return getattr(result, "hypothesis", result)
 
 
 def _of_autoware(number: int, detected: Any) -> _Row:
@@ -177,6 +192,9 @@ def _of_autoware(number: int, detected: Any) -> _Row:
         size=size,
         yaw=yaw,
         score=_score(f"{path}.existence_probability", score),
+        covariance=_covariance(f"{where}.covariance", kinematics.pose_with_covariance.covariance)
+        if kinematics.has_position_covariance
+        else _UNKNOWN,
         velocity=velocity,
     )
 
@@ -219,6 +237,13 @@ def _size(path: str, value: Any) -> list[float]:
         if number <= 0:
             raise invalid(f"{path}.{axis}", "a positive length", number)
     return size
+
+
+def _covariance(path: str, value: Any) -> Sequence[float]:
+    if len(value) != len(_UNKNOWN):
+        raise invalid(path, f"{len(_UNKNOWN)} numbers", len(value))
+    covariance: list[float] = np.asarray(value, np.float64).tolist()
+    return covariance
 
 
 def _score(path: str, value: float) -> float:

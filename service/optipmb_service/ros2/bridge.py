@@ -273,7 +273,7 @@ class Bridge:
         }
         if waiting.kind == "points":
             return schemas.Points(**header, xyz=arrays.points_of(waiting.message))
-        boxes = arrays.boxes_of(waiting.message, stream.topics.classes)
+        boxes = arrays.boxes_of(waiting.message, stream.topics.classes, covariance=stream.topics.covariance)
         return schemas.Detections(
             **header,
             labels=boxes.labels,
@@ -283,6 +283,7 @@ class Bridge:
             yaw=boxes.yaw,
             score=boxes.score,
             velocity=boxes.velocity,
+            position_covariance=boxes.position_covariance,
             has_points=self._has_points(stream),
         )
 

@@ -74,6 +74,7 @@ def frame_of(parameters: optipmb.Parameters, message: schemas.Detections) -> tup
         velocity=message.velocity,
         pose=pose_of(message),
         field_of_view=view_of(message),
+        position_covariance=message.position_covariance,
     )
 
 

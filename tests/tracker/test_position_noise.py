@@ -1,0 +1,270 @@
+"""Detections with a covariance of their own, and noise that grows with the distance, against numpy's formulas."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import optipmb
+from optipmb.birth import birth_states
+from optipmb.gating import gate
+from optipmb.table import ClassTable
+from optipmb.update import ukf_updates
+
+CARS, FRAMES, DT_NS = 6, 12, 100_000_000
+HALF = np.pi / 6
+
+
+def parameters_of(profile: str, growth: float = 0.0) -> optipmb.Parameters:
+    """The profile with the growth in every class."""
+    document = optipmb.load_profile(profile).model_dump()
+    for table in document["classes"].values():
+        table["measurement_noise"]["position_growth"] = growth
+    return optipmb.parse_parameters(document)
+
+
+def drive(parameters: optipmb.Parameters, **given: Any) -> list[optipmb.StepResult]:
+    """Cars that drive apart, seen with noise, faintly at first, and with velocities now and then."""
+    rng, tracker = np.random.default_rng(3), optipmb.Tracker(parameters)
+    density, results = tracker.initial(), []
+    label = np.arange(CARS) % len(parameters.labels)
+    yaw = np.linspace(0, 5, CARS)
+    ahead = np.column_stack((np.cos(yaw), np.sin(yaw), np.zeros(CARS)))
+    for k in range(FRAMES):
+        frame, _ = optipmb.make_frame(
+            parameters,
+            stamp_ns=k * DT_NS,
+            labels=parameters.labels,
+            label=label,
+            center=(20.0 + 0.8 * k) * ahead + rng.normal(0, 0.1, (CARS, 3)),
+            size=np.full((CARS, 3), [4.0, 1.8, 1.5]),
+            yaw=yaw + rng.normal(0, 0.05, CARS),
+            score=np.where(np.arange(CARS) < 2 + k, 0.9, 0.35),
+            velocity=8.0 * ahead[:, :2] if k % 3 else None,
+            **{name: value(label) for name, value in given.items()},
+        )
+        results.append(tracker.step(density, frame))
+        density = results[-1].density
+    assert len(results[-1].tracks) >= CARS - 1
+    return results
+
+
+def bytes_of(results: list[optipmb.StepResult]) -> list[bytes]:
+    """Everything that the steps gave."""
+    return [
+        column.tobytes()
+        for one in results
+        for column in (
+            *optipmb.columns_of(one.density).values(),
+            *(getattr(one.tracks, f.name) for f in fields(one.tracks)),
+        )
+    ]
+
+
+@pytest.mark.parametrize("profile", ["kitti", "kitti-paper", "nuscenes", "nuscenes-paper", "generic"])
+def test_the_covariance_of_the_profile_changes_no_byte(profile: str) -> None:
+    """Detections whose covariance is R of their class, or unknown, give the density and tracks of those without."""
+    parameters = parameters_of(profile)
+    sigma = np.array([one.measurement_noise.position for one in parameters.classes.values()])
+
+    def same(label: Any) -> Any:
+        given = sigma[label][:, None, None] ** 2 * np.eye(3)
+        given[1::2] = np.nan
+        return given
+
+    expected = bytes_of(drive(parameters))
+    assert bytes_of(drive(parameters, position_covariance=same)) == expected
+    far = bytes_of(
+        drive(parameters, position_covariance=lambda label: np.full((len(label), 3, 3), 0.3) + 2 * np.eye(3))
+    )
+    assert far != expected
+
+
+def test_noise_that_grows_is_that_covariance() -> None:
+    """R is (sigma^2 + g^2 d^2) I, d from the sensor; a covariance of the detection takes its place."""
+    parameters, growing = parameters_of("kitti"), parameters_of("kitti", growth=0.02)
+    assert "position_growth" not in optipmb.load_profile("kitti").model_dump()["classes"]["Car"]["measurement_noise"]
+    sensor = np.array([30.0, -10.0, 1.5])
+    pose = optipmb.Pose(sensor, np.array([np.cos(HALF / 2), 0.0, 0.0, np.sin(HALF / 2)]))
+    found, tables = [], [ClassTable.of(one) for one in (parameters, growing)]
+    center = np.array([[40.0, 3.0, 0.0], [5.0, -60.0, 0.0]])
+    sigma = parameters.classes["Car"].measurement_noise.position
+    for k, one in enumerate((parameters, growing)):
+        own = (sigma**2 + 0.02**2 * (center[:, :2] ** 2).sum(axis=1))[:, None, None] * np.eye(3)
+        boxes: Any = {"center": center, "size": np.ones((2, 3)), "yaw": [0.0, 1.0], "score": [0.9, 0.8]}
+        frame, _ = optipmb.make_frame(
+            one, stamp_ns=0, labels=("Car",), label=[0, 0], pose=pose, position_covariance=None if k else own, **boxes
+        )
+        found.append(optipmb.tracker.preprocess(frame, tables[k])[0].position)
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-12, atol=1e-12)
+    assert found[1][0, 2] > 1.5
+
+
+def pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A state, its covariance, and a covariance of a position that is far from a circle."""
+    root = rng.normal(0, 0.3, (6, 6))
+    mean = np.array([3.0, -2.0, 7.0, 0.4, 0.1, 0.5]) + rng.normal(0, 0.1, 6)
+    turned = np.array([[np.cos(HALF), -np.sin(HALF)], [np.sin(HALF), np.cos(HALF)]])
+    return mean, root @ root.T + 0.05 * np.eye(6), turned @ np.diag([2.0, 0.1]) @ turned.T
+
+
+def updated(mean: Any, covariance: Any, z: Any, spread: Any, velocity: Any, iterations: int) -> tuple[Any, Any]:
+    """The kernel's update with a detection of covariance `spread`, under sigma = 0.5."""
+    position = np.array([[z[0], z[1], *(spread[[0, 0, 1], [0, 1, 1]] / 0.25)]])
+    out, out_spread = np.empty((1, 6)), np.empty((1, 6, 6))
+    zero = np.zeros(1, np.int64)
+    noise = np.array([0.5]), np.array([0.7]), np.array([0.2]), np.array([iterations])
+    measured = position, np.array([velocity]), np.array([z[2]]), zero
+    assert ukf_updates(zero, zero, mean[None], covariance[None], *measured, *noise, out, out_spread) == 0
+    return out[0], out_spread[0]
+
+
+def test_the_update_is_the_kalman_filter_with_that_covariance() -> None:
+    """Without a velocity H is linear: numpy's K = P H' (H P H' + R)^-1 with the full R gives the same posterior."""
+    rng, h = np.random.default_rng(0), np.eye(6)[[0, 1, 3]]
+    for _ in range(20):
+        mean, covariance, spread = pair(rng)
+        z = h @ mean + rng.normal(0, 0.5, 3)
+        noise = np.zeros((3, 3))
+        noise[:2, :2], noise[2, 2] = spread, 0.2**2
+        gain = covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + noise)
+        found, found_spread = updated(mean, covariance, z, spread, [np.nan, np.nan], 0)
+        np.testing.assert_allclose(found, mean + gain @ (z - h @ mean), rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(found_spread, covariance - gain @ h @ covariance, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("iterations", [0, 3])
+def test_turning_the_world_turns_the_update(iterations: int) -> None:
+    """With a velocity too: the full covariance does what the diagonal one does in its own axes."""
+    rng = np.random.default_rng(1)
+    cos, sin = np.cos(HALF), np.sin(HALF)
+    back = np.array([[cos, sin], [-sin, cos]])
+    whole = np.eye(6)
+    whole[:2, :2] = back
+    for _ in range(20):
+        mean, covariance, spread = pair(rng)
+        z = np.array([*(mean[:2] + rng.normal(0, 0.5, 2)), mean[3] + 0.1])
+        velocity = np.array([6.5, 3.0])
+        one, one_spread = updated(mean, covariance, z, spread, velocity, iterations)
+        turned = whole @ mean
+        turned[3] -= HALF
+        z_turned = np.array([*(back @ z[:2]), z[2] - HALF])
+        other, other_spread = updated(
+            turned, whole @ covariance @ whole.T, z_turned, back @ spread @ back.T, back @ velocity, iterations
+        )
+        expected = whole @ one
+        expected[3] -= HALF
+        np.testing.assert_allclose(other, expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(other_spread, whole @ one_spread @ whole.T, rtol=1e-8, atol=1e-9)
+
+
+def test_a_less_certain_detection_moves_a_track_less() -> None:
+    """The larger the covariance, the nearer the posterior is to the prediction, and the more it leaves unknown."""
+    mean, covariance, spread = pair(np.random.default_rng(2))
+    z = np.array([mean[0] + 1.0, mean[1] - 1.0, mean[3]])
+    moved, left = [], []
+    for scale in (0.01, 0.1, 1.0, 10.0, 1000.0):
+        found, found_spread = updated(mean, covariance, z, scale * spread, [np.nan, np.nan], 0)
+        moved.append(float(np.hypot(*(found - mean)[:2])))
+        left.append(float(np.trace(found_spread[:2, :2])))
+    assert moved == sorted(moved, reverse=True)
+    assert left == sorted(left)
+    assert moved[0] > 1.0
+    assert moved[-1] < 0.05
+
+
+def test_the_likelihood_of_a_pair_has_the_covariance_of_its_detection() -> None:
+    """It is ln N(z; z_hat, P_xy + Sigma), another for each detection of an object."""
+    rng = np.random.default_rng(4)
+    mean, covariance, spread = pair(rng)
+    position = mean[:2] + rng.normal(0, 1.0, (5, 2))
+    spreads = spread * np.linspace(0.5, 4.0, 5)[:, None, None]
+    columns = np.column_stack((position, spreads[:, [0, 0, 1], [0, 1, 1]] / 0.25))
+    zeros = np.zeros(5, np.int64)
+    _, measurement, found = gate(
+        mean[None], covariance[None], zeros[:1], np.array([50.0]), columns, zeros, np.array([0.5])
+    )
+    assert measurement.tolist() == list(range(5))
+    for m in range(5):
+        total, away = covariance[:2, :2] + spreads[m], position[m] - mean[:2]
+        squared = away @ np.linalg.solve(total, away)
+        expected = -np.log(2 * np.pi) - 0.5 * np.log(np.linalg.det(total)) - 0.5 * squared
+        assert found[m] == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_birth_is_as_uncertain_as_its_detection() -> None:
+    """P^0 of x and y is that of the class times the covariance in units of R; the rest stays."""
+    _, _, spread = pair(np.random.default_rng(5))
+    position = np.array([[1.0, 2.0, *(spread[[0, 0, 1], [0, 1, 1]] / 0.25)]])
+    known = np.array([[0.9, 0.9, 3.0, 0.3, 0.2, 1.0]])
+    mean, covariance = np.empty((1, 6)), np.empty((1, 6, 6))
+    zero = np.zeros(1, np.int64)
+    velocity, limits = np.full((1, 2), np.nan), (np.zeros(1), known, known)
+    birth_states(zero, position, np.zeros(1), velocity, zero, *limits, mean, covariance)
+    expected = np.diag(known[0] ** 2)
+    expected[:2, :2] = 0.9**2 * spread / 0.25
+    np.testing.assert_allclose(covariance[0], expected, rtol=1e-12)
+
+
+def test_a_covariance_of_the_sensor_is_turned_to_the_world() -> None:
+    """Along the axes of a tilted sensor: Sigma_world = T Sigma T', of which x and y count."""
+    tilted = np.array([0.8, 0.1, -0.3, 0.5])
+    pose = optipmb.Pose(np.array([5.0, 6.0, 7.0]), tilted / np.linalg.norm(tilted))
+    root = np.random.default_rng(6).normal(0, 1, (2, 3, 3))
+    given = root @ root.transpose(0, 2, 1) + 0.01 * np.eye(3)
+    boxes: Any = {"center": np.ones((2, 3)), "size": np.ones((2, 3)), "yaw": [0, 1], "score": [0.0, 0.5]}
+    frame, left_out = optipmb.make_frame(
+        parameters_of("kitti"), stamp_ns=0, labels=("Car",), label=[0, 0], pose=pose, position_covariance=given, **boxes
+    )
+    assert left_out == 1
+    world = pose.rotation @ given[1] @ pose.rotation.T
+    assert frame.position_covariance is not None
+    np.testing.assert_allclose(frame.position_covariance, [[world[0, 0], world[0, 1], world[1, 1]]], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        -np.eye(3),
+        np.zeros((3, 3)),
+        np.full((3, 3), 1.0),
+        np.diag([1.0, 1.0, 1e9]),
+        np.diag([1.0, 1e-9, 1.0]),
+        np.array([[1.0, 0.5, 0.0], [0.4, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        np.array([[1.0, np.nan, 0.0], [np.nan, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        np.diag([np.inf, 1.0, 1.0]),
+    ],
+)
+def test_what_is_no_covariance_is_refused_by_its_object(wrong: np.ndarray) -> None:
+    """Not positive definite, not symmetric, not finite, or too large or small: the error names the object."""
+    tracker = optipmb.OnlineTracker("kitti")
+    boxes: Any = {
+        "center": np.ones((2, 3)),
+        "size": np.ones((2, 3)),
+        "yaw": [0, 1],
+        "score": [0.9, 0.5],
+        "label": [0, 0],
+    }
+    with pytest.raises(optipmb.FrameError) as caught:
+        tracker.update(boxes, t=0.0, position_covariance=np.stack([np.eye(3), wrong]))
+    assert caught.value.path == "position_covariance[1]"
+    assert "symmetric covariance" in caught.value.expected
+    with pytest.raises(optipmb.FrameError, match="position_covariance"):
+        tracker.update(boxes, t=0.0, position_covariance=np.eye(3))
+    frame, _ = optipmb.make_frame(
+        tracker.parameters,
+        stamp_ns=0,
+        labels=("Car",),
+        position_covariance=[np.eye(3), np.full((3, 3), np.nan)],
+        **boxes,
+    )
+    for row in ([-1.0, 0.0, 1.0], [1.0, 1.1, 1.0], [1.0, np.nan, 1.0], [np.inf, 0.0, 1.0]):
+        with pytest.raises(optipmb.FrameError, match=r"position_covariance\[1\]"):
+            replace(frame, position_covariance=[[1.0, 0.0, 1.0], row])
+    assert replace(frame, cloud=None).position_covariance is not None
+    assert tracker.density.stamp_ns < 0
+    tracker.update(boxes, t=0.0, position_covariance=np.full((2, 3, 3), np.nan))
+    assert tracker.density.stamp_ns == 0
