@@ -1,7 +1,8 @@
 """Runs the tests nearest to what changed: `python tests/nearest.py COMMIT`, which may be a branch.
 
 A test file is near when it imports a module that changed; when no test does, those that import a module that imports
-one, and so on. Tests that changed run too. Files are compared with where the branch left COMMIT; files that are not
+one, and so on. Of many that are equally near, the namesakes run: a package that imports all its parts brings them all
+near. Tests that changed run too. Files are compared with where the branch left COMMIT; files that are not
 committed count. (Tools that watch which lines a test runs cannot see into compiled kernels.)
 """
 
@@ -17,6 +18,8 @@ SOURCES = (".", "schemas", "service", "clients", "tests/support", "benchmarks", 
 """Folders that imports are looked up in."""
 SLOW = ("e2e", "docker")
 """Tests of whole systems run only when they changed themselves."""
+MANY = 8
+"""Beyond so many files a check would take more than a minute."""
 
 
 def main(since: str) -> int:
@@ -78,11 +81,17 @@ def _nearest(changed: set[Path], imports: dict[Path, set[Path]], tests: set[Path
     while reached:
         importers = {path for path, found in imports.items() if found & reached} - reached
         if near := importers & tests:
-            return near
+            return (len(near) > MANY and _namesakes(near, changed)) or near
         if not importers:
             break
         reached |= importers
     return set()
+
+
+def _namesakes(tests: set[Path], changed: set[Path]) -> set[Path]:
+    """Return the tests with a word in their name that a changed module has in its own, or in that of its folder."""
+    words = {word for path in changed for part in (path.parent.name, path.stem) for word in part.split("_")} - {""}
+    return {path for path in tests if words & set(path.stem.split("_"))}
 
 
 if __name__ == "__main__":
