@@ -87,6 +87,28 @@ def test_tracks_of_a_bag_are_those_of_the_data(
         )
 
 
+def test_covariances_in_a_bag_count_where_asked_for(tmp_path: Path) -> None:
+    """With the option a doubtful detection leaves its track doubtful; without it the covariance changes nothing."""
+    (sequence,) = open_dataset("scene", frames=12, vehicles=4, pedestrians=0, cyclists=0).sequences(["0000"])
+    plain = [*bags.messages(sequence)]
+    path = bags.write_mcap(tmp_path / "plain.mcap", plain)
+    for one in plain:
+        for box in one.message["detections"] if one.topic == "/detector/boxes" else ():
+            box["results"][0]["pose"]["covariance"] = np.diag([9.0, 9.0, 1.0, 0.0, 0.0, 0.0]).ravel().tolist()
+    doubtful = bags.write_mcap(tmp_path / "doubtful.mcap", plain)
+    expected = tracks_of("rosbag", path, tmp_path / "a")
+    unasked, zeros, found = (
+        tracks_of("rosbag", bag, tmp_path / name, **options)
+        for name, bag, options in (
+            ("b", doubtful, {}), ("c", path, {"covariance": 1}), ("d", doubtful, {"covariance": 1}),
+        )
+    )  # fmt: skip
+    for same in (unasked, zeros):
+        assert same.center.tobytes() == expected.center.tobytes()
+        assert same.covariance.tobytes() == expected.covariance.tobytes()
+    assert np.median(found.covariance[:, 0, 0]) > 3.0 * np.median(expected.covariance[:, 0, 0])
+
+
 def test_tracks_of_real_data_are_the_same_from_a_bag(tmp_path: Path) -> None:
     """KITTI's first sequence with its clouds, as a bag, gives the tracks of the files."""
     root = kitti_root()
