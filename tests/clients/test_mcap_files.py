@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run_here
 from foxglove_client import FoxgloveClient
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-from optipmb_client.datasets import DatasetError, open_dataset
+from optipmb_client.datasets import DatasetError, dataset_at, open_dataset
 from optipmb_client.foxglove_messages import FoxgloveMessages
 from optipmb_client.foxglove_server import FoxgloveServer
 from optipmb_client.mcap_files.plan import plan, renamed, steps
@@ -391,3 +392,24 @@ def test_a_dataset_needs_frames_in_order(tmp_path: Path) -> None:
         put(writer, detections(0), 2)
     with pytest.raises(DatasetError, match="optipmb play"):
         open_dataset("mcap", path).sequences(["all"])
+
+
+def test_a_folder_of_recordings_is_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Streams of the same name in several files are told apart by the names of these, and tracked in processes too."""
+    for number, name in enumerate(("monday", "monday.late")):
+        with RecordingWriter(tmp_path / f"{name}.mcap") as writer:
+            for frame in range(1 + number):
+                put(writer, detections(frame), frame)
+            put(writer, tracks(0, [1]), 9)
+    names = ["monday.garage.robot-1.lidar", "monday.late.garage.robot-1.lidar"]
+    dataset = open_dataset(dataset_at(tmp_path), tmp_path)
+    assert [(one.name, len(one)) for one in dataset.sequences(["all"])] == [(names[0], 1), (names[1], 2)]
+    for at, name in enumerate(names):
+        (sequence,) = dataset.sequences([name])
+        assert (sequence.name, len(sequence)) == (name, 1 + at)
+    for jobs in ("1", "2"):
+        assert run_here(capsys, "track", tmp_path, "--jobs", jobs, "--out", tmp_path / jobs).returncode == 0
+    for name in names:
+        assert (tmp_path / "1" / f"{name}.txt").read_bytes() == (tmp_path / "2" / f"{name}.txt").read_bytes()
+    with pytest.raises(DatasetError, match=r"streams of the recording: monday\.garage"):
+        dataset.sequences(["tuesday"])

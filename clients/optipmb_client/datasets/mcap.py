@@ -110,7 +110,7 @@ class RecordedDataset:
     name = "mcap"
 
     def __init__(self, path: Path) -> None:
-        files = sorted(file for file in path.iterdir() if _is_recording(file)) if path.is_dir() else [path]
+        files = sorted(filter(_is_recording, path.iterdir()), key=lambda one: one.stem) if path.is_dir() else [path]
         if not files:
             raise DatasetError(path, "a folder with recordings (.mcap)", "none in it")
         self._files = {f"{file.stem}." if path.is_dir() else "": RecordingFile(file) for file in files}
