@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -27,7 +28,10 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="session")
 def _compiled() -> None:
+    """Do what the service does at its start: a full garbage collection may take as long as no frame is allowed to."""
     optipmb.warm_up()
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture
