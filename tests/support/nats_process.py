@@ -9,9 +9,11 @@ import sys
 import time
 from typing import TYPE_CHECKING, Self
 
+from optipmb_service.app.nats import PAYLOAD_MB, program
 from routers import free_endpoint
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
     from types import TracebackType
 
@@ -42,26 +44,8 @@ class NatsProcess:
 
     def start(self) -> None:
         """Start it, and wait until it takes connections."""
-        log = (self._folder / "nats.log").open("ab")
-        with log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "optipmb_service", "nats", "--listen", self.address, "--store", self._folder],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env={name: value for name, value in os.environ.items() if not name.startswith("OPTIPMB_")},
-            )
-        host, _, port = self.address.partition(":")
-        ends = time.monotonic() + START_S
-        while True:
-            try:
-                socket.create_connection((host, int(port)), 1.0).close()
-            except OSError:
-                assert self.process.poll() is None, (self._folder / "nats.log").read_text()
-                assert time.monotonic() < ends, "the server does not listen"
-                time.sleep(0.01)  # another process: there is nothing to wait on
-            else:
-                return
+        command = [sys.executable, "-m", "optipmb_service", "nats", "--listen", self.address, "--store", self._folder]
+        self.process = started(command, self.address, self._folder / "nats.log")
 
     def kill(self) -> None:
         """SIGKILL."""
@@ -69,3 +53,73 @@ class NatsProcess:
             self.process.kill()
             self.process.wait()
             self.process = None
+
+
+class NatsTrio:
+    """Three servers of one cluster, as those who run them configure them.
+
+    Args:
+        folder: where their files are.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._addresses = [free_endpoint().removeprefix("tcp/") for _ in range(6)]
+        self.urls = [f"nats://{address}" for address in self._addresses[:3]]
+        self._processes: dict[int, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Self:
+        for index in range(3):
+            self.start(index)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for index in tuple(self._processes):
+            self.kill(index)
+
+    def start(self, index: int) -> None:
+        """Start one of them, and wait until it takes connections."""
+        routes = ", ".join(f'"nats://{address}"' for address in self._addresses[3:])
+        file = self._folder / f"{index}.conf"
+        file.write_text(f"""
+            server_name: n{index}
+            listen: "{self._addresses[index]}"
+            max_payload: {PAYLOAD_MB}MB
+            jetstream {{ store_dir: "{self._folder / str(index)}" }}
+            cluster {{ name: test, listen: "{self._addresses[3 + index]}", routes: [{routes}] }}
+        """)
+        server = program()
+        assert server is not None
+        command = [server, "--config", str(file)]
+        self._processes[index] = started(command, self._addresses[index], self._folder / f"{index}.log")
+
+    def kill(self, index: int) -> None:
+        """SIGKILL."""
+        process = self._processes.pop(index)
+        process.kill()
+        process.wait()
+
+
+def started(command: Sequence[str | Path], address: str, log: Path) -> subprocess.Popen[bytes]:
+    """Start a server, and wait until it takes connections."""
+    with log.open("ab") as file:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=file,
+            stderr=file,
+            env={name: value for name, value in os.environ.items() if not name.startswith("OPTIPMB_")},
+        )
+    host, _, port = address.partition(":")
+    ends = time.monotonic() + START_S
+    while True:
+        try:
+            socket.create_connection((host, int(port)), 1.0).close()
+        except OSError:
+            assert process.poll() is None, log.read_text()
+            assert time.monotonic() < ends, "the server does not listen"
+            time.sleep(0.01)  # another process: there is nothing to wait on
+        else:
+            return process

@@ -56,8 +56,12 @@ LEAST: Final = (2, 12)
 """First version of the server that refuses a checkpoint for its fence."""
 
 EXISTS: Final = 10058
-NOT_THE_NEWEST: Final = frozenset({10071, 10164})
+NOT_THE_NEWEST: Final = 10071
+UNDECIDED: Final = 10164
+"""Several servers have not agreed yet on a write that was asked for before."""
+
 NOTHING_THERE: Final = 10037
+AGAIN_S: Final = 0.05
 ENDS: Final = frozenset({"204", "404"})
 """Status that ends a batch: that was all, or there is nothing."""
 
@@ -262,12 +266,17 @@ class JetStream:
     async def _publish(self, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
         """Return the sequence of a message that was kept; None when another one than expected is the newest."""
         client = await self._ready()
-        answer = json.loads((await client.request(subject, data, timeout=CALL_S, headers=headers)).data)
-        if (error := answer.get("error")) is None:
-            return int(answer["seq"])
-        if error.get("err_code") in NOT_THE_NEWEST:
-            return None
-        raise _Refused(error)
+        while True:
+            answer = json.loads((await client.request(subject, data, timeout=CALL_S, headers=headers)).data)
+            error = answer.get("error", {})
+            code = error.get("err_code")
+            if code is None:
+                return int(answer["seq"])
+            if code == NOT_THE_NEWEST:
+                return None
+            if code != UNDECIDED:
+                raise _Refused(error)
+            await asyncio.sleep(AGAIN_S)  # whoever called sets the bound
 
     async def _save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
         turn = asyncio.Semaphore(SAVED_AT_ONCE)

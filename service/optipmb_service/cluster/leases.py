@@ -178,6 +178,10 @@ class LeaseTable:
         return sorted([self.member, *(name for name, one in self._members.items() if one.alive)])
 
     def elsewhere(self, partition: int) -> bool:
+        """Whether another member holds a partition, or is about to; may be called by any thread."""
+        return partition in self._partitions and (partition not in self.held or partition in self.leaving)
+
+    def taken(self, partition: int) -> bool:
         """Whether another living member holds a partition; may be called by any thread."""
         _, holder = self._partitions.get(partition, (0, NOBODY))
         known = self._members.get(holder)
@@ -204,7 +208,7 @@ class LeaseTable:
             partition = (first + offset) % PARTITIONS
             if missing <= 0:
                 break
-            if partition not in self.held and not self.elsewhere(partition):
+            if partition not in self.held and not self.taken(partition):
                 revision, _ = self._partitions.get(partition, (0, NOBODY))
                 writes.append(Write(partition_key(partition), self.member, revision))
                 missing -= 1

@@ -124,7 +124,8 @@ class Member:
     def request(self, stream: str) -> None:
         """Ask for a stream."""
         with self._lock:
-            self._roles.setdefault(stream, Role.STANDBY if self.elsewhere(stream) else Role.CLAIMING)
+            taken = self._table.taken(partition_of(stream))
+            self._roles.setdefault(stream, Role.STANDBY if taken else Role.CLAIMING)
             self._unsettled = True
         self._wake.set()
 
@@ -264,7 +265,7 @@ class Member:
             return RoleChange.RECALLED if leaving and role is Role.OWNER else None
         if held and not leaving:
             return RoleChange.GRANTED
-        if role is Role.CLAIMING and (leaving or self._table.elsewhere(partition)):
+        if role is Role.CLAIMING and (leaving or self._table.taken(partition)):
             return RoleChange.DENIED
         return None
 

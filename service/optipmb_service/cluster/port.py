@@ -88,7 +88,7 @@ class Ownership(Protocol):
         """Whether this instance owns a stream, also while its write lease has lapsed."""
 
     def elsewhere(self, stream: str) -> bool:
-        """Whether another instance tracks a stream, as far as is known."""
+        """Whether another instance tracks a stream, or is about to, as far as is known; it answers for the stream."""
 
     def request(self, stream: str) -> None:
         """Ask for a stream."""
