@@ -85,7 +85,7 @@ def test_terminated_in_the_middle(tmp_path: Path) -> None:
         node.send(*(SENSOR.detections(seq) for seq in range(50, 60)))
         for seq in range(5):
             publisher.publish(stamp_ns=SENSOR.stamp_ns(seq), points=cloud, **box)
-        fleet.service("a", cloud_wait_s=5.0)
+        fleet.service("a", cloud_wait_s=30.0)
         assert [tracks.cloud_used for tracks in node.tracks("site/node/late", 5)] == [True] * 5
         check(node, 60, owner="a")
 
