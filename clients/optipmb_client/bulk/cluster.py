@@ -62,6 +62,7 @@ class RayCluster:
                 "include_dashboard": False,
                 "_node_ip_address": "127.0.0.1",  # nothing listens to other machines
                 "_temp_dir": self._folder.name,
+                "_system_config": {"task_oom_retries": ATTEMPTS - 1},  # without end by default
             }
         else:
             _answers(address)
