@@ -29,10 +29,12 @@ class PoseLike(Protocol):
     """Anything with the two parts of a pose."""
 
     @property
-    def translation(self) -> Floats: ...  # noqa: D102 - (3,) metres
+    def translation(self) -> Floats:
+        """(3,) metres."""
 
     @property
-    def quaternion(self) -> Floats: ...  # noqa: D102 - (4,) w x y z
+    def quaternion(self) -> Floats:
+        """(4,) w x y z."""
 
 
 class Pose(NamedTuple):

@@ -27,13 +27,16 @@ class Executor(Protocol):
     """Runs tasks. Use it as a context manager: at its end nothing of it is left, whatever was under way."""
 
     @property
-    def width(self) -> int: ...  # noqa: D102 - tasks that are to be under way at once
+    def width(self) -> int:
+        """Tasks that are to be under way at once."""
 
     @property
-    def attempts(self) -> int: ...  # noqa: D102 - how often the loop starts a task whose process dies
+    def attempts(self) -> int:
+        """How often the loop starts a task whose process dies."""
 
     @property
-    def here(self) -> bool: ...  # noqa: D102 - whether tasks run in this process, and share its objects
+    def here(self) -> bool:
+        """Whether tasks run in this process, and share its objects."""
 
     def start(self, function: Function, shared: Any) -> None:
         """Make ready to call `function(shared, task)`; a second call changes what is called."""

@@ -149,16 +149,20 @@ class DataSequence(Protocol):
     """One recording: its frames in order, and the truth if there is any."""
 
     @property
-    def name(self) -> str: ...  # noqa: D102 - as the dataset calls it
+    def name(self) -> str:
+        """As the dataset calls it."""
 
     @property
-    def labels(self) -> tuple[str, ...]: ...  # noqa: D102 - the classes of its detections; without any, the benchmark's
+    def labels(self) -> tuple[str, ...]:
+        """The classes of its detections; without any, the benchmark's."""
 
     @property
-    def poses(self) -> Sequence[Pose]: ...  # noqa: D102 - world from sensor, one per frame
+    def poses(self) -> Sequence[Pose]:
+        """World from sensor, one per frame."""
 
     @property
-    def has_clouds(self) -> bool: ...  # noqa: D102 - whether any frame has a point cloud
+    def has_clouds(self) -> bool:
+        """Whether any frame has a point cloud."""
 
     def __len__(self) -> int: ...
 
@@ -173,10 +177,12 @@ class Dataset(Protocol):
     """A collection of sequences."""
 
     @property
-    def name(self) -> str: ...  # noqa: D102 - as given to `open_dataset`
+    def name(self) -> str:
+        """As given to `open_dataset`."""
 
     @property
-    def profile(self) -> str: ...  # noqa: D102 - the parameter profile that fits it
+    def profile(self) -> str:
+        """The parameter profile that fits it."""
 
     def sequences(self, names: Sequence[str]) -> Sequence[DataSequence]:
         """Return the sequences of these names, `all`, or the names of splits, each once and in order."""

@@ -27,34 +27,44 @@ class FullRows(TrackRows, Protocol):
     """The tracks of one frame with all that is known of them."""
 
     @property
-    def yaw_rate(self) -> Floats: ...  # noqa: D102 - (N,)
+    def yaw_rate(self) -> Floats:
+        """(N,)."""
 
     @property
-    def acceleration(self) -> Floats: ...  # noqa: D102 - (N,)
+    def acceleration(self) -> Floats:
+        """(N,)."""
 
     @property
-    def covariance(self) -> Floats: ...  # noqa: D102 - (N, 6, 6)
+    def covariance(self) -> Floats:
+        """(N, 6, 6)."""
 
     @property
-    def age(self) -> Floats: ...  # noqa: D102 - (N,)
+    def age(self) -> Floats:
+        """(N,)."""
 
     @property
-    def time_since_detection(self) -> Floats: ...  # noqa: D102 - (N,)
+    def time_since_detection(self) -> Floats:
+        """(N,)."""
 
     @property
-    def detection(self) -> Ints: ...  # noqa: D102 - (N,)
+    def detection(self) -> Ints:
+        """(N,)."""
 
     @property
-    def horizons(self) -> Floats | None: ...  # noqa: D102 - (H,)
+    def horizons(self) -> Floats | None:
+        """(H,)."""
 
     @property
-    def path_position(self) -> Floats | None: ...  # noqa: D102 - (N, H, 2)
+    def path_position(self) -> Floats | None:
+        """(N, H, 2)."""
 
     @property
-    def path_yaw(self) -> NDArray[np.float32] | None: ...  # noqa: D102 - (N, H)
+    def path_yaw(self) -> NDArray[np.float32] | None:
+        """(N, H)."""
 
     @property
-    def path_covariance(self) -> NDArray[np.float32] | None: ...  # noqa: D102 - (N, H, 2, 2)
+    def path_covariance(self) -> NDArray[np.float32] | None:
+        """(N, H, 2, 2)."""
 
 
 @dataclass(frozen=True)

@@ -17,38 +17,48 @@ class TrackRows(Protocol):
     """The tracks of one frame, in the world frame; messages and in-process results both are of this shape."""
 
     @property
-    def id(self) -> Ints: ...  # noqa: D102 - (N,)
+    def id(self) -> Ints:
+        """(N,)."""
 
     @property
-    def labels(self) -> tuple[str, ...]: ...  # noqa: D102 - class names
+    def labels(self) -> tuple[str, ...]:
+        """Class names."""
 
     @property
-    def label(self) -> Ints: ...  # noqa: D102 - (N,) index into labels
+    def label(self) -> Ints:
+        """(N,) index into labels."""
 
     @property
-    def center(self) -> Floats: ...  # noqa: D102 - (N, 3)
+    def center(self) -> Floats:
+        """(N, 3)."""
 
     @property
-    def size(self) -> Floats: ...  # noqa: D102 - (N, 3) length, width, height
+    def size(self) -> Floats:
+        """(N, 3) length, width, height."""
 
     @property
-    def yaw(self) -> Floats: ...  # noqa: D102 - (N,)
+    def yaw(self) -> Floats:
+        """(N,)."""
 
     @property
-    def velocity(self) -> Floats: ...  # noqa: D102 - (N, 2)
+    def velocity(self) -> Floats:
+        """(N, 2)."""
 
     @property
-    def score(self) -> Floats: ...  # noqa: D102 - (N,)
+    def score(self) -> Floats:
+        """(N,)."""
 
     @property
-    def existence(self) -> Floats: ...  # noqa: D102 - (N,) probability
+    def existence(self) -> Floats:
+        """(N,) probability."""
 
 
 class ResultWriter(Protocol):
     """Takes the tracks of one sequence frame by frame; the file appears complete at `close`, or not at all."""
 
     @property
-    def path(self) -> Path: ...  # noqa: D102 - the finished file
+    def path(self) -> Path:
+        """The finished file."""
 
     def add(self, index: int, pose: PoseLike, tracks: TrackRows) -> None:
         """Write the tracks (world frame) of frame `index`, whose sensor stood at `pose`."""

@@ -44,13 +44,16 @@ class Scorer(Protocol):
     """Compares tracks with the truth, for one class."""
 
     @property
-    def name(self) -> str: ...  # noqa: D102 - the class
+    def name(self) -> str:
+        """The class."""
 
     @property
-    def rules(self) -> Rules: ...  # noqa: D102 - what is ignored, and what is excused
+    def rules(self) -> Rules:
+        """What is ignored, and what is excused."""
 
     @property
-    def near(self) -> Rules: ...  # noqa: D102 - by the distance of centres
+    def near(self) -> Rules:
+        """By the distance of centres."""
 
     def counts(self, clip: Clip, tracks: ResultTable) -> Bools:
         """Return which of the tracks of a clip (R,), in the world frame, the benchmark looks at."""

@@ -69,49 +69,64 @@ class TrackColumns(Protocol):
     """The N tracks of one frame in the world frame; `optipmb_schemas.Tracks` is of this shape."""
 
     @property
-    def id(self) -> Ints: ...  # noqa: D102 - (N,)
+    def id(self) -> Ints:
+        """(N,)."""
 
     @property
-    def labels(self) -> tuple[str, ...]: ...  # noqa: D102 - class names
+    def labels(self) -> tuple[str, ...]:
+        """Class names."""
 
     @property
-    def label(self) -> Ints: ...  # noqa: D102 - (N,) index into labels
+    def label(self) -> Ints:
+        """(N,) index into labels."""
 
     @property
-    def center(self) -> Floats: ...  # noqa: D102 - (N, 3) m
+    def center(self) -> Floats:
+        """(N, 3) m."""
 
     @property
-    def size(self) -> Floats: ...  # noqa: D102 - (N, 3) length, width, height, m
+    def size(self) -> Floats:
+        """(N, 3) length, width, height, m."""
 
     @property
-    def yaw(self) -> Floats: ...  # noqa: D102 - (N,) rad
+    def yaw(self) -> Floats:
+        """(N,) rad."""
 
     @property
-    def velocity(self) -> Floats: ...  # noqa: D102 - (N, 2) m/s
+    def velocity(self) -> Floats:
+        """(N, 2) m/s."""
 
     @property
-    def yaw_rate(self) -> Floats: ...  # noqa: D102 - (N,) rad/s
+    def yaw_rate(self) -> Floats:
+        """(N,) rad/s."""
 
     @property
-    def acceleration(self) -> Floats: ...  # noqa: D102 - (N,) m/s^2 along the heading
+    def acceleration(self) -> Floats:
+        """(N,) m/s^2 along the heading."""
 
     @property
-    def existence(self) -> Floats: ...  # noqa: D102 - (N,) probability
+    def existence(self) -> Floats:
+        """(N,) probability."""
 
     @property
-    def score(self) -> Floats: ...  # noqa: D102 - (N,) in [0, 1]
+    def score(self) -> Floats:
+        """(N,) in [0, 1]."""
 
     @property
-    def covariance(self) -> Floats: ...  # noqa: D102 - (N, 6, 6) of x, y, speed, heading, turn rate, acceleration
+    def covariance(self) -> Floats:
+        """(N, 6, 6) of x, y, speed, heading, turn rate, acceleration."""
 
     @property
-    def horizons(self) -> Floats | None: ...  # noqa: D102 - (H,) s; None: without paths
+    def horizons(self) -> Floats | None:
+        """(H,) s; None: without paths."""
 
     @property
-    def path_position(self) -> Floats | None: ...  # noqa: D102 - (N, H, 2) m
+    def path_position(self) -> Floats | None:
+        """(N, H, 2) m."""
 
     @property
-    def path_yaw(self) -> NDArray[np.float32] | None: ...  # noqa: D102 - (N, H) rad
+    def path_yaw(self) -> NDArray[np.float32] | None:
+        """(N, H) rad."""
 
 
 def messages(types: Types, tracks: TrackColumns, stamp_ns: int, frame: str, stream: str) -> Iterator[tuple[str, Any]]:

@@ -26,14 +26,29 @@ if TYPE_CHECKING:
 class Context(Protocol):
     """What is used of gRPC's context of a call."""
 
-    async def read(self) -> Any: ...  # noqa: D102 - the next request, or EOF
-    async def write(self, message: bytes) -> None: ...  # noqa: D102 - a response
-    async def send_initial_metadata(self, initial_metadata: Any) -> None: ...  # noqa: D102 - at the beginning
-    async def abort(self, code: Any, details: str, trailing_metadata: Any) -> Any: ...  # noqa: D102 - an error
-    def auth_context(self) -> Any: ...  # noqa: D102 - of the certificate
-    def invocation_metadata(self) -> Any: ...  # noqa: D102 - of the caller
-    def peer(self) -> str: ...  # noqa: D102 - address of the caller
-    def done(self) -> bool: ...  # noqa: D102 - whether the caller has gone
+    async def read(self) -> Any:
+        """Return the next request, or EOF."""
+
+    async def write(self, message: bytes) -> None:
+        """Send a response."""
+
+    async def send_initial_metadata(self, initial_metadata: Any) -> None:
+        """Send the metadata that precede the first response."""
+
+    async def abort(self, code: Any, details: str, trailing_metadata: Any) -> Any:
+        """End the call with an error."""
+
+    def auth_context(self) -> Any:
+        """Return what is known of the caller's certificate."""
+
+    def invocation_metadata(self) -> Any:
+        """Return the metadata that the caller has sent."""
+
+    def peer(self) -> str:
+        """Return the address of the caller."""
+
+    def done(self) -> bool:
+        """Tell whether the caller has gone."""
 
 
 FIRST_S: Final = 30.0

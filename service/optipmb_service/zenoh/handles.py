@@ -29,7 +29,8 @@ _T = TypeVar("_T")
 class Undeclared(Protocol):
     """What is declared on a session."""
 
-    def undeclare(self) -> object: ...  # noqa: D102 - withdraw it
+    def undeclare(self) -> object:
+        """Withdraw it."""
 
 
 class _Dropped(Protocol):
