@@ -54,7 +54,10 @@ def cluster() -> Iterator[Any]:
     with tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as folder:  # sockets need a short path
         common = {"object_store_memory": BYTES, "temp_dir": folder}
         head = {"num_cpus": 0, "include_dashboard": False, "_system_config": {"health_check_period_ms": 1000}}
-        made = cluster_utils.Cluster(initialize_head=True, head_node_args={**common, **head})
+        with pytest.MonkeyPatch.context() as patch:  # the head notes its address in a folder that it does not make
+            patch.setenv("RAY_TMPDIR", folder)
+            (Path(folder) / "ray").mkdir()
+            made = cluster_utils.Cluster(initialize_head=True, head_node_args={**common, **head})
         for _ in range(2):
             made.add_node(num_cpus=1, **common)
         yield made

@@ -152,6 +152,8 @@ def test_a_profile_of_some_streams_that_there_is_not_is_one_clear_line(tmp_path:
 def refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *options: str, says: str) -> None:
     """Run the command in this process, which must refuse its options before anything is started."""
     monkeypatch.setattr(cli, "_run_one", lambda _: pytest.fail("it was started"))
+    # Some options are refused when the log goes to the standard error of this test already, which ends with it.
+    monkeypatch.setattr(cli.logs, "configure", lambda *_: None)
     with pytest.raises(SystemExit) as ended:
         cli.main(options)
     shown = capsys.readouterr()
