@@ -158,24 +158,24 @@ class Frame:
 
     def __post_init__(self) -> None:
         count = np.shape(self.score)[0] if np.ndim(self.score) == 1 else 0
-        for name, shape in _COLUMNS:
-            column = _shaped(name, getattr(self, name), (count, *shape))
-            object.__setattr__(self, name, _sealed(column))
-        for name in ("label", "source"):
-            index = _integers(name, getattr(self, name))
+        arrays = {name: _shaped(name, getattr(self, name), (count, *shape)) for name, shape in _COLUMNS}
+        indices = {name: _integers(name, getattr(self, name)) for name in ("label", "source")}
+        for name, index in indices.items():
             if index.shape != (count,):
                 raise FrameError(name, f"shape ({count},)", str(index.shape))
-            object.__setattr__(self, name, _sealed(index))
         if self.position_covariance is not None:
             column = _shaped("position_covariance", self.position_covariance, (count, 3))
             _all("position_covariance", semidefinite(column), "a covariance R_xx, R_xy, R_yy, or NaN alone", column)
-            object.__setattr__(self, "position_covariance", _sealed(column))
+            arrays["position_covariance"] = column
         if not 0 <= self.stamp_ns < 2**63:
             raise FrameError("stamp_ns", "whole nanoseconds in [0, 2^63)", repr(self.stamp_ns))
         check_view(self.field_of_view)
-        given = self.label, len(self.labels), self.center, self.size, self.yaw, self.score, self.velocity
+        center, size, yaw, velocity, score = (arrays[name] for name, _ in _COLUMNS)
+        given = indices["label"], len(self.labels), center, size, yaw, score, velocity
         if not allowed(*given):
             _refuse(*given)
+        for name, array in (arrays | indices).items():  # after the check: read-only arrays would compile it once more
+            object.__setattr__(self, name, _sealed(array))
 
 
 _COLUMNS: Final[tuple[tuple[str, tuple[int, ...]], ...]] = (

@@ -24,6 +24,7 @@ SUPPORT = Path(__file__).resolve().parents[1] / "support"
 # modules; arrays from messages, which are read-only; a density that was stored.
 FRESH = """
 import json, sys
+from dataclasses import replace
 sys.path.insert(0, sys.argv[1])
 import numpy as np
 import optipmb
@@ -50,7 +51,8 @@ for seed, modules in enumerate([optipmb.Modules(), optipmb.Modules(), *baselines
         if given.cloud is not None:
             pose = optipmb.Pose(given.cloud.pose.translation, given.cloud.pose.quaternion)
             cloud = optipmb.PointCloud(read_only(given.cloud.xyz), pose)
-        frame, _ = optipmb.make_frame(parameters, pose=here if seed else None, cloud=cloud, **columns)
+        frame, _ = optipmb.make_frame(parameters, pose=here if seed else None, **columns)
+        frame = replace(frame, cloud=cloud)  # as where a cloud comes after its frame
         density = tracker.step(density, frame).density
     stored = {name: read_only(column) for name, column in optipmb.columns_of(density).items()}
     density = optipmb.density_of(density.stamp_ns, density.next_id, stored, parameters.labels)
