@@ -55,7 +55,7 @@ class Sample:
 
 @pytest.mark.timeout(SECONDS + 300)
 def test_nothing_grows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Nothing grows and nothing is lost: memory within 5 %, no queue longer, every frame tracked, each message counted.
+    """Nothing grows or is lost: memory within 5 %, queues below a second, every frame tracked, each message counted.
 
     Streams with and without clouds, and one that also sends every frame twice and garbage between.
     """
@@ -92,7 +92,8 @@ def test_nothing_grows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert (status.duplicates, status.refused) == (extra, extra)
     assert status.received == status.frames + status.duplicates + status.refused
     assert ended <= settled * (1 + MOST_GROWTH), f"{settled} kB have become {ended} kB"
-    assert median(sample.waiting for sample in last) < STREAMS, "a frame of every stream waits"
+    # A queue that grows has more by then; a pause of the machine leaves less.
+    assert median(sample.waiting for sample in last) < STREAMS * RATE_HZ, "a second of every stream waits"
 
 
 def _watched(
