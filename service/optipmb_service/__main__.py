@@ -3,7 +3,7 @@
 import sys
 
 from optipmb_service.app import health_command
-from optipmb_service.app.uncollected import uncollected
+from optipmb_service.app.collector import collector_paused
 
 
 def main() -> None:
@@ -11,7 +11,7 @@ def main() -> None:
     if sys.argv[1:2] == ["health"]:
         sys.exit(health_command.main(sys.argv[2:]))
     try:
-        with uncollected():
+        with collector_paused():
             from optipmb_service.app import cli  # noqa: PLC0415 - a second that `health` can do without
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("optipmb"):

@@ -19,8 +19,8 @@ from typer.main import get_command
 
 from optipmb_service import __version__
 from optipmb_service.app import health_command, nats, router
+from optipmb_service.app.collector import collector_paused
 from optipmb_service.app.loops import leave
-from optipmb_service.app.uncollected import uncollected
 from optipmb_service.observability import logs
 from optipmb_service.settings import (
     DEFAULT_GRPC,
@@ -242,7 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run_one(settings: Settings) -> int:
     # It takes the tracker along: 150 MB and seconds.
-    with uncollected():
+    with collector_paused():
         from optipmb_service.app.worker import run_alone  # noqa: PLC0415 - neither a parent nor a question needs it
 
     return run_alone(settings)

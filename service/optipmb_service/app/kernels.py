@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 import optipmb
-from optipmb_service.app.uncollected import uncollected
+from optipmb_service.app.collector import collector_paused
 
 UNUSED: Final = "scipy.linalg"
 COMPILER: Final = "libllvmlite"
@@ -23,7 +23,7 @@ def warm_up() -> None:
     With its array functions numba loads scipy's linear algebra where that is installed: 17 MB, for functions that no
     kernel uses. It does without where there is none, so it is shown none.
     """
-    with uncollected():
+    with collector_paused():
         if UNUSED not in sys.modules:
             sys.modules[UNUSED] = None  # type: ignore[assignment]  # what makes an import fail, as Python has it
             try:
