@@ -8,7 +8,7 @@ other, and every exception reaches the caller's process whatever it is made of.
 from optipmb_client.bulk.choice import executor_for
 from optipmb_client.bulk.executors import ATTEMPTS, Executor, Here
 from optipmb_client.bulk.loop import Outcome, in_order, run, values
-from optipmb_client.bulk.task import Done, Failed, WorkerDied
+from optipmb_client.bulk.task import Done, Failed, WorkerDiedError
 
 __all__ = [
     "ATTEMPTS",
@@ -17,7 +17,7 @@ __all__ = [
     "Failed",
     "Here",
     "Outcome",
-    "WorkerDied",
+    "WorkerDiedError",
     "executor_for",
     "in_order",
     "run",

@@ -20,7 +20,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from optipmb_client.bulk.executors import ATTEMPTS
-from optipmb_client.bulk.task import Done, Failed, Function, WorkerDied, attempt
+from optipmb_client.bulk.task import Done, Failed, Function, WorkerDiedError, attempt
 from optipmb_client.errors import ClientError
 
 __all__ = ["LOCAL", "RayCluster"]
@@ -97,7 +97,7 @@ class RayCluster:
         except RayTaskError as error:  # before or after the task: this package is not there, or is another
             return Failed(f"on a node of Ray: {str(error).strip().splitlines()[-1]}")
         except RayError as error:
-            raise WorkerDied(f"Ray has given up after {ATTEMPTS} attempts ({type(error).__name__})") from error
+            raise WorkerDiedError(f"Ray has given up after {ATTEMPTS} attempts ({type(error).__name__})") from error
         return result
 
     def __enter__(self) -> Self:

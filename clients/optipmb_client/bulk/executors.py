@@ -10,12 +10,13 @@ import threading
 import uuid
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import cache
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Protocol, Self
 
-from optipmb_client.bulk.task import Done, Failed, Function, WorkerDied, attempt
+from optipmb_client.bulk.task import Done, Failed, Function, WorkerDiedError, attempt
 
 __all__ = ["ATTEMPTS", "Executor", "Here", "Processes"]
 
@@ -48,7 +49,7 @@ class Executor(Protocol):
         """Return what a task gave; called once for each that has ended.
 
         Raises:
-            WorkerDied: nothing came back.
+            WorkerDiedError: nothing came back.
         """
 
     def __enter__(self) -> Self: ...
@@ -109,19 +110,20 @@ class Processes:
         """Write down what is called; processes are started with the first tasks."""
         self._close()
         self._folder = tempfile.TemporaryDirectory(prefix="optipmb-bulk-", ignore_cleanup_errors=True)
-        self._call = Path(self._folder.name, "call")
-        self._call.write_bytes(pickle.dumps((function, shared), pickle.HIGHEST_PROTOCOL))
+        call = Path(self._folder.name, "call")
+        call.write_bytes(pickle.dumps((function, shared), pickle.HIGHEST_PROTOCOL))
+        self._call = str(call)
         self._theirs, self._ours = self._context.Pipe(duplex=False)
 
     def submit(self, task: Any) -> Future[Any]:
         """Give the task to a process that waits, or to a new one."""
         pool = self._idle.pop() if self._idle else self._new()
         try:
-            future = pool.submit(_run, task)
+            future = pool.submit(_run, self._call, task)
         except BrokenProcessPool:  # it was killed while it waited
             pool.shutdown()
             pool = self._new()
-            future = pool.submit(_run, task)
+            future = pool.submit(_run, self._call, task)
         self._busy[future] = pool
         return future
 
@@ -132,7 +134,7 @@ class Processes:
             file = Path(future.result())
         except BrokenProcessPool as error:
             pool.shutdown()
-            raise WorkerDied("its process died (killed, or out of memory)") from error
+            raise WorkerDiedError("its process died (killed, or out of memory)") from error
         self._idle.append(pool)
         result: Done[Any] | Failed = pickle.loads(file.read_bytes())  # noqa: S301  our own process wrote it
         file.unlink()
@@ -147,7 +149,7 @@ class Processes:
         self._close()
 
     def _new(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, self._context, _begin, (self._theirs, str(self._call)))
+        return ProcessPoolExecutor(1, self._context, _begin, (self._theirs, str(Path(self._call).parent)))
 
     def _close(self) -> None:
         if self._folder is None:
@@ -161,16 +163,11 @@ class Processes:
         self._folder = None
 
 
-_held: tuple[Function, Any] | None = None
-
-
-def _begin(end: Connection, call: str) -> None:
-    """Make a process ready: it keeps what is called, and ends when the other end of the pipe is closed."""
-    global _held  # noqa: PLW0603  a process of a pool has no other place to keep anything
+def _begin(end: Connection, folder: str) -> None:
+    """Make a process ready: it ends when the other end of the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its processes
-    threading.Thread(target=_end_with, args=(end, Path(call).parent), daemon=True).start()
-    tempfile.tempdir = str(Path(call).parent)  # what a killed process leaves goes with the folder
-    _held = pickle.loads(Path(call).read_bytes())  # noqa: S301  the parent wrote it
+    threading.Thread(target=_end_with, args=(end, Path(folder)), daemon=True).start()
+    tempfile.tempdir = folder  # what a killed process leaves goes with it
 
 
 def _end_with(end: Connection, folder: Path) -> None:
@@ -179,9 +176,15 @@ def _end_with(end: Connection, folder: Path) -> None:
     os._exit(0)  # the task at work is not waited for
 
 
-def _run(task: Any) -> str:
+@cache
+def _called(file: str) -> tuple[Function, Any]:
+    """Return what is called, which a process reads once: it serves one `start`."""
+    called: tuple[Function, Any] = pickle.loads(Path(file).read_bytes())  # noqa: S301  the parent wrote it
+    return called
+
+
+def _run(call: str, task: Any) -> str:
     """Run a task in a process of the pool; return the file with what it gave."""
-    assert _held is not None  # noqa: S101  the pool has called _begin
     file = Path(tempfile.gettempdir(), uuid.uuid4().hex)
-    file.write_bytes(pickle.dumps(attempt(*_held, task), pickle.HIGHEST_PROTOCOL))
+    file.write_bytes(pickle.dumps(attempt(*_called(call), task), pickle.HIGHEST_PROTOCOL))
     return str(file)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from optipmb_client.bulk.executors import Executor
-from optipmb_client.bulk.task import Done, Failed, WorkerDied
+from optipmb_client.bulk.task import Done, Failed, WorkerDiedError
 
 __all__ = ["Outcome", "in_order", "run", "values"]
 
@@ -46,7 +46,7 @@ def run(
             place, number = under_way.pop(future)
             try:
                 result = executor.take(future)
-            except WorkerDied as died:
+            except WorkerDiedError as died:
                 if number < executor.attempts:
                     note(f"{name(tasks[place])}: {died}; starts again")
                     waiting.appendleft((place, number + 1))

@@ -10,7 +10,7 @@ from optipmb_schemas import MessageError
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.files import DatasetError
 
-__all__ = ["Done", "Failed", "Function", "WorkerDied", "attempt"]
+__all__ = ["Done", "Failed", "Function", "WorkerDiedError", "attempt"]
 
 T = TypeVar("T")
 
@@ -19,7 +19,7 @@ Function: TypeAlias = Callable[[Any, Any], Any]
 _INPUT: Final = (UsageError, DatasetError, MessageError, OSError)
 
 
-class WorkerDied(Exception):  # noqa: N818  the name says what happened
+class WorkerDiedError(Exception):
     """The process or the machine that ran a task is gone, and nothing of the task came back."""
 
 
