@@ -79,8 +79,8 @@ types: install
 kernels: install
 	$(BIN)/optipmb warm-up
 
-# With more JOBS than processors it takes about as long, and answers come late.
-JOBS ?= 2
+# One more than two processors: what starts processes and waits for them leaves a third of the time free.
+JOBS ?= 3
 tests: kernels
 	$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not accuracy and not alone and not bounds and not ray"
 
