@@ -87,27 +87,29 @@ def block_of(array: NDArray[Any]) -> dict[str, Any]:
     return {"dtype": array.dtype.str[1:], "shape": array.shape, "data": _data(array)}
 
 
-def pack_field(name: str, array: NDArray[Any], offset: int) -> tuple[bytes, bytes | memoryview]:
-    """Return a field of a message that is to lie at `offset`, in two parts: all before the data, and the data.
+def head_of(name: str, dtype: str, shape: tuple[int, ...]) -> bytes:
+    """Return all before the data of a small array that is a field of a message, and nothing for others.
 
-    The data of a large array are a view, not a copy, and aligned.
+    The data are its bytes in memory, so where numbers are stored otherwise than on the wire there is no small array.
     """
-    if array.nbytes < LARGE:
-        return _head(name, array.dtype, array.shape), _data(array)
+    size = prod(shape) * DTYPES[dtype].itemsize
+    if size >= LARGE or not _LITTLE:
+        return b""
+    field: bytes = _msgpack.packb({name: {"dtype": dtype, "shape": shape, "data": bytes(size)}})
+    return field[1 : len(field) - size]
+
+
+def pack_large(name: str, array: NDArray[Any], offset: int) -> tuple[bytes, bytes | memoryview]:
+    """Return a field with a large array that is to lie at `offset`, in two parts: all before the data, and the data.
+
+    The data are aligned, and a view, not a copy, if they can be.
+    """
     before, after = _large_head(name, array.dtype, array.shape)
     padding = -(offset + len(before) + 2 + len(after)) % ALIGNMENT
     return before + b"\xc4" + bytes((padding, *bytes(padding))) + after, _data(array)
 
 
 # Messages have the same few shapes over and over.
-
-
-@lru_cache(1024)
-def _head(name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
-    """Return all before the data of a small array."""
-    data = bytes(prod(shape) * dtype.itemsize)
-    field: bytes = _msgpack.packb({name: {"dtype": dtype.str[1:], "shape": shape, "data": data}})
-    return field[1 : len(field) - len(data)]
 
 
 @lru_cache(1024)
@@ -122,4 +124,4 @@ def _data(array: NDArray[Any]) -> bytes | memoryview:
     """Return the bytes of an array, little-endian, row by row: of a large one a view."""
     if not (_LITTLE and array.dtype.isnative and array.flags.c_contiguous):
         array = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-    return array.data if array.nbytes >= LARGE else array.tobytes()
+    return array.data.cast("B") if array.nbytes >= LARGE else array.tobytes()

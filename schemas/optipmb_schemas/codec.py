@@ -6,12 +6,13 @@ are checked before memory is taken for them. `encode` is deterministic: equal me
 
 import json
 import re
+from functools import lru_cache
 from typing import Any, Final, TypeVar, cast
 
 import msgpack
 import numpy as np
 
-from optipmb_schemas.blocks import block_of, pack_field, read_array
+from optipmb_schemas.blocks import block_of, head_of, pack_large, read_array
 from optipmb_schemas.compact import read_detections
 from optipmb_schemas.control import MoveRequest, Problem, ResetRequest, ServiceStatus, SessionParameters, SessionState
 from optipmb_schemas.errors import MessageError, show
@@ -44,6 +45,9 @@ _UNDECLARED: Final = frozenset({"", "zenoh/bytes", "zenoh/string"})  # what Zeno
 _JSON_STARTS: Final = frozenset(b"{ \t\r\n")  # in msgpack these are small integers, never the start of a map
 _DIGITS: Final = 20  # of a 64-bit integer with its sign; the time to read longer ones grows with their square
 
+_SMALL_MAP: Final = 16
+"""Fields from which on the head of a map has three bytes."""
+
 _SCALARS: Final = frozenset({str, bytes, int, float, bool})  # what msgpack takes as it is
 
 _msgpack: Any = msgpack  # its type information is partial
@@ -57,22 +61,33 @@ def encoding_of(message: Message | type[Message], *, form: str = "msgpack") -> s
 
 def encode(message: Message) -> bytes:
     """Return the message as msgpack, arrays as blocks. Fields that are None are left out."""
-    fields = message.present()
-    packer = _msgpack.Packer()
-    pack = packer.pack
-    parts: list[bytes | memoryview] = [packer.pack_map_header(len(fields))]
-    size = len(parts[0])
+    kind, fields = type(message), message.present()
+    pack = _msgpack.Packer().pack
+    parts: list[bytes | memoryview] = [_msgpack.Packer().pack_map_header(len(fields))]
+    plain: dict[str, Any] = {}
     for name, value in fields:
-        if isinstance(value, np.ndarray):
-            head, data = pack_field(name, value, size)
-            parts += (head, data)
-            size += len(head) + value.nbytes
-        else:
-            plain = value if type(value) in _SCALARS else _plain(value, blocks=True)
-            packed: bytes = pack(name) + pack(plain)
-            parts.append(packed)
-            size += len(packed)
+        if type(value) is not np.ndarray:
+            plain[name] = value if type(value) in _SCALARS else _plain(value, blocks=True)
+            continue
+        if plain:
+            parts.append(_without_head(pack(plain), len(plain)))
+            plain = {}
+        head = _head(kind, name, value.shape)
+        parts += (head, value.tobytes()) if head else pack_large(name, value, sum(map(len, parts)))
+    if plain:
+        parts.append(_without_head(pack(plain), len(plain)))
     return b"".join(parts)
+
+
+@lru_cache(4096)
+def _head(kind: type[Message], name: str, shape: tuple[int, ...]) -> bytes:
+    """Return what stands before the data of an array, which has the number type of its field; see `head_of`."""
+    return head_of(name, kind.arrays[name].dtype, shape)
+
+
+def _without_head(packed: bytes, count: int) -> bytes:
+    """Return the fields of a packed map of so many without the head that says how many."""
+    return packed[1 if count < _SMALL_MAP else 3 :]
 
 
 def encode_json(message: Message) -> bytes:
@@ -120,6 +135,7 @@ def build(fields: dict[str, Any], expected: type[T], limits: Limits) -> T:
     return expected(**fields)
 
 
+@lru_cache(256)
 def _form(encoding: str, expected: type[Message]) -> str:
     """Return `msgpack`, `json`, or nothing when the encoding does not say. Refuse other types and versions."""
     if encoding in _UNDECLARED:
@@ -216,7 +232,9 @@ def _plain(value: Any, *, blocks: bool) -> Any:
     if isinstance(value, Message):
         fields: dict[str, Any] = {}
         for name, field in value.present():
-            if isinstance(field, np.ndarray):
+            if type(field) in _SCALARS and blocks:
+                fields[name] = field
+            elif isinstance(field, np.ndarray):
                 fields[name] = block_of(field) if blocks else value.arrays[name].to_lists(field)
             else:
                 fields[name] = _plain(field, blocks=blocks)

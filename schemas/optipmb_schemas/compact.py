@@ -5,14 +5,19 @@ The usual form has columns of little-endian float64 and int64 and known fields o
 What is not plainly a valid message in this form gives None: the walk and the models read it then, or say what is wrong
 with it. So there is one set of rules and one set of errors, and tests hold what is accepted here equal to the models.
 
+Most payloads have the layout of one that was read before (`layout`): of those only the values are looked at.
+
 The bounds are those of `structure`. A payload is short enough here that whatever is built from it is small, every value
 in it is looked at, and so it holds no more values, no deeper nesting and no longer texts than the limits allow.
 """
 
 import sys
+from collections import OrderedDict
 from collections.abc import Callable
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from math import prod
+from operator import le
 from struct import unpack
 from typing import Any, Final, TypeVar
 
@@ -22,6 +27,7 @@ from numpy.typing import NDArray
 
 from optipmb_schemas.arrays import unit_quaternion
 from optipmb_schemas.fields import check_labels, check_stream
+from optipmb_schemas.layout import Layout, layout_of, stream_end
 from optipmb_schemas.limits import Limits
 from optipmb_schemas.messages import INT64, Detections, FieldOfView, Pose
 from optipmb_schemas.model import Message
@@ -36,14 +42,16 @@ _EPOCH: Final = 16
 _TEXT: Final = 64
 _LABELS: Final = 256
 _KNOWN: Final = frozenset(Detections.model_fields) - {"position_covariance"}
+_INNER: Final[dict[str, Any]] = {"pose": Pose, "field_of_view": FieldOfView}
 _REQUIRED: Final = frozenset(name for name, field in Detections.model_fields.items() if field.is_required())
 _BLOCK: Final = frozenset({"dtype", "shape", "data"})
 _PADDED: Final = _BLOCK | {"pad"}
 _DTYPES: Final = {"i8": frozenset({"i8", "<i8"}), "f8": frozenset({"f8", "<f8"})}
 _COLUMNS: Final = (("center", 3), ("size", 3), ("yaw", 1), ("score", 1), ("velocity", 2))
 _RANGES: Final = tuple(Detections.arrays[name] for name, _ in _COLUMNS)
-_LOWEST: Final = np.array([np.nextafter(one.low, np.inf) if one.above else one.low for one in _RANGES])
-_HIGHEST: Final = np.array([one.high for one in _RANGES], np.float64)
+_LOWEST: Final = [float(np.nextafter(one.low, np.inf)) if one.above else one.low for one in _RANGES]
+_HIGHEST: Final = [one.high for one in _RANGES]
+_LITTLE: Final = sys.byteorder == "little"
 _FRAMES: Final = frozenset({"world", "sensor"})
 _VELOCITY: Final = len(_COLUMNS) - 1
 _NUMBERS: Final[dict[type[Message], tuple[tuple[str, int, float, float], ...]]] = {
@@ -51,31 +59,136 @@ _NUMBERS: Final[dict[type[Message], tuple[tuple[str, int, float, float], ...]]] 
     for kind in (Pose, FieldOfView)
 }
 
+MOST_LENGTHS: Final = 256
+"""Lengths of payloads of which layouts are remembered; a layout takes about two kilobytes."""
+
+MOST_LAYOUTS: Final = 4
+"""Layouts of one length."""
+
 T = TypeVar("T", Pose, FieldOfView)
 _msgpack: Any = msgpack  # its type information is partial
 
 
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """A layout of valid payloads, and what is the same in all of them.
+
+    Attributes:
+        layout: where the values lie.
+        limits: within which these payloads are.
+        fields: all fields, with the values of those that are in the layout itself.
+        given: names of the fields that are there.
+        labels: how many there are.
+        inner: names of the fields that are maps.
+        shapes: shape of each column of numbers, in the order of `_COLUMNS`, and where it begins in bytes.
+        starts: where it begins in numbers.
+    """
+
+    layout: Layout
+    limits: Limits
+    fields: dict[str, Any]
+    given: frozenset[str]
+    labels: int
+    inner: tuple[str, ...]
+    shapes: tuple[tuple[str, tuple[int, ...], int], ...]
+    starts: NDArray[np.intp]
+
+
+_known: OrderedDict[int, list[_Known]] = OrderedDict()
+"""By the number of bytes behind the stream; empty when one such payload was read, for the second one makes a layout."""
+
+
 def read_detections(payload: bytes, limits: Limits) -> Detections | None:
     """Return the message of a payload in this form; None when it is in another, or not valid."""
-    if len(payload) > min(MOST, limits.max_values) or limits.max_depth < DEEPEST or sys.byteorder != "little":
+    if len(payload) > MOST or len(payload) > limits.max_values or limits.max_depth < DEEPEST or not _LITTLE:
         return None
+    found = stream_end(payload)
     try:
-        pairs = _msgpack.unpackb(
-            payload,
-            object_pairs_hook=tuple,
-            ext_hook=_refuse,
-            max_str_len=limits.max_text,
-            max_array_len=_LABELS,
-            max_map_len=len(_KNOWN),
-        )
-        fields = _once(pairs)
-        if fields.get("pose") is not None:
-            fields["pose"] = _part(fields["pose"], Pose)
-        if fields.get("field_of_view") is not None:
-            fields["field_of_view"] = _part(fields["field_of_view"], FieldOfView)
-        return checked(fields, dict(fields["label"])["shape"][0], _data, limits)
+        if found is not None:
+            for known in _known.get(len(payload) - found[1], ()):
+                if known.limits is limits and (values := known.layout.values(payload, found[1])) is not None:
+                    return _read_known(known, found[0], values)
+        message = _read(payload, limits)
+        if found is not None:
+            _remember(payload, found[1], message, limits)
     except (ValueError, TypeError, LookupError):
         return None
+    return message
+
+
+def _read_known(known: _Known, stream: bytes, values: tuple[Any, ...]) -> Detections:
+    """Return the message of values in a known layout.
+
+    Raises:
+        ValueError: they are not valid.
+    """
+    fields = known.fields | dict(zip(known.layout.names, values, strict=True))
+    _need(len(stream) <= known.limits.max_text and fields["seq"] <= INT64 and fields["stamp_ns"] <= INT64)
+    fields["stream"] = _stream_of(stream)
+    for name in known.inner:
+        fields[name] = checked_part(_INNER[name], partial(_taken, fields, name))
+    label = fields["label"]
+    _need(int(np.maximum.reduce(np.frombuffer(label, np.uint64))) < known.labels)  # a negative one is larger than any
+    fields["label"] = np.frombuffer(label, np.int64)
+    buffer = b"".join([fields[name] for name, _, _ in known.shapes])
+    for name, shape, begin in known.shapes:
+        fields[name] = np.ndarray(shape, np.float64, buffer, begin)
+    _check_ranges(np.frombuffer(buffer, np.float64), known.starts, fields.get("velocity"))
+    return Detections.of_valid(fields, set(known.given))
+
+
+def _taken(fields: dict[str, Any], name: str, part: str, _length: int) -> bytes:
+    """Take the bytes of an array inside a field out of the values."""
+    data: bytes = fields.pop(f"{name}.{part}")
+    return data
+
+
+def _remember(payload: bytes, start: int, message: Detections, limits: Limits) -> None:
+    """Remember the layout of a valid payload when a second one of its length has come."""
+    length = len(payload) - start
+    alike = _known.get(length)
+    if alike is None:
+        _known[length] = []
+        if len(_known) > MOST_LENGTHS:
+            _known.popitem(last=False)
+        return
+    if (layout := layout_of(payload, start)) is None:
+        return
+    names = {name.partition(".")[0] for name in layout.names}
+    fields = {name: None if name in names else value for name, value in message.__dict__.items()}
+    count, begin, shapes = len(message.label), 0, []
+    for name, width in _columns(message.velocity):
+        shapes.append((name, (count, width) if width > 1 else (count,), begin))
+        begin += 8 * count * width
+    known = _Known(
+        layout,
+        limits,
+        fields,
+        frozenset(message.model_fields_set),
+        len(message.labels),
+        tuple(name for name in _INNER if name in names),
+        tuple(shapes),
+        _starts(count)[: len(shapes)],
+    )
+    alike.append(known)
+    del alike[:-MOST_LAYOUTS]
+    _known.move_to_end(length)
+
+
+def _read(payload: bytes, limits: Limits) -> Detections:
+    pairs = _msgpack.unpackb(
+        payload,
+        object_pairs_hook=tuple,
+        ext_hook=_refuse,
+        max_str_len=limits.max_text,
+        max_array_len=_LABELS,
+        max_map_len=len(_KNOWN),
+    )
+    fields = _once(pairs)
+    for name, kind in _INNER.items():
+        if fields.get(name) is not None:
+            fields[name] = _part(fields[name], kind)
+    return checked(fields, dict(fields["label"])["shape"][0], _data, limits)
 
 
 def checked(
@@ -130,18 +243,31 @@ def checked_part(kind: type[T], data: Callable[[str, int], bytes]) -> T:
 
 def _read_columns(fields: dict[str, Any], count: int, data: Callable[[Any, str, list[int]], bytes]) -> None:
     """Replace the columns of numbers by arrays, all of which lie in one buffer, and check their ranges together."""
-    columns = _COLUMNS if fields.get("velocity") is not None else _COLUMNS[:-1]
+    columns = _columns(fields.get("velocity"))
     parts = [data(fields[name], "f8", [count, width] if width > 1 else [count]) for name, width in columns]
     numbers = np.frombuffer(b"".join(parts), np.float64)
-    starts, ends = _bounds(count)
-    lowest = np.minimum.reduceat(numbers, starts[: len(columns)])
-    highest = np.maximum.reduceat(numbers, starts[: len(columns)])
-    good = (lowest >= _LOWEST[: len(columns)]) & (highest <= _HIGHEST[: len(columns)])  # NaN is in no range
-    for (name, width), start, end in zip(columns, starts.tolist(), ends, strict=False):
-        column = numbers[start:end]
+    begin = 0
+    for name, width in columns:
+        column = numbers[begin : begin + count * width]
         fields[name] = column.reshape(count, width) if width > 1 else column
-    if not good.all():
-        _need(bool(good[:_VELOCITY].all()) and _unknown_or_good(fields["velocity"]))
+        begin += count * width
+    _check_ranges(numbers, _starts(count)[: len(columns)], fields.get("velocity"))
+
+
+def _columns(velocity: object) -> tuple[tuple[str, int], ...]:
+    """Return names and widths of the columns of numbers that are there."""
+    return _COLUMNS if velocity is not None else _COLUMNS[:-1]
+
+
+def _check_ranges(numbers: NDArray[np.float64], starts: NDArray[np.intp], velocity: NDArray[np.float64] | None) -> None:
+    """Check the numbers of all columns; ValueError when one is out of its range."""
+    lowest = np.minimum.reduceat(numbers, starts).tolist()
+    highest = np.maximum.reduceat(numbers, starts).tolist()
+    # The extremes of a column with a NaN are NaN, which is in no range.
+    if not (all(map(le, _LOWEST, lowest)) and all(map(le, highest, _HIGHEST))):
+        within = zip(map(le, _LOWEST, lowest), map(le, highest, _HIGHEST), strict=True)
+        good = [above and below for above, below in within]
+        _need(all(good[:_VELOCITY]) and velocity is not None and _unknown_or_good(velocity))
 
 
 def _unknown_or_good(velocity: NDArray[np.float64]) -> bool:
@@ -151,10 +277,10 @@ def _unknown_or_good(velocity: NDArray[np.float64]) -> bool:
 
 
 @lru_cache(64)
-def _bounds(count: int) -> tuple[NDArray[np.intp], list[int]]:
-    """Return where each column begins and ends in the buffer."""
+def _starts(count: int) -> NDArray[np.intp]:
+    """Return where each column begins in the buffer."""
     ends = np.cumsum([count * width for _, width in _COLUMNS])
-    return np.concatenate([[0], ends[:-1]]).astype(np.intp), ends.tolist()
+    return np.concatenate([[0], ends[:-1]]).astype(np.intp)
 
 
 def _part(pairs: Any, kind: type[T]) -> T:
@@ -187,6 +313,11 @@ def _data(pairs: Any, dtype: str, shape: list[int]) -> bytes:
 @lru_cache(4096)
 def _stream(name: str) -> str:
     return check_stream(name)
+
+
+@lru_cache(4096)
+def _stream_of(name: bytes) -> str:
+    return check_stream(name.decode())
 
 
 @lru_cache(64)

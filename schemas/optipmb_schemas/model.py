@@ -66,15 +66,18 @@ class Message(BaseModel):
             if array is not None and array.flags.writeable:
                 fields[name] = array = array.view()
                 array.flags.writeable = False
-        return cls._of(cls.optional | fields, set(fields))
+        return cls.of_valid(cls.optional | fields, set(fields))
 
     def with_trusted(self, /, **fields: Any) -> Self:
         """Return the message with other values in some fields, which are known to be valid."""
-        return self._of(self.__dict__ | fields, self.model_fields_set | fields.keys())
+        return self.of_valid(self.__dict__ | fields, self.model_fields_set | fields.keys())
 
     @classmethod
-    def _of(cls, values: dict[str, Any], given: set[str]) -> Self:
-        """Do what pydantic's `model_construct` does, without looking at every field of the description."""
+    def of_valid(cls, values: dict[str, Any], given: set[str]) -> Self:
+        """Return the message of the values of all fields, read-only arrays among them, of which `given` were given.
+
+        It does what pydantic's `model_construct` does, without looking at every field of the description.
+        """
         message = cls.__new__(cls)
         set_attribute = object.__setattr__
         set_attribute(message, "__dict__", values)

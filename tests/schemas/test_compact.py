@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_schemas import Detections, Limits, Message, MessageError, codec, decode, encode
+from optipmb_schemas import Detections, Limits, Message, MessageError, codec, compact, decode, encode
 from optipmb_schemas.compact import MOST, read_detections
+from optipmb_schemas.layout import stream_end
 from optipmb_schemas.limits import DEFAULT
 
 CORPUS = Path(__file__).parents[1] / "fuzz" / "corpus" / "messages"
@@ -89,6 +90,67 @@ def test_what_our_encoder_writes_needs_no_models(examples: dict[str, Message]) -
     payload = encode(Detections(**larger))
     assert len(payload) < MOST
     assert check(payload)
+
+
+def known(payload: bytes) -> bool:
+    """Whether a payload has the layout of one that was read."""
+    stream = stream_end(payload)
+    assert stream is not None
+    layouts = compact._known.get(len(payload) - stream[1], ())
+    return any(one.layout.values(payload, stream[1]) is not None for one in layouts)
+
+
+def test_every_byte_of_a_known_layout_replaced_by_others(examples: dict[str, Message]) -> None:
+    """Whatever byte is another one, in the values or between them: what is read is what the models make of it."""
+    for changes in ({}, {"velocity": None, "has_points": None}, {"frame": "world", "pose": None}):
+        payload = encode(examples["Detections"].model_copy(update={"seq": 2**40, **changes}))
+        assert check(payload)
+        assert check(payload)
+        assert known(payload)
+        same, read = 0, 0
+        for at, byte in enumerate(payload):
+            for other in {0, 0x7F, 0xC0, 0xFF, byte ^ 1, byte ^ 0x80} - {byte}:
+                changed = payload[:at] + bytes([other]) + payload[at + 1 :]
+                try:
+                    by_models(changed)
+                except MessageError:
+                    assert read_detections(changed, DEFAULT) is None
+                else:
+                    same += known(changed)
+                    read += check(changed)
+        assert same
+        assert read
+
+
+def test_streams_share_a_layout_and_other_labels_have_another(examples: dict[str, Message]) -> None:
+    """A layout holds for every stream, and of several messages of one length each has its own values."""
+    example = examples["Detections"].model_copy(update={"seq": 300})
+    others = {"has_points": not example.has_points}, {"labels": tuple(label.upper() for label in example.labels)}
+    for _ in range(3):
+        for changes in ({}, *others):
+            for stream in ("a/b/c", "a/b/d", "some/longer/name", f"{'long' * 8}/b/c"):
+                assert check(encode(example.model_copy(update={"stream": stream, **changes})))
+    payload = encode(example)
+    assert known(payload)
+    assert not check(payload.replace(example.stream.encode(), b"owner" + b"/" * (len(example.stream) - 5)))
+    assert not check(payload, Limits(max_detections=len(example.label) - 1))
+
+
+def test_layouts_that_are_remembered_are_few(examples: dict[str, Message]) -> None:
+    """Lengths, and layouts of one length, beyond a number push out the oldest."""
+    example = dict(examples["Detections"].present())
+    for count in range(1, 2 * compact.MOST_LENGTHS // 3):
+        rows = {"label": np.zeros(count, int), "center": np.ones((count, 3)), "size": np.ones((count, 3))}
+        rows |= {"yaw": np.ones(count), "score": np.ones(count), "velocity": None}
+        for seq in (2**10, 2**20, 2**40):
+            assert check(encode(Detections(**example | rows | {"seq": seq})))
+    for number in range(3 * compact.MOST_LAYOUTS):
+        payload = encode(Detections(**example | {"seq": 2**40, "labels": [f"{number:09}{one}" for one in range(20)]}))
+        assert check(payload)
+        assert check(payload)
+        assert known(payload)
+    assert len(compact._known) <= compact.MOST_LENGTHS
+    assert max(map(len, compact._known.values())) <= compact.MOST_LAYOUTS
 
 
 @pytest.mark.parametrize("limits", SMALL, ids=str)
