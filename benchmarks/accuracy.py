@@ -37,7 +37,7 @@ SETS = (
     ("nuscenes", "centerpoint", ("car", "pedestrian")),
     ("nuscenes", "pointpillars", ("car",)),
 )
-SHOWN = ("sAMOTA", "AMOTA", "MOTA", "HOTA", "HOTA, all", "IDS", "FP", "FN")
+SHOWN = ("sAMOTA", "AMOTA", "MOTA", "HOTA", "HOTA, all", "IDS")
 
 
 def ways(dataset: str, name: str) -> Iterator[Way]:

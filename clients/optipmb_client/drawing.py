@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from optipmb_client.animation import animate_tracks
 from optipmb_client.datasets import DataSequence
 from optipmb_client.evaluation import ClassResult
 from optipmb_client.evaluation.tracks import read_tracks
@@ -24,7 +25,7 @@ def draw_results(
     """Draw the result file of a sequence from above.
 
     Args:
-        picture: The PNG file.
+        picture: The PNG file, or the GIF file of a moving picture.
         sequence: What was tracked.
         folder: Where its result file is, or a table of tracks.
         results: Figures of the classes; their misses and identity changes are marked.
@@ -36,6 +37,9 @@ def draw_results(
     """
     table = read_tracks(folder, sequence).to_world(sequence.poses)
     shown = _from_score(table, results, score)
+    if picture.suffix == ".gif":
+        animate_tracks(picture, sequence, shown, sequence.truth())
+        return
     best = [result.sweep.results[result.sweep.best] for result in results]
     draw_tracks(picture, sequence, shown, sequence.truth(), best)
 

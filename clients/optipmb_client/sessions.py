@@ -22,7 +22,7 @@ from optipmb_client.errors import ServiceRefused, ServiceUnavailable
 from optipmb_client.links import Link
 from optipmb_client.transport import Answer, Connection
 
-__all__ = ["close_session", "find_services", "move_stream", "set_parameters"]
+__all__ = ["close_session", "find_services", "move_stream", "session_state", "set_parameters"]
 
 QUERY_S = 2.0
 MOVE_S = 25.0
@@ -62,6 +62,15 @@ def close_session(connection: Link, stream: str, *, prefix: str = PREFIX) -> Ses
     """End the session of a stream and free what it holds; None when no service answers, or it says no."""
     key = Keys(prefix).query(stream, "reset")
     asked = connection.query(key, encode(ResetRequest(close=True)), encoding_of(ResetRequest), timeout=QUERY_S)
+    try:
+        return _read(asked, SessionState) if asked else None
+    except ServiceRefused:
+        return None
+
+
+def session_state(connection: Link, stream: str, *, prefix: str = PREFIX) -> SessionState | None:
+    """Return the state of a stream's session; None when no service answers, or it has none."""
+    asked = connection.query(Keys(prefix).query(stream, "state"), timeout=QUERY_S)
     try:
         return _read(asked, SessionState) if asked else None
     except ServiceRefused:

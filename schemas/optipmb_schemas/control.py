@@ -139,7 +139,7 @@ class SessionSummary(Message):
     stream: Stream = Field(description="Name of the stream.")
     profile: Name = Field(description="Name of the parameters in force.")
     state: Word = Field(description="State of the session, such as `running`.")
-    rate_hz: NonNegative = Field(default=0.0, description="Frames per second lately.")
+    rate_hz: NonNegative = Field(default=0.0, description="Frames per second in the last 5 s.")
     latency_p50_ms: NonNegative = Field(default=0.0, description="Median time from arrival to publication, ms.")
     latency_p99_ms: NonNegative = Field(default=0.0, description="99th percentile of the same, ms.")
     frames: Count = Field(default=0, description="Frames tracked.")

@@ -354,6 +354,18 @@ def test_a_lost_cloud_is_counted() -> None:
     assert one.clouds_lost == 1
 
 
+def test_a_recording_that_begins_late_is_known() -> None:
+    """Tracks that are older than the first frame, and frames without tracks between others, are found."""
+    first = detections(0, stamp=1_500_000_000)
+    whole = [recorded(first, 1), recorded(tracks(0, [1]).model_copy(update={"age": np.zeros(1)}), 2)]
+    (one,) = plan(whole).values()
+    assert (one.begins_late, one.never_tracked) == (False, 0)
+    late = [recorded(first, 1), recorded(tracks(0, [1]), 2)]  # half a second old
+    late += [recorded(detections(n, stamp=1_500_000_000 + n), 2 + n) for n in (1, 2, 3)]
+    (one,) = plan([*late, recorded(tracks(2, [1]), 9)]).values()
+    assert (one.begins_late, one.never_tracked) == (True, 1)
+
+
 def test_another_name_changes_nothing_else() -> None:
     """A renamed message is the same but for the stream; what is no message keeps its bytes."""
     frame = detections(3)

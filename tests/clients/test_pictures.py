@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from optipmb_client.animation import animate_tracks
 from optipmb_client.datasets import DataSequence, Truth, open_dataset
 from optipmb_client.errors import ClientError
 from optipmb_client.evaluation import ClearResult, Rules, evaluate_clear
 from optipmb_client.pictures import draw_tracks
 from optipmb_client.results import ResultTable, empty_table
+from PIL import Image
 
 PNG = b"\x89PNG\r\n\x1a\n"
 RULES = Rules(measure="distance", limit=2.0)
@@ -83,3 +85,29 @@ def test_without_matplotlib_the_error_says_what_to_install(tmp_path: Path, monke
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ClientError, match=r"optipmb\[plot\]"):
         draw_tracks(tmp_path / "a.png", sequence, tracks)
+
+
+def test_a_gif_shows_every_frame_in_the_time_of_the_sequence(tmp_path: Path) -> None:
+    """One picture for each frame, shown as long as the frame lasts, in colours of tracks; the same bytes again."""
+    sequence, truth, tracks = scene()
+    for name in ("a.gif", "b.gif"):
+        animate_tracks(tmp_path / name, sequence, tracks, truth)
+    assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
+    with Image.open(tmp_path / "a.gif") as picture:
+        durations = []
+        for one in range(getattr(picture, "n_frames", 1)):
+            picture.seek(one)
+            durations.append(picture.info["duration"])
+        assert (picture.width, durations) == (800, [100] * (len(sequence) - 1) + [1000])
+        shown = {colour for _, colour in picture.convert("RGB").getcolors(1 << 24) or ()}
+    assert len(shown) > 10
+
+
+def test_a_gif_follows_a_sensor_that_drives_far(tmp_path: Path) -> None:
+    """Tracks over more than one view are drawn around the sensor, and without tracks or truth only what there is."""
+    sequence, truth, tracks = scene()
+    far = np.concatenate([tracks.center[:-20], tracks.center[-20:] + np.array([900.0, 0.0, 0.0])])
+    animate_tracks(tmp_path / "far.gif", sequence, replace(tracks, center=far), truth)
+    animate_tracks(tmp_path / "none.gif", sequence, empty_table())
+    with Image.open(tmp_path / "far.gif") as wide, Image.open(tmp_path / "none.gif") as empty:
+        assert wide.height < wide.width == empty.width

@@ -1,6 +1,7 @@
 """Recordings made by the command from a real service, played into another one."""
 
 import contextlib
+import re
 import signal
 import time
 from collections.abc import Iterator
@@ -151,6 +152,20 @@ def test_tracks_that_differ_are_told(
     assert done.returncode == 1
     assert "differ from the recorded ones, the first is number" in done.stderr
     assert "profile kitti here has other values than what was in force" in done.stderr
+
+
+def test_a_stream_that_was_tracked_before_is_told(incident: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Played twice under the recorded name, ids go on from the first time: status 1, and why, in one line."""
+    with ServiceProcess() as fresh:
+        fresh.wait_until_ready()
+        again = ("play", incident, "--as-recorded", "--connect", fresh.endpoint)
+        done = run_here(capsys, *again)
+        assert (done.returncode, done.stderr) == (0, "")
+        done = run_here(capsys, *again)
+    assert done.returncode == 1
+    why, what = done.stderr.splitlines()
+    assert re.search(r"this service has tracked replay/\S+ before, so ids begin at \d+: play it without", why)
+    assert "frames differ from the recorded ones" in what
 
 
 def test_a_killed_recording_still_plays(

@@ -1,6 +1,7 @@
 """`optipmb play`: a recording into a service."""
 
 import secrets
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +21,7 @@ from optipmb_client.commands.options import (
     mcap_needed,
     print_json,
     say,
+    warn,
 )
 from optipmb_client.commands.replay import speed_of
 from optipmb_client.datasets import open_dataset
@@ -110,20 +112,35 @@ def play(  # noqa: PLR0913  these are the command's options
 def _complain(results: "list[PlayedStream]") -> None:
     wrong = False
     for result in results:
-        if result.clouds_lost:
-            typer.echo(f"optipmb: {result.name}: {result.clouds_lost} clouds are missing in the recording", err=True)
-        if result.other_values:
-            here = f"profile {result.profile} here has other values than what was in force"
-            typer.echo(f"optipmb: {result.name}: {here}", err=True)
+        for reason in _reasons(result):
+            warn(f"{result.name}: {reason}")
         if result.first_difference is not None:
             differ = f"{result.recorded - result.equal} of {result.recorded} frames differ from the recorded ones"
-            typer.echo(f"optipmb: {result.name}: {differ}, the first is number {result.first_difference}", err=True)
+            warn(f"{result.name}: {differ}, the first is number {result.first_difference}")
         if not result.recorded and result.returned < result.frames:
-            missing = f"{result.frames - result.returned} of {result.frames} frames have no tracks"
-            typer.echo(f"optipmb: {result.name}: {missing}", err=True)
+            warn(f"{result.name}: {result.frames - result.returned} of {result.frames} frames have no tracks")
         wrong |= result.first_difference is not None or (not result.recorded and result.returned < result.frames)
     if wrong:
         raise typer.Exit(1)
+
+
+def _reasons(result: "PlayedStream") -> Iterator[str]:
+    """Yield why tracks may differ from the recorded ones."""
+    if result.clouds_lost:
+        yield f"{result.clouds_lost} clouds are missing in the recording"
+    if result.other_values:
+        yield f"profile {result.profile} here has other values than what was in force"
+    if result.first_difference is None:
+        return
+    if result.first_id > 1:
+        yield (
+            f"this service has tracked {result.stream} before, so ids begin at {result.first_id}: "
+            "play it without --as-recorded, or into another service"
+        )
+    if result.begins_late:
+        yield "the recording begins in the middle of a session: ids and the first seconds differ"
+    if result.never_tracked:
+        yield f"{result.never_tracked} frames were not tracked when it was recorded"
 
 
 def _line(result: "PlayedStream") -> str:

@@ -7,7 +7,7 @@ and without one where its recorded tracks were made without. So it does not depe
 import collections
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias, TypeVar
+from typing import Final, TypeAlias, TypeVar
 
 from optipmb_schemas import Detections, Message, MessageError, SessionParameters, Tracks, decode, encode, encoding_of
 
@@ -18,6 +18,9 @@ __all__ = ["FrameId", "Step", "StreamPlan", "content", "plan", "renamed", "steps
 
 FrameId: TypeAlias = tuple[bytes, int]
 """Epoch and sequence number."""
+
+MARGIN_S: Final = 1e-3
+"""Of ages, which are of floating point."""
 
 _T = TypeVar("_T", bound=Message)
 
@@ -49,6 +52,18 @@ class StreamPlan:
         """Frames whose recorded tracks were made with a cloud that the recording lacks."""
         used = (frame for frame, tracks in self.tracks.items() if tracks.cloud_used)
         return sum(frame in self.frames and frame not in self.with_cloud for frame in used)
+
+    @property
+    def begins_late(self) -> bool:
+        """Whether the recording begins in the middle of a session: tracks are older than its first frame."""
+        first = min(self.frames.values(), default=0)
+        return any((tracks.age > (tracks.stamp_ns - first) * 1e-9 + MARGIN_S).any() for tracks in self.tracks.values())
+
+    @property
+    def never_tracked(self) -> int:
+        """Frames without recorded tracks between others that have some."""
+        tracked = [place for place, frame in enumerate(self.frames) if frame in self.tracks]
+        return tracked[-1] - tracked[0] + 1 - len(tracked) if tracked else 0
 
     def settle(self) -> None:
         """Give each frame its cloud; to be called when all is known."""

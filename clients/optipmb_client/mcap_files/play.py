@@ -19,7 +19,7 @@ from optipmb_client.mcap_files.plan import FrameId, Step, StreamPlan, content, p
 from optipmb_client.mcap_files.reading import Recorded, RecordingFile
 from optipmb_client.recording import Latency, latency
 from optipmb_client.replay import CLOUD_WAIT_S, KEPT_PROBLEMS, POINTS_WANTED_S, STRAGGLERS_S, TICK_S, Pace
-from optipmb_client.sessions import close_session, set_parameters
+from optipmb_client.sessions import close_session, session_state, set_parameters
 from optipmb_client.subscriber import Subscriber
 from optipmb_client.transport import Connection, Sender
 
@@ -44,6 +44,9 @@ class PlayedStream:
         recorded: Frames whose tracks are in the recording.
         equal: Those of them whose tracks came back with the same bytes, but for session, delivery and stream's name.
         first_difference: Number of the first of them whose tracks did not; None: there is none.
+        begins_late: Whether the recording begins in the middle of a session.
+        never_tracked: Frames without recorded tracks between others that have some.
+        first_id: Where track ids began: above 1 the service had tracked a stream of this name before.
         tracks: Newest tracks by frame.
         latency: From publishing to receiving.
         problems: How many problems were reported.
@@ -61,6 +64,9 @@ class PlayedStream:
     recorded: int
     equal: int
     first_difference: int | None
+    begins_late: bool
+    never_tracked: int
+    first_id: int
     tracks: dict[FrameId, Tracks]
     latency: Latency | None
     problems: int
@@ -160,6 +166,7 @@ class _Player:
         self._under_way: dict[FrameId, None] = {}
         self._progress = time.monotonic()
         self._in_force = SessionParameters()
+        self._first_id = 1
         self._results: dict[FrameId, Tracks] = {}
         self._latencies: list[int] = []
         self._problems: collections.deque[Problem] = collections.deque(maxlen=KEPT_PROBLEMS)
@@ -177,6 +184,8 @@ class _Player:
         self._in_force = set_parameters(
             self._connection, self._stream, wanted, prefix=self._prefix, patience_s=self._pace.service_s
         )
+        state = session_state(self._connection, self._stream, prefix=self._prefix)
+        self._first_id = max(1, state.next_id) if state else 1
         return self
 
     def __exit__(
@@ -241,6 +250,9 @@ class _Player:
             recorded=len(known),
             equal=len(known) - len(differs),
             first_difference=differs[0][1] if differs else None,
+            begins_late=one.begins_late,
+            never_tracked=one.never_tracked,
+            first_id=self._first_id,
             tracks=self._results,
             latency=latency(self._latencies),
             problems=self._problem_count,

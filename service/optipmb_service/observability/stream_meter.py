@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import threading
+from bisect import bisect_left
 from collections import deque
 from typing import Final
 
 import optipmb_schemas as schemas
 
 LATENCIES: Final = 512
-ARRIVALS: Final = 64
+ARRIVALS: Final = 1024
+RATE_NS: Final = 5_000_000_000
+"""The rate is that of the frames of this time; of a slower stream that of its last two frames."""
+SILENT_PERIODS: Final = 3
+"""After so many periods without a frame the rate falls."""
 
 
 class StreamMeter:
@@ -38,14 +43,19 @@ class StreamMeter:
             self._latencies.append(latency_ns)
 
     def rate_hz(self, now_ns: int) -> float:
-        """Return frames per second over the last arrivals, falling while none comes; 0 with fewer than two."""
+        """Return frames per second over the last `RATE_NS`, falling while none comes; 0 with fewer than two."""
         with self._lock:
-            count = len(self._arrivals)
-            first, last = (self._arrivals[0], self._arrivals[-1]) if count else (0, 0)
-        if count < 2 or last <= first:  # noqa: PLR2004 - a rate needs two frames
+            arrivals = list(self._arrivals)
+        if len(arrivals) < 2:  # noqa: PLR2004 - a rate needs two frames
             return 0.0
-        silent = (now_ns - last) * (count - 1) > 3 * (last - first)
-        return (count - 1) * 1e9 / ((now_ns if silent else last) - first)
+        last = arrivals[-1]
+        begin = min(bisect_left(arrivals, last - RATE_NS), len(arrivals) - 2)
+        count, span = len(arrivals) - 1 - begin, last - arrivals[begin]
+        if span <= 0:
+            return 0.0
+        if (now_ns - last) * count > SILENT_PERIODS * span:
+            return (len(arrivals) - bisect_left(arrivals, now_ns - RATE_NS)) * 1e9 / RATE_NS
+        return count * 1e9 / span
 
     def latency_ms(self) -> tuple[float, float]:
         """Return the median and the 99th percentile over the last frames; zeros without any."""

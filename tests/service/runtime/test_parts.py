@@ -209,16 +209,35 @@ def test_a_problem_takes_any_text(text: str) -> None:
 
 
 def test_figures_of_a_stream() -> None:
-    """Rate and latencies of the last frames; the rate falls in silence; without frames all are zero."""
+    """Rate and latencies of the last frames; the rate falls to zero in silence; without frames all are zero."""
     meter = StreamMeter(0)
     assert (meter.rate_hz(SECOND), meter.latency_ms(), meter.age_s(SECOND)) == (0.0, (0.0, 0.0), None)
     for frame in range(21):
         meter.arrived(frame * SECOND // 10, frame=True)
         meter.published((frame + 1) * 1_000_000)
     assert meter.rate_hz(2 * SECOND) == pytest.approx(10)
-    assert meter.rate_hz(20 * SECOND) == pytest.approx(1)
+    assert meter.rate_hz(5 * SECOND) == pytest.approx(21 / 5)
+    assert meter.rate_hz(6 * SECOND) == pytest.approx(11 / 5)
+    assert meter.rate_hz(20 * SECOND) == 0.0
     assert meter.latency_ms() == (11.0, 21.0)
     assert meter.age_s(3 * SECOND) == 1.0
+
+
+def test_the_rate_is_of_the_last_seconds() -> None:
+    """A pause, and another rate before, are forgotten after five seconds; a slow stream has the rate of two frames."""
+    meter = StreamMeter(0)
+    for frame in range(50):
+        meter.arrived(frame * SECOND // 50, frame=True)
+    for frame in range(26):
+        meter.arrived(600 * SECOND + frame * SECOND // 5, frame=True)
+    assert meter.rate_hz(605 * SECOND) == pytest.approx(5)
+    for frame in range(2):
+        meter.arrived((620 + 10 * frame) * SECOND, frame=True)
+    assert meter.rate_hz(631 * SECOND) == pytest.approx(0.1)
+    assert meter.rate_hz(700 * SECOND) == 0.0
+    for frame in range(10_000):
+        meter.arrived(800 * SECOND + frame * SECOND // 1000, frame=True)
+    assert meter.rate_hz(810 * SECOND) == pytest.approx(1000, rel=0.01)
 
 
 def test_clouds_are_found_by_stamp_and_bounded() -> None:
