@@ -227,7 +227,7 @@ def live(tree: Path, objects: int, points: int, seconds: float) -> dict[str, flo
     """Return microseconds of processor time per frame of a service in a process of its own, and its latencies."""
     with tempfile.TemporaryDirectory() as folder, ServiceProcess("--instance", "router") as router:
         router.wait_ready()
-        environment = {"PYTHONPATH": roots(tree), "OPTIPMB_STORE": folder}
+        environment = {"PYTHONPATH": roots(tree), "PYTHONSAFEPATH": "1", "OPTIPMB_STORE": folder}
         options = ("--connect", router.endpoint, "--instance", "cost", "--log-level", "warning")
         with ServiceProcess(*options, environment=environment, listen=False) as service:
             service.wait_ready()

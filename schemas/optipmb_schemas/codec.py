@@ -240,6 +240,8 @@ def _plain(value: Any, *, blocks: bool) -> Any:
                 fields[name] = _plain(field, blocks=blocks)
         return fields
     if isinstance(value, tuple | list):
+        if blocks and _SCALARS.issuperset(map(type, value)):
+            return value
         return [_plain(item, blocks=blocks) for item in value]
     if isinstance(value, dict):
         return {key: _plain(value[key], blocks=blocks) for key in sorted(value)}

@@ -61,10 +61,9 @@ class Message(BaseModel):
         For what a program has made itself out of values that were checked. Every value has the type that the field
         holds, arrays their dtype and order; all fields are given that have no default.
         """
-        for name in cls.arrays:
-            array = fields.get(name)
-            if array is not None and array.flags.writeable:
-                fields[name] = array = array.view()
+        for name, value in fields.items():
+            if type(value) is np.ndarray and value.flags.writeable:
+                fields[name] = array = value.view()
                 array.flags.writeable = False
         return cls.of_valid(cls.optional | fields, set(fields))
 

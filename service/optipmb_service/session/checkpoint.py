@@ -12,7 +12,7 @@ state: `state_bytes` leaves it out, so that two sessions that took the same fram
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
@@ -35,11 +35,15 @@ DIGEST: Final = 16
 HEAD: Final = len(MAGIC) + 2 + DIGEST
 MAX_BYTES: Final = 2**28
 MAX_SOFTWARE: Final = 100
+MAX_PROFILES: Final = 64
+"""Profiles whose form in checkpoints is remembered."""
 MAX_LABEL: Final = 64
 """Characters of a class name, as messages take it."""
 
 _msgpack: Any = msgpack  # its type information is partial
 _SOFTWARE: Final = version("optipmb")
+_profiles: dict[int, tuple[optipmb.Parameters, dict[str, Any]]] = {}
+"""The profiles that were written last, by their ids."""
 
 
 class CheckpointError(ValueError):
@@ -164,7 +168,7 @@ def _digest(version_: int, body: bytes) -> bytes:
 
 
 def _body(checkpoint: Checkpoint) -> dict[str, Any]:
-    parameters = checkpoint.parameters.model_dump(mode="json")
+    parameters = _dumped(checkpoint.parameters)
     # Most sessions of a store have one of a few profiles; the order of the classes is that of their indices.
     return {
         "software": checkpoint.software,
@@ -185,10 +189,24 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
         ],
         # Without a window the present is its beginning.
         "head": _state(checkpoint.head) if checkpoint.window else None,
-        "deliveries": asdict(checkpoint.deliveries),
+        "deliveries": _table(checkpoint.deliveries),
         "newest_cloud_ns": checkpoint.newest_cloud_ns,
         "run": checkpoint.run,
     }
+
+
+def _dumped(parameters: optipmb.Parameters) -> dict[str, Any]:
+    """Return a profile as maps and numbers; sessions write the same one every second."""
+    known = _profiles.get(id(parameters))
+    if known is None or known[0] is not parameters:
+        if len(_profiles) >= MAX_PROFILES:
+            _profiles.clear()
+        known = _profiles[id(parameters)] = parameters, parameters.model_dump(mode="json")
+    return known[1]
+
+
+def _table(values: FrameCounts | PoseHistory | Deliveries) -> dict[str, Any]:
+    return {name: getattr(values, name) for name in values.__slots__}
 
 
 def _packed(one: Recorded, name: str, message: schemas.Message) -> bytes:
@@ -216,9 +234,9 @@ def _state(state: FilterState) -> dict[str, Any]:
         "last": None if state.last is None else [state.last.epoch, state.last.seq, state.last.stamp_ns],
         "tracked": None if state.tracked is None else list(state.tracked),
         "tracks": state.tracks,
-        "counts": asdict(state.counts),
+        "counts": _table(state.counts),
         "reported": sorted(state.reported),
-        "whereabouts": asdict(state.pose_history),
+        "whereabouts": _table(state.pose_history),
     }
 
 

@@ -7,7 +7,8 @@ be viewed.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import fields
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 IDENTITY = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
 """The pose of arrays that are in the world frame already."""
+
+_COLUMNS: Final = tuple(column.name for column in fields(optipmb.Tracks))
 
 
 def pose_of(message: schemas.Detections | schemas.Points) -> optipmb.Pose | None:
@@ -132,6 +135,8 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
         schemas.MessageError: the tracks hold numbers that no message may.
     """
     make = schemas.Tracks.trusted if optipmb.sound(tracks) else schemas.Tracks
+    for name in _COLUMNS:
+        getattr(tracks, name).setflags(write=False)  # they are the message's now, which so needs no views of them
     path_fields = {} if paths is None else schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
     return make(
         stream=stream,
@@ -144,7 +149,7 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
         cloud_used=cloud_used,
         gap=gap,
         ignored=ignored,
-        labels=tuple(parameters.classes),
+        labels=parameters.labels,
         id=tracks.id,
         label=tracks.label,
         center=tracks.center,

@@ -144,6 +144,14 @@ class ReorderWindow:
 
     def _fitting(self, span_ns: int | None, most: int, most_bytes: int) -> int:
         """Return how many of the newest frames fit."""
+        entries = self._entries
+        if span_ns != 0 and entries and len(entries) <= most and sum([one.weight for one in entries]) <= most_bytes:
+            # Mostly all but the oldest few fit, and they are of one generation: their span is that of the two ends.
+            last, first = entries[-1], 0
+            if span_ns is not None and entries[0].place.generation == last.place.generation:
+                while last.time_ns - entries[first].time_ns > span_ns:
+                    first += 1
+                return len(entries) - first
         elapsed, weight, number = 0, 0, 0
         later: Entry | None = None
         for entry in reversed(self._entries):

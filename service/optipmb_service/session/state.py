@@ -7,7 +7,7 @@ two sessions that took the same frames have equal states, whatever came twice, l
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from optipmb_service.session.timeline import Cursor, FrameId, Placement
 
@@ -135,6 +135,11 @@ class Entry:
 
 def size_of(message: schemas.Detections, points: schemas.Points | None) -> int:
     """Return the bytes that the inputs of a frame take, nearly."""
-    arrays = (message.label, message.center, message.size, message.yaw, message.score, message.velocity)
-    size = 256 + sum(array.nbytes for array in arrays if array is not None)
-    return size + (points.xyz.nbytes if points is not None else 0)
+    row = _ROW if message.velocity is None else _ROW + _VELOCITY
+    return 256 + row * len(message.label) + (points.xyz.nbytes if points is not None else 0)
+
+
+_ROW: Final = 8 * (1 + 3 + 3 + 1 + 1)
+"""Bytes of label, center, size, yaw and score of a detection."""
+
+_VELOCITY: Final = 8 * 2
