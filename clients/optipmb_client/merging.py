@@ -35,12 +35,12 @@ class Merging:
     """Remembers what holds of each of the newest `capacity` frames, by numbers and a digest: some 500 bytes each."""
 
     def __init__(self, capacity: int) -> None:
-        self._frames: collections.OrderedDict[tuple[str, bytes, int], _Frame] = collections.OrderedDict()
+        self._frames: collections.OrderedDict[tuple[str, str | None, bytes, int], _Frame] = collections.OrderedDict()
         self._capacity = capacity
 
     def take(self, tracks: Tracks) -> Novelty:
         """Tell what a message brings, and remember it."""
-        key = tracks.stream, tracks.epoch, tracks.seq
+        key = tracks.stream, tracks.sensor, tracks.epoch, tracks.seq
         order = (tracks.delivery.run if tracks.delivery else 0, tracks.revision)
         known = self._frames.get(key)
         # A service without checkpoints begins a session anew, and counts from nothing: what comes from it holds too.

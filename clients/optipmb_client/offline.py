@@ -289,7 +289,7 @@ def _period(sequences: Sequence[DataSequence], frames: int) -> float | None:
     """Return the median time in seconds between neighbouring frames, so many, at the start of the first sequences."""
     steps = [
         (after.stamp_ns - before.stamp_ns) / 1e9
-        for one in sequences[:LOOKED_AT]
+        for one in itertools.chain.from_iterable(getattr(one, "sensors", (one,)) for one in sequences[:LOOKED_AT])
         for before, after in itertools.pairwise(itertools.islice(one.frames(), frames))
     ]
     return median(steps) or None if steps else None

@@ -49,6 +49,8 @@ def _streams(sessions: Sequence[SessionSummary]) -> Table:
             str(session.gaps),
             "never" if session.age_s is None else f"{duration(session.age_s)} ago",
         )
+        for sensor in session.sensors:
+            table.add_row(f"  {sensor}", "", "silent" if sensor in session.silent else "feeds it")
     return table
 
 

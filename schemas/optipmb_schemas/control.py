@@ -152,6 +152,12 @@ class SessionSummary(Message):
     worker: Count | None = Field(
         default=None, description="Number of the worker process that has the stream, where there are several."
     )
+    sensors: tuple[Stream, ...] = Field(
+        default=(), max_length=256, description="Streams that share the session; none where it is that of one stream."
+    )
+    silent: tuple[Stream, ...] = Field(
+        default=(), max_length=256, description="Those of them that have sent no frame lately."
+    )
 
 
 class ServiceStatus(Message):

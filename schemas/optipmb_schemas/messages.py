@@ -182,6 +182,11 @@ class Delivery(Message):
 class Tracks(Header):
     """The tracks of one frame, N of them, ordered by id. `epoch`, `seq` and `stamp_ns` are those of the detections."""
 
+    sensor: Stream | None = Field(
+        default=None,
+        description="Stream of the detections, where several sensors feed one session: `epoch` and `seq` are of this "
+        "stream. Absent: it is `stream`.",
+    )
     session: SessionId = Field(
         description="32 hexadecimal digits. New when the session starts anew: earlier tracks have ended."
     )

@@ -96,6 +96,13 @@ def _server(value: str) -> str:
     return value
 
 
+def _pattern(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_.*-]+(/[A-Za-z0-9_.*-]+){2}", value):
+        raise ValueError(f"a pattern of streams looks like site/*/lidar*, received {value!r}")
+    return value
+
+
+Pattern = Annotated[str, AfterValidator(_pattern)]
 Server = Annotated[str, AfterValidator(_server)]
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
 Endpoints = Annotated[tuple[Endpoint, ...], NoDecode, BeforeValidator(_listed)]
@@ -221,6 +228,11 @@ class Settings(BaseSettings):
     profiles: dict[str, str] = Field(
         default_factory=dict,
         description="stream pattern (as `site/*/lidar*`) to profile name or file; the first match applies",
+    )
+    fuse: Annotated[tuple[Pattern, ...], NoDecode, BeforeValidator(_listed)] = Field(
+        default=(),
+        description="patterns of streams (as `site/*/lidar*`) whose sensors feed one session per node, with tracks on"
+        " `site/node/fused`",
     )
     cloud_wait_s: float = Field(default=0.1, ge=0, le=60, description="longest wait of a frame for its cloud")
     cloud_memory_s: float = Field(
@@ -480,6 +492,8 @@ def load(
         raise SettingsInvalidError(f"setting {path}{where}: {message}") from error
     if not settings.endpoints and not settings.connect:
         raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
+    if settings.fuse and not settings.rewind_s:
+        raise SettingsInvalidError("setting fuse: sensors do not come in order of their stamps: rewind_s must not be 0")
     if settings.workers > 1 and settings.zenoh_config is not None and settings.is_router:
         # Its access control would be deaf to the workers, which come over a socket and without a certificate.
         raise SettingsInvalidError(

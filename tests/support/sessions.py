@@ -55,7 +55,7 @@ class Merged:
         outputs = list(outputs)
         assert not dumps(outputs), dumps(outputs)[0].error
         for message in tracks(outputs):
-            key = message.epoch, message.seq
+            key = message.epoch + (message.sensor or "").encode(), message.seq
             old_run, old = self.newest.get(key, (-1, message))
             if (old_run, old.revision) == (run, message.revision):
                 assert plain(old) == plain(message), f"another message of revision {message.revision} for {key}"

@@ -52,6 +52,10 @@ def track(  # noqa: PLR0913  these are the command's options
         bool,
         typer.Option("--smooth", help="Estimate every state from all frames of its track, later ones too: for labels."),
     ] = False,
+    fuse: Annotated[
+        bool,
+        typer.Option("--fuse", help="The sensors of a recording feed one density, by turns: by the column sensor."),
+    ] = False,
     keep_input: Annotated[
         bool, typer.Option("--keep-input", help="Of a bag, with --out FILE.mcap: also copy what is in it.")
     ] = False,
@@ -81,8 +85,8 @@ def track(  # noqa: PLR0913  these are the command's options
         return
     from optipmb_client import offline, tracking  # noqa: PLC0415  loads the tracker and its compiler
 
-    if keep_input:
-        option = [*(option or ()), "keep_input=1"]
+    flags = {"keep_input": keep_input, "fuse": fuse}
+    option = [*(option or ()), *(f"{name}=1" for name, given in flags.items() if given)]
     asked = asked_for(data, dataset, root, detections, option)
     opened, chosen = open_sequences(asked, sequences)
     _check_out(out, asked.name, chosen)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+from optipmb_client.datasets.fused import FusedDataset
 from optipmb_client.datasets.interface import (
     Cloud,
     DataSequence,
@@ -68,7 +69,8 @@ def open_dataset(
             when only truth, poses and clouds are read.
         options: of the dataset. kitti: `clouds`; nuscenes: `clouds`, `z_bottom`; scene: the fields of `SceneOptions`;
             mcap: none; rosbag: `points`, `odometry`, `fixed_frame`, `keep_input` and `class.NAME`;
-            table: those of `optipmb_client.datasets.table.OPTIONS`.
+            table: those of `optipmb_client.datasets.table.OPTIONS`. For table and mcap also `fuse`: the sensors of a
+            recording share a density.
 
     Raises:
         DatasetError: the name, the root, the detector or an option is not known.
@@ -84,7 +86,11 @@ def open_dataset(
         raise DatasetError("--root", "the file or folder of the dataset", "nothing")
     if name in {"table", "mcap", "rosbag"} and detections is not None:
         raise DatasetError("--detections", "nothing, for the file itself has them", repr(str(detections)))
-    return _OPEN[name](Path(root), detections, options)
+    fuse = str(options.pop("fuse", "0")) not in {"0", "0.0", "False"}
+    if fuse and name not in {"table", "mcap"}:
+        raise DatasetError("--fuse", "a table with a column `sensor`, or a recording (.mcap)", name)
+    opened = _OPEN[name](Path(root), detections, options)
+    return FusedDataset(opened) if fuse else opened
 
 
 _Options: TypeAlias = dict[str, float | str]

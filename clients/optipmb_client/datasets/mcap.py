@@ -39,6 +39,10 @@ class RecordedSequence:
 
     def __init__(self, name: str, recording: RecordingFile, plan_: StreamPlan) -> None:
         self.name = name
+        self.sensor = plan_.stream
+        self.sensor_column = "sensor"
+        self.columns: dict[str, str] = {}
+        self.recording = f"{name.removesuffix(plan_.stream.rpartition('/')[2])}fused"
         self.has_clouds = bool(plan_.with_cloud)
         self._recording = recording
         self._plan = replace(plan_, tracks={})  # they are large, and not needed for tracking

@@ -90,11 +90,14 @@ class TrackColumns:
     def _place(self, frame: Ints) -> Columns:
         """Return the columns that say where and when."""
         keys = getattr(self._sequence, "key_columns", None)
+        others: Columns = getattr(self._sequence, "frame_columns", {})
         if keys is not None:
             columns = {name: np.full(len(frame), value) for name, value in keys.items()}
+            columns |= {name: values[frame] for name, values in others.items()}
             return columns | {self._sequence.time_column: self._sequence.times[frame]}  # type: ignore[attr-defined]  # a table
         stamps = np.array([one.stamp_ns for one in self._sequence.frames()], dtype=np.int64)
-        return {"sequence": np.full(len(frame), self._sequence.name), "stamp_ns": stamps[frame]}
+        columns = {"sequence": np.full(len(frame), self._sequence.name)}
+        return columns | {name: values[frame] for name, values in others.items()} | {"stamp_ns": stamps[frame]}
 
     def _all(self, name: str, width: int = 0) -> NDArray[Any]:
         order = sorted(self._tracks)

@@ -144,11 +144,12 @@ class Delivery(_message.Message):
     def __init__(self, instance: _Optional[str] = ..., received_ns: _Optional[int] = ..., published_ns: _Optional[int] = ..., queue_ms: _Optional[float] = ..., decode_ms: _Optional[float] = ..., step_ms: _Optional[float] = ..., run: _Optional[int] = ...) -> None: ...
 
 class Tracks(_message.Message):
-    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "session", "revision", "profile", "cloud_used", "gap", "ignored", "labels", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "horizons", "path_position", "path_yaw", "path_covariance", "delivery")
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "profile", "cloud_used", "gap", "ignored", "labels", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "horizons", "path_position", "path_yaw", "path_covariance", "delivery")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
     STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     REVISION_FIELD_NUMBER: _ClassVar[int]
     PROFILE_FIELD_NUMBER: _ClassVar[int]
@@ -181,6 +182,7 @@ class Tracks(_message.Message):
     epoch: bytes
     seq: int
     stamp_ns: int
+    sensor: str
     session: str
     revision: int
     profile: str
@@ -209,7 +211,7 @@ class Tracks(_message.Message):
     path_yaw: Array
     path_covariance: Array
     delivery: Delivery
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
 
 class Problem(_message.Message):
     __slots__ = ("stream", "instance", "code", "path", "expected", "received", "message", "seq", "stamp_ns", "count", "reported_ns")
@@ -310,7 +312,7 @@ class SessionParameters(_message.Message):
     def __init__(self, profile: _Optional[str] = ..., cloud_wait_s: _Optional[float] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., restart: _Optional[bool] = ..., values: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ...) -> None: ...
 
 class SessionSummary(_message.Message):
-    __slots__ = ("stream", "profile", "state", "rate_hz", "latency_p50_ms", "latency_p99_ms", "frames", "refused", "shed", "gaps", "tracks", "queue", "age_s", "worker")
+    __slots__ = ("stream", "profile", "state", "rate_hz", "latency_p50_ms", "latency_p99_ms", "frames", "refused", "shed", "gaps", "tracks", "queue", "age_s", "worker", "sensors", "silent")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     PROFILE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -325,6 +327,8 @@ class SessionSummary(_message.Message):
     QUEUE_FIELD_NUMBER: _ClassVar[int]
     AGE_S_FIELD_NUMBER: _ClassVar[int]
     WORKER_FIELD_NUMBER: _ClassVar[int]
+    SENSORS_FIELD_NUMBER: _ClassVar[int]
+    SILENT_FIELD_NUMBER: _ClassVar[int]
     stream: str
     profile: str
     state: str
@@ -339,7 +343,9 @@ class SessionSummary(_message.Message):
     queue: int
     age_s: float
     worker: int
-    def __init__(self, stream: _Optional[str] = ..., profile: _Optional[str] = ..., state: _Optional[str] = ..., rate_hz: _Optional[float] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., frames: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., tracks: _Optional[int] = ..., queue: _Optional[int] = ..., age_s: _Optional[float] = ..., worker: _Optional[int] = ...) -> None: ...
+    sensors: _containers.RepeatedScalarFieldContainer[str]
+    silent: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, stream: _Optional[str] = ..., profile: _Optional[str] = ..., state: _Optional[str] = ..., rate_hz: _Optional[float] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., frames: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., tracks: _Optional[int] = ..., queue: _Optional[int] = ..., age_s: _Optional[float] = ..., worker: _Optional[int] = ..., sensors: _Optional[_Iterable[str]] = ..., silent: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class TrackRequest(_message.Message):
     __slots__ = ("detections", "points")

@@ -47,14 +47,15 @@ class EncodedTracks:
     run: int
     payload: bytes
     """The message `Tracks`, serialized."""
+    sensor: str = ""
+    """Stream of the detections, where several share a session."""
 
     @classmethod
     def of(cls, proto: pb.Tracks, columns: bytes = b"") -> Self:
         """Return the tracks of a message, and of columns that are serialized already."""
         payload = proto.SerializeToString() + columns
-        return cls(
-            proto.stream, proto.epoch, proto.seq, proto.stamp_ns, proto.revision, proto.delivery.run, payload
-        )  # fmt: skip
+        place = (proto.stream, proto.epoch, proto.seq, proto.stamp_ns)
+        return cls(*place, proto.revision, proto.delivery.run, payload, proto.sensor)
 
     def message(self) -> pb.Tracks:
         """Return the message."""

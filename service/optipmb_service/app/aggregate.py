@@ -20,6 +20,7 @@ from optipmb_service import __version__
 from optipmb_service.observability import collectors
 from optipmb_service.observability.health import STUCK_S
 from optipmb_service.observability.metrics import Collected, ReadOnDemand, families
+from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.problems import problem_of
 
@@ -66,8 +67,8 @@ class Network(Protocol):
     def ask(self, key: str, timeout: float) -> bytes | None:
         """Return the first answer at a key."""
 
-    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
-        """Hand over what comes on a stream, until the result is called."""
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:
+        """Hand over what comes on a stream, and the detections of a pattern of others, until the result is called."""
 
 
 class AggregateView:
@@ -84,6 +85,7 @@ class AggregateView:
         self._instance = settings.instance
         self._clustered = bool(settings.cluster)
         self._keys = schemas.Keys(settings.prefix)
+        self._fusion = Fusion(settings.fuse)
         self._limits = settings.limits.limits()
         self._workers = workers
         self._network = network
@@ -168,7 +170,7 @@ class AggregateView:
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
         """Hand over what comes on a stream to a viewer, whichever worker tracks it, until the result is called."""
-        return None if self._ending else self._network.tap(stream, receive)
+        return None if self._ending else self._network.tap(stream, receive, self._fusion.seen_by(stream))
 
     def text(self) -> bytes:
         """Return the metrics of all processes in Prometheus' text format; those of a worker have its label."""

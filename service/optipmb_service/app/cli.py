@@ -88,6 +88,12 @@ class Options(GatewayOptions, total=False):
     profile: Annotated[
         str | None, typer.Option(metavar="NAME|FILE", help="Profile of streams that no pattern in the settings names.")
     ]
+    fuse: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PATTERN", help="Streams whose sensors feed one session per node, repeatable; as 'site/*/lidar*'."
+        ),
+    ]
     cluster: Annotated[
         str | None,
         typer.Option(metavar="SERVERS", help="NATS servers that the members share; as nats://10.0.0.1:4222,nats://…"),

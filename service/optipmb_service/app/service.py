@@ -190,7 +190,7 @@ class Service:
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
         """Hand over what comes on a stream to a viewer, until the result is called."""
-        return self._transport.tap(stream, receive)
+        return self._transport.tap(stream, receive, self._registry.fusion.seen_by(stream))
 
     def client(self) -> Client:
         """Return what an edge in this process uses of the network."""

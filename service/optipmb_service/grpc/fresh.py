@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 MAX_EARLY: Final = 1024
 """Most items that wait until it is known what the caches hold."""
 
-Publication = tuple[str, bytes, int, int, int]
-"""One publication of the tracks of a frame: stream, epoch, number, run, revision."""
+Publication = tuple[str, str, bytes, int, int, int]
+"""One publication of the tracks of a frame: stream, sensor, epoch, number, run, revision."""
 
 
 class Fresh:
@@ -53,4 +53,4 @@ def order(tracks: EncodedTracks) -> tuple[int, int]:
 
 
 def _publication(tracks: EncodedTracks) -> Publication:
-    return (tracks.stream, tracks.epoch, tracks.seq, *order(tracks))
+    return (tracks.stream, tracks.sensor, tracks.epoch, tracks.seq, *order(tracks))

@@ -40,6 +40,8 @@ class ActorContext:
 
     Attributes:
         instance: name of the service.
+        keys: the keys of streams.
+        fused: whether a session is that of several streams.
         limits: bounds on messages.
         policy: waiting and restarting of sessions.
         queue_frames: most frames waiting per stream.
@@ -66,6 +68,8 @@ class ActorContext:
     """
 
     instance: str
+    keys: schemas.Keys
+    fused: Callable[[str], bool]
     limits: schemas.Limits
     policy: Policy
     queue_frames: int

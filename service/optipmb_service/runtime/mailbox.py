@@ -1,14 +1,14 @@
-"""A stream's bounded mailbox.
+"""The bounded mailbox of a session.
 
 Readers put in, one worker thread takes out. What is not urgent keeps its order. Point clouds go before frames, so that
-no frame goes on without a cloud that has long arrived; when too many wait, or too many bytes, the oldest is shed and
-counted.
+no frame goes on without a cloud that has long arrived; when too many of a stream wait, or too many bytes, its oldest is
+shed and counted. Where several streams feed the session, none takes the room of another.
 """
 
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
 
 from optipmb_service.runtime.byte_budget import ByteBudget
@@ -24,26 +24,28 @@ UNLIMITED: Final = 2**62
 
 
 class Mailbox:
-    """What waits for a stream's worker.
+    """What waits for a session's worker.
 
     Args:
-        frames: most frames waiting.
-        clouds: most point clouds waiting.
-        most_bytes: most bytes of messages waiting.
-        budget: bytes that wait in the mailboxes of all streams.
+        frames: most frames of a stream waiting.
+        clouds: most point clouds of a stream waiting.
+        most_bytes: most bytes of messages of a stream waiting.
+        budget: bytes that wait in the mailboxes of all sessions.
     """
 
     def __init__(self, frames: int, clouds: int, most_bytes: int = UNLIMITED, budget: ByteBudget | None = None) -> None:
         self._most_bytes = most_bytes
         self._budget = budget or ByteBudget(UNLIMITED)
-        self._bytes = 0
+        self._bytes: Counter[str] = Counter()
         self._lock = threading.Lock()
         self._urgent: deque[Command] = deque()
         self._clouds: deque[Packet] = deque()
         self._frames: deque[Packet | Command] = deque()
         self._most_frames = frames
         self._most_clouds = clouds
-        self._waiting = 0
+        self._frames_of: Counter[str] = Counter()
+        self._clouds_of: Counter[str] = Counter()
+        self._shed_of: Counter[str] = Counter()
         self._scheduled = False
         self._rung = False
         self._closed = False
@@ -58,25 +60,31 @@ class Mailbox:
     @property
     def waiting(self) -> int:
         """Frames that wait."""
-        return self._waiting
+        return self._frames_of.total()
+
+    def shed_since(self) -> dict[str, int]:
+        """Return the frames shed since this was asked last, by `Packet.origin`."""
+        with self._lock:
+            shed, self._shed_of = self._shed_of, Counter()
+        return shed
 
     def counts(self) -> tuple[int, int, int]:
         """Return the frames shed so far, those that wait, and the clouds shed so far, of one moment."""
         with self._lock:
-            return self.shed_frames, self._waiting, self.shed_clouds
+            return self.shed_frames, self.waiting, self.shed_clouds
 
     def offer_frame(self, packet: Packet) -> bool | None:
         """Put a frame last; True: a worker must be sent, None: closed."""
         with self._lock:
             if self._closed:
                 return None
-            if self._waiting >= self._most_frames:
-                self._shed_frame()
+            if self._frames_of[packet.origin] >= self._most_frames:
+                self._shed_frame(packet.origin)
             if self._fits(packet):
                 self._frames.append(packet)
-                self._waiting += 1
+                self._frames_of[packet.origin] += 1
             else:
-                self.shed_frames += 1
+                self._count_shed(packet.origin)
             return self._schedule()
 
     def offer_cloud(self, packet: Packet) -> bool | None:
@@ -84,10 +92,11 @@ class Mailbox:
         with self._lock:
             if self._closed:
                 return None
-            if len(self._clouds) >= self._most_clouds:
-                self._shed_cloud()
+            if self._clouds_of[packet.origin] >= self._most_clouds:
+                self._shed_cloud(packet.origin)
             if self._fits(packet):
                 self._clouds.append(packet)
+                self._clouds_of[packet.origin] += 1
             else:
                 self.shed_clouds += 1
             return self._schedule()
@@ -120,14 +129,13 @@ class Mailbox:
             if urgent:
                 return None
             if self._clouds:
-                return "cloud", self._taken(self._clouds.popleft())
+                return "cloud", self._taken(self._clouds.popleft(), self._clouds_of)
             if not self._frames:
                 return None
             item = self._frames.popleft()
             if not isinstance(item, Packet):
                 return "command", item
-            self._waiting -= 1
-            return "frame", self._taken(item)
+            return "frame", self._taken(item, self._frames_of)
 
     @property
     def clouds_waiting(self) -> int:
@@ -152,33 +160,44 @@ class Mailbox:
         return first
 
     def _fits(self, packet: Packet) -> bool:
-        """Make room for a message, by what is older; False when there is none even so, and it is not to be kept."""
-        while self._bytes + packet.held > self._most_bytes or not self._budget.take(packet.held):
-            if not (self._shed_cloud() or self._shed_frame()):
+        """Make room for a message, by what its stream sent before; False when there is none even so."""
+        origin = packet.origin
+        while self._bytes[origin] + packet.held > self._most_bytes or not self._budget.take(packet.held):
+            if not (self._shed_cloud(origin) or self._shed_frame(origin)):
                 return False
-        self._bytes += packet.held
+        self._bytes[origin] += packet.held
         return True
 
-    def _taken(self, packet: Packet) -> Packet:
-        self._bytes -= packet.held
+    def _taken(self, packet: Packet, counts: Counter[str]) -> Packet:
+        """Count a message that leaves; what counts nothing is forgotten, for names of streams are anybody's choice."""
+        origin = packet.origin
         self._budget.add(-packet.held)
+        for counter, less in ((self._bytes, packet.held), (counts, 1)):
+            counter[origin] -= less
+            if not counter[origin]:
+                del counter[origin]
         return packet
 
-    def _shed_cloud(self) -> bool:
-        """Drop the oldest cloud; False when there is none."""
-        if not self._clouds:
-            return False
-        self._taken(self._clouds.popleft())
-        self.shed_clouds += 1
-        return True
-
-    def _shed_frame(self) -> bool:
-        """Drop the oldest frame; commands between the frames stay. False when there is none."""
-        for index, item in enumerate(self._frames):
-            if isinstance(item, Packet):
-                del self._frames[index]
-                self._taken(item)
-                self._waiting -= 1
-                self.shed_frames += 1
+    def _shed_cloud(self, origin: str) -> bool:
+        """Drop the oldest cloud of a stream; False when there is none."""
+        for index, packet in enumerate(self._clouds):
+            if packet.origin == origin:
+                del self._clouds[index]
+                self._taken(packet, self._clouds_of)
+                self.shed_clouds += 1
                 return True
         return False
+
+    def _shed_frame(self, origin: str) -> bool:
+        """Drop the oldest frame of a stream; commands between the frames stay. False when there is none."""
+        for index, item in enumerate(self._frames):
+            if isinstance(item, Packet) and item.origin == origin:
+                del self._frames[index]
+                self._taken(item, self._frames_of)
+                self._count_shed(origin)
+                return True
+        return False
+
+    def _count_shed(self, origin: str) -> None:
+        self.shed_frames += 1
+        self._shed_of[origin] += 1

@@ -34,6 +34,11 @@ class Packet:
     now_ns: int
 
     @property
+    def origin(self) -> str:
+        """What tells the stream: the key without its topic."""
+        return self.key.rpartition("/")[0]
+
+    @property
     def held(self) -> int:
         """Bytes that it takes while it waits."""
         return PACKET_BYTES + (0 if self.payload is None else self.size)

@@ -96,8 +96,13 @@ class Queries:
             nowhere = self._problem("", error)
             _guarded(request, lambda: request.refuse(nowhere))
             return
-        if not self._registry.share.has(stream):
+        session = self._registry.fusion.session_of(stream)
+        if not self._registry.share.has(session):
             request.finish()  # another process has the stream, and answers
+            return
+        if session != stream:
+            shared = schemas.MessageError("invalid_value", "key", f"{session}, the session that it shares", stream)
+            _guarded(request, lambda: request.refuse(self._problem(stream, shared)))
             return
         commands: dict[str, tuple[Callable[[StreamActor, Request], None], bool]] = {
             "state": (lambda *_: None, True),

@@ -20,6 +20,7 @@ from optipmb_service.cluster.port import RoleChange
 from optipmb_service.runtime import dumps
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.context import Actor, ActorContext
+from optipmb_service.runtime.fusion import FUSED, Fusion
 from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
 from optipmb_service.runtime.stream_actor import StreamActor
 from optipmb_service.session.problems import problem_of
@@ -112,6 +113,7 @@ class Registry:
         self.profiles = profiles
         self.instance = settings.instance
         self.keys = schemas.Keys(settings.prefix)
+        self.fusion = Fusion(settings.fuse)
         self.limits = settings.limits.limits()
         self.cloud_wait_s = settings.cloud_wait_s
         self._settings = settings
@@ -121,7 +123,7 @@ class Registry:
         self._actors: dict[str, StreamActor] = {}
         self._sessions = 0
         self._lives: OrderedDict[str, Lineage] = OrderedDict()
-        self._streams: dict[str, str] = {}
+        self._streams: dict[str, tuple[str, str]] = {}
         self._past = MessageCounters()
         self._metrics = metrics
         self._full: dict[str, tuple[int, str]] = {}
@@ -133,6 +135,8 @@ class Registry:
         self._mailboxes = ByteBudget(settings.memory_mb * MEGABYTE // 2)
         self._context = ActorContext(
             instance=settings.instance,
+            keys=self.keys,
+            fused=self.fusion.is_session,
             limits=self.limits,
             policy=Policy(
                 gap_limit_ns=round(settings.gap_limit_s * SECOND),
@@ -178,21 +182,21 @@ class Registry:
         if share.count == 1:
             return True
         try:
-            return share.has(self._parsed(key))
+            return share.has(self._parsed(key)[1])
         except schemas.MessageError:
             return share.index == 0  # a key that is none of a stream is reported by one of the processes
 
     def frame(self, packet: Packet) -> None:
         """Hand detections to their stream; never waits."""
         self._metrics.received("detections", packet.size)
-        if (stream := self._stream_of(packet)) is not None and not self._over_quota(stream, packet, frame=True):
-            self._offer(stream, lambda actor: actor.mailbox.offer_frame(packet))
+        if (session := self._session_of(packet, frame=True)) is not None:
+            self._offer(session, lambda actor: actor.mailbox.offer_frame(packet))
 
     def cloud(self, packet: Packet) -> None:
         """Hand a point cloud to its stream; never waits."""
         self._metrics.received("points", packet.size)
-        if (stream := self._stream_of(packet)) is not None and not self._over_quota(stream, packet, frame=False):
-            self._offer(stream, lambda actor: actor.mailbox.offer_cloud(packet))
+        if (session := self._session_of(packet, frame=False)) is not None:
+            self._offer(session, lambda actor: actor.mailbox.offer_cloud(packet))
 
     def command(self, stream: str, command: Callable[[StreamActor], None], *, urgent: bool) -> bool:
         """Have a worker run a command for a stream; False when the service takes no more streams."""
@@ -242,10 +246,11 @@ class Registry:
             if not self.share.has(actor.stream):
                 # What was on its way while the stream was moved began a session once more.
                 self.command(actor.stream, StreamActor.hand_over, urgent=False)
-            age_s = actor.meter.age_s(now_ns)
-            if age_s is not None and age_s > self._settings.stale_s and not actor.stale:
-                actor.stale = True
-                log.warning("stream_stale", stream=actor.stream, age_s=round(age_s, 3))
+            for stream, meter in tuple(actor.sensors.items()):
+                age_s = meter.age_s(now_ns)
+                if age_s is not None and age_s > self._settings.stale_s and stream not in actor.stale:
+                    actor.stale.add(stream)
+                    log.warning("stream_stale", stream=stream, age_s=round(age_s, 3))
             if now_ns - actor.meter.active_ns > self._settings.idle_s * SECOND:
                 self.command(actor.stream, self._close_idle, urgent=False)
         self._evict()
@@ -392,27 +397,32 @@ class Registry:
         with self._lock:
             self._past += MessageCounters(received=1, refused=1)
 
-    def _stream_of(self, packet: Packet) -> str | None:
+    def _session_of(self, packet: Packet, *, frame: bool) -> str | None:
+        """Return the name of the session of a message's stream; None when it is refused."""
         try:
-            return self._parsed(packet.key)
+            stream, session = self._parsed(packet.key)
         except schemas.MessageError as error:
             self._count_refused()
             self._report("invalid_value", "", error.expected, error.received)
             return None
+        return None if self._over_quota(stream, packet, frame=frame) else session
 
-    def _parsed(self, key: str) -> str:
-        """Return the stream of a key, remembered.
+    def _parsed(self, key: str) -> tuple[str, str]:
+        """Return the stream of a key and its session, remembered.
 
         Raises:
             MessageError: it is none.
         """
-        stream = self._streams.get(key)
-        if stream is None:
+        parsed = self._streams.get(key)
+        if parsed is None:
             stream = self.keys.stream_of(key)
+            if self.fusion.is_session(stream):
+                raise schemas.MessageError("invalid_value", "key", f"a sensor not named {FUSED}, as its tracks", key)
+            parsed = stream, self.fusion.session_of(stream)
             if len(self._streams) >= MAX_KEYS:
                 self._streams.clear()
-            self._streams[key] = stream
-        return stream
+            self._streams[key] = parsed
+        return parsed
 
     def _report(self, code: str, stream: str, expected: str, received: str) -> None:
         message = f"Key: expected {expected}, received {received}."

@@ -1,4 +1,7 @@
-"""A stream's way through the service: decode, session, publish, all on one worker at a time, so nothing is locked here.
+"""A session's way through the service: decode, track, publish, all on one worker at a time, so nothing is locked here.
+
+Most sessions are those of one stream. Where several streams share one (`fusion`), the actor has its name, and what is
+wrong with a message is said on the stream that it came on.
 
 An actor is made for whatever arrives on a stream's key, its session only for a valid message of a stream that this
 instance owns: garbage costs an actor that is gone when its mailbox is empty. While another instance owns the stream, or
@@ -22,10 +25,10 @@ from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.stream_counters import StreamCounters
 from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 from optipmb_service.runtime.track_publisher import Arrival, TrackPublisher
-from optipmb_service.session.checkpoint import Checkpoint, forgotten
+from optipmb_service.session.checkpoint import Checkpoint, CheckpointError, forgotten
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Begun, Output, Quarantined, Tracked
+from optipmb_service.session.values import MAX_SENSORS, Begun, Output, Quarantined, Tracked
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -46,10 +49,10 @@ TURN_NS: Final = 5_000_000
 
 
 class StreamActor:
-    """One stream.
+    """One stream, or several that share a session.
 
     Args:
-        stream: `site/node/sensor`.
+        stream: `site/node/sensor`; the name of the session, where several streams share it.
         context: what all actors share.
     """
 
@@ -58,7 +61,11 @@ class StreamActor:
         self.mailbox = Mailbox(context.queue_frames, context.queue_clouds, context.mailbox_bytes, context.mailboxes)
         self.meter = StreamMeter(time.monotonic_ns())
         self.session: Session | None = None
-        self.stale = False
+        self.fused = context.fused(stream)
+        self.sensors: dict[str, StreamMeter] = {} if self.fused else {stream: self.meter}
+        """Of each stream."""
+        self.stale: set[str] = set()
+        """Streams that fell silent."""
         self._accounts = StreamCounters(self.mailbox)
         self._context = context
         self._takeover = TakeoverBuffer(context.standby_ns, context.budget)
@@ -68,7 +75,7 @@ class StreamActor:
         self._asking: list[Callable[[StreamActor], None]] = []
         self._changed = False
         self._armed_ns: int | None = None
-        self._degraded_ns = 0
+        self._degraded_ns: dict[str, int] = {}
         self._opening: Lineage | None = None
         self._grant = 0
 
@@ -154,9 +161,11 @@ class StreamActor:
 
     def _settle(self) -> None:
         """Let go what has waited long enough, and have the worker come back for what has not."""
-        if shed := self._accounts.shed():
+        if self._accounts.shed():
             expected = f"at most {self._context.queue_frames} frames waiting"
-            self._report("shed", "", expected, f"{shed} more; the oldest were dropped", count=shed)
+            for origin, shed in self.mailbox.shed_since().items():
+                received, stream = f"{shed} more; the oldest were dropped", self._stream_of(origin)
+                self._report("shed", "", expected, received, count=shed, stream=stream)
         session = self.session
         if session is None or (deadline_ns := session.deadline_ns) is None:
             return
@@ -175,26 +184,33 @@ class StreamActor:
         if session is None:
             self._buffer(packet, frame=frame)
             return
-        if time.monotonic_ns() < self._degraded_ns:
+        stream = self._stream_of(packet.origin)
+        if time.monotonic_ns() < self._degraded_ns.get(stream, 0):
             self._accounts.receive(frame=frame)
             self._accounts.refuse(session, frame=frame)
             expected = f"at most {self._context.step_limit_ns / 1e9:g} s of processor time for a message"
-            self._report("overload", "", expected, "a stream that took more just before")
+            self._report("overload", "", expected, "a stream that took more just before", stream=stream)
             return
         began_ns = time.thread_time_ns()
         try:
             self._track(session, packet, frame=frame)
         finally:
-            self._charge(time.thread_time_ns() - began_ns)
+            self._charge(stream, time.thread_time_ns() - began_ns)
 
-    def _charge(self, took_ns: int) -> None:
-        """Degrade the stream when a message took too long: the others of the process waited for it."""
+    def _charge(self, stream: str, took_ns: int) -> None:
+        """Degrade a stream when a message of it took too long: the others of the process waited for it."""
         if took_ns <= self._context.step_limit_ns:
             return
-        self._degraded_ns = time.monotonic_ns() + REST * took_ns
-        log.warning("stream_degraded", stream=self.stream, took_s=took_ns / 1e9, refused_s=REST * took_ns / 1e9)
+        now_ns = time.monotonic_ns()
+        self._degraded_ns = {name: until for name, until in self._degraded_ns.items() if until > now_ns}
+        self._degraded_ns[stream] = now_ns + REST * took_ns
+        log.warning("stream_degraded", stream=stream, took_s=took_ns / 1e9, refused_s=REST * took_ns / 1e9)
         expected = f"at most {self._context.step_limit_ns / 1e9:g} s of processor time for a message"
-        self._report("overload", "", expected, f"{took_ns / 1e9:.3f} s")
+        self._report("overload", "", expected, f"{took_ns / 1e9:.3f} s", stream=stream)
+
+    def _stream_of(self, origin: str) -> str:
+        """Return the stream of what came on a key."""
+        return origin.removeprefix(f"{self._context.keys.prefix}/")
 
     def _track(self, session: Session, packet: Packet, *, frame: bool) -> None:
         began_ns = time.perf_counter_ns()
@@ -204,10 +220,7 @@ class StreamActor:
         if message is None:
             return
         now_ns = time.monotonic_ns()
-        self.meter.arrived(packet.now_ns, frame=frame)
-        if self.stale and frame:
-            self.stale = False
-            log.info("stream_back", stream=self.stream)
+        self._arrived(packet, message.stream, frame=frame)
         ticket = Arrival(packet.wall_ns, packet.now_ns, time.perf_counter_ns() - began_ns)
         if isinstance(message, schemas.Points):
             outputs = session.on_points(message, now_ns, ticket=ticket)
@@ -217,14 +230,24 @@ class StreamActor:
             outputs = session.on_detections(message, now_ns, arrived_ns=packet.now_ns, ticket=ticket)
         self._deliver(outputs)
 
+    def _arrived(self, packet: Packet, stream: str, *, frame: bool) -> None:
+        """Note a valid message of a stream."""
+        self.meter.arrived(packet.now_ns, frame=frame)
+        if self.fused and (stream in self.sensors or len(self.sensors) < MAX_SENSORS):
+            self.sensors.setdefault(stream, StreamMeter(packet.now_ns)).arrived(packet.now_ns, frame=frame)
+        if stream in self.stale and frame:
+            self.stale.discard(stream)
+            log.info("stream_back", stream=stream)
+
     def _read(self, packet: Packet, *, frame: bool) -> schemas.Detections | schemas.Points | None:
         """Return the message of a packet; None after a refusal."""
         kind = schemas.Detections if frame else schemas.Points
+        stream = self._stream_of(packet.origin)
         try:
-            return message_of(packet, kind, self.stream, self._context.limits)
+            return message_of(packet, kind, stream, self._context.limits)
         except schemas.MessageError as error:
             self._accounts.refuse(self.session, frame=frame)
-            self._report(error.code, error.path, error.expected, error.received, what=kind.__name__)
+            self._report(error.code, error.path, error.expected, error.received, what=kind.__name__, stream=stream)
             return None
 
     def _deliver(self, outputs: Sequence[Output]) -> None:
@@ -248,11 +271,13 @@ class StreamActor:
             else:
                 self._context.reporter.report(output, time.monotonic_ns())
 
-    def _report(self, code: str, path: str, expected: str, received: str, *, what: str = "", count: int = 1) -> None:
+    def _report(
+        self, code: str, path: str, expected: str, received: str, *, what: str = "", count: int = 1, stream: str = ""
+    ) -> None:
         message = f"{what or 'Stream'}: {path or 'message'}: expected {expected}, received {received}."
         problem = problem_of(
             code,
-            stream=self.stream,
+            stream=stream or self.stream,
             instance=self._context.instance,
             path=path,
             expected=expected,
@@ -372,6 +397,8 @@ class StreamActor:
 
         def restore(checkpoint: Checkpoint) -> Session:
             now_ns = time.monotonic_ns()
+            if checkpoint.fused is not self.fused:
+                raise CheckpointError(f"of {'several streams' if checkpoint.fused else 'one stream'}, by `fuse` then")
             return Session.restore(
                 checkpoint, now_ns, context.policy, instance=context.instance, tracker=context.tracker
             )
@@ -405,6 +432,7 @@ class StreamActor:
                 self.stream,
                 context.parameters_of(self.stream),
                 context.policy,
+                fused=self.fused,
                 instance=context.instance,
                 life=lineage,
                 tracker=context.tracker,
@@ -477,6 +505,10 @@ class StreamActor:
         session = self.session
         if session is None:
             return None
-        return self.meter.summary(
-            self._accounts.state(session), now_ns, stale=self.stale, degraded=now_ns < self._degraded_ns
-        )
+        degraded = any(now_ns < until for until in tuple(self._degraded_ns.values()))
+        stale, sensors = frozenset(self.stale), sorted(self.sensors)
+        state = self._accounts.state(session)
+        summary = self.meter.summary(state, now_ns, stale=bool(sensors) and stale >= set(sensors), degraded=degraded)
+        if not self.fused:
+            return summary
+        return summary.model_copy(update={"sensors": tuple(sensors), "silent": tuple(sorted(stale))})

@@ -22,14 +22,14 @@ import optipmb_schemas as schemas
 import optipmb
 from optipmb_service.session import convert
 from optipmb_service.session.document import Document
-from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory
+from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, SensorState
 from optipmb_service.session.timeline import EPOCHS, WINDOW, Cursor, FrameId, SeenNumbers
-from optipmb_service.session.values import MAX_CLOUD_WAIT_NS, MAX_COUNT, MAX_ERROR, MAX_LABELS, Deliveries
+from optipmb_service.session.values import MAX_CLOUD_WAIT_NS, MAX_COUNT, MAX_ERROR, MAX_LABELS, MAX_SENSORS, Deliveries
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
-VERSION: Final = 2
+VERSION: Final = 3
 MAGIC: Final = b"OPTIPMB\0"
 DIGEST: Final = 16
 HEAD: Final = len(MAGIC) + 2 + DIGEST
@@ -37,6 +37,10 @@ MAX_BYTES: Final = 2**28
 MAX_SOFTWARE: Final = 100
 MAX_PROFILES: Final = 64
 """Profiles whose form in checkpoints is remembered."""
+MAX_STREAM: Final = 512
+"""Characters of the name of a stream, at least."""
+FUSED: Final = 3
+"""The version since which a session may have several sensors."""
 MAX_LABEL: Final = 64
 """Characters of a class name, as messages take it."""
 
@@ -68,41 +72,38 @@ class Recorded:
     revision: int
     packed: dict[str, bytes] = field(default_factory=dict, compare=False)
 
-    @property
-    def frame_id(self) -> FrameId:
-        """Which frame it is."""
-        return FrameId(self.message.epoch, self.message.seq, self.message.stamp_ns)
-
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
     """What a session is made of, between two frames. Nothing in it changes any more.
 
     Attributes:
-        stream: `site/node/sensor`.
+        stream: `site/node/sensor`; that of the tracks, where several sensors feed the session.
         parameters: the profile.
+        fused: whether several sensors feed it.
         cloud_wait_ns: the wait for clouds that was asked for, None where the service's own holds.
-        quarantine: the error for which frames are refused; empty while they are not.
-        epochs: which frames came.
+        quarantine: the error for which frames of a sensor are refused, by sensor.
+        seen: which frames came, by sensor.
         base: the state before the window.
         window: the frames of the window.
         head: the present state.
         deliveries: what was not tracked, and what was corrected.
-        newest_cloud_ns: stamp of the cloud that arrived last.
+        newest_cloud_ns: stamp of the cloud that arrived last, by sensor.
         run: how often the session was taken up again.
         software: version of the service that wrote it.
     """
 
     stream: str
     parameters: optipmb.Parameters
+    fused: bool
     cloud_wait_ns: int | None
-    quarantine: str
-    epochs: tuple[SeenNumbers, ...]
+    quarantine: Mapping[str, str]
+    seen: Mapping[str, tuple[SeenNumbers, ...]]
     base: FilterState
     window: tuple[Recorded, ...]
     head: FilterState
     deliveries: Deliveries
-    newest_cloud_ns: int | None
+    newest_cloud_ns: Mapping[str, int]
     run: int = 0
     software: str = _SOFTWARE
 
@@ -110,6 +111,11 @@ class Checkpoint:
     def session(self) -> str:
         """The id of the present life of the density."""
         return self.head.session
+
+    def frame_id(self, one: Recorded) -> FrameId:
+        """Return which frame one of the window is."""
+        message = one.message
+        return FrameId(message.epoch, message.seq, message.stamp_ns, message.stream if self.fused else "")
 
 
 def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
@@ -120,7 +126,7 @@ def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
 def state_bytes(checkpoint: Checkpoint) -> bytes:
     """Return the bytes of what does not depend on how messages were delivered."""
     window = tuple(replace(one, revision=0) for one in checkpoint.window)
-    bare = replace(checkpoint, window=window, deliveries=Deliveries(), newest_cloud_ns=None, run=0, software="")
+    bare = replace(checkpoint, window=window, deliveries=Deliveries(), newest_cloud_ns={}, run=0, software="")
     return encode_checkpoint(bare)
 
 
@@ -174,9 +180,14 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
         "software": checkpoint.software,
         "stream": checkpoint.stream,
         "parameters": parameters,
+        "fused": checkpoint.fused,
         "cloud_wait_ns": checkpoint.cloud_wait_ns,
-        "quarantine": checkpoint.quarantine,
-        "epochs": [[seen.epoch, seen.highest, _mask(seen.mask)] for seen in checkpoint.epochs],
+        "quarantine": [list(one) for one in sorted(checkpoint.quarantine.items())],
+        "epochs": [
+            [name, seen.epoch, seen.highest, _mask(seen.mask)]
+            for name, epochs in sorted(checkpoint.seen.items())
+            for seen in epochs
+        ],
         "base": _state(checkpoint.base),
         "window": [
             {
@@ -190,7 +201,7 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
         # Without a window the present is its beginning.
         "head": _state(checkpoint.head) if checkpoint.window else None,
         "deliveries": _table(checkpoint.deliveries),
-        "newest_cloud_ns": checkpoint.newest_cloud_ns,
+        "newest_cloud_ns": [list(one) for one in sorted(checkpoint.newest_cloud_ns.items())],
         "run": checkpoint.run,
     }
 
@@ -221,7 +232,7 @@ def _mask(mask: int) -> bytes:
 
 
 def _state(state: FilterState) -> dict[str, Any]:
-    density, cursor = state.density, state.cursor
+    density, last = state.density, state.last
     return {
         "stamp_ns": density.stamp_ns,
         "next_id": density.next_id,
@@ -229,14 +240,21 @@ def _state(state: FilterState) -> dict[str, Any]:
         "session": state.session,
         "starts": state.starts,
         "generation": state.generation,
-        "course": [cursor.epoch, cursor.seq, cursor.era, cursor.generation, cursor.newest_ns, cursor.floor_ns],
-        "jumped": [cursor.jumped, cursor.jumped_ns],
-        "last": None if state.last is None else [state.last.epoch, state.last.seq, state.last.stamp_ns],
-        "tracked": None if state.tracked is None else list(state.tracked),
+        "last": None if last is None else [last.epoch, last.seq, last.stamp_ns, last.sensor],
         "tracks": state.tracks,
         "counts": _table(state.counts),
-        "reported": sorted(state.reported),
-        "whereabouts": _table(state.pose_history),
+        "sensors": [{"sensor": name, **_sensor(one)} for name, one in sorted(state.sensors.items())],
+    }
+
+
+def _sensor(one: SensorState) -> dict[str, Any]:
+    cursor = one.cursor
+    return {
+        "course": [cursor.epoch, cursor.seq, cursor.era, cursor.generation, cursor.newest_ns, cursor.floor_ns],
+        "jumped": [cursor.jumped, cursor.jumped_ns],
+        "tracked": None if one.tracked is None else list(one.tracked),
+        "reported": sorted(one.reported),
+        "whereabouts": _table(one.pose_history),
     }
 
 
@@ -254,56 +272,87 @@ def _read_1(body: Document) -> Checkpoint:
         if not isinstance(table, dict):
             raise body.wrong(f"parameters.classes.{name}", "a map", type(table).__name__)
         table.pop("heading_sign_reliable", None)
-    return _read(body, earlier=True)
+    return _read(body, 1)
 
 
 def _read_2(body: Document) -> Checkpoint:
-    return _read(body, earlier=False)
+    """Read version 2, whose sessions have one sensor, without a name."""
+    return _read(body, 2)
 
 
-def _read(body: Document, *, earlier: bool) -> Checkpoint:
+def _read_3(body: Document) -> Checkpoint:
+    return _read(body, 3)
+
+
+def _read(body: Document, version_: int) -> Checkpoint:
     stream = body.stream("stream")
     parameters = optipmb.parse_parameters(body.map("parameters"))
     schemas.SessionParameters(profile=parameters.name)  # as messages take it
-    base = _read_state(body.document("base"), stream, parameters, earlier=earlier)
-    window = tuple(_read_recorded(one, stream) for one in body.documents("window"))
-    if len({one.frame_id for one in window}) != len(window):
-        raise body.wrong("window", "every frame once", "one again")
-    head = _read_state(body.document("head"), stream, parameters, earlier=earlier) if window else base
-    return Checkpoint(
+    fused = version_ >= FUSED and body.flag("fused")
+    base = _read_state(body.document("base"), stream, parameters, version_)
+    window = tuple(_read_recorded(one, None if fused else stream) for one in body.documents("window"))
+    head = _read_state(body.document("head"), stream, parameters, version_) if window else base
+    if version_ < FUSED:
+        newest_ns = body.optional("newest_cloud_ns", body.whole)
+        quarantine, newest_cloud_ns = {"": body.text("quarantine", MAX_ERROR)}, {"": newest_ns}
+    else:
+        errors, newest = body.rows("quarantine", 2), body.rows("newest_cloud_ns", 2)
+        quarantine = {_read_sensor(row): row.text("1", MAX_ERROR) for row in errors}
+        newest_cloud_ns = {_read_sensor(row): row.whole("1") for row in newest}
+    checkpoint = Checkpoint(
         stream=stream,
         parameters=parameters,
+        fused=fused,
         cloud_wait_ns=body.optional("cloud_wait_ns", lambda name: body.whole(name, high=MAX_CLOUD_WAIT_NS)),
-        quarantine=body.text("quarantine", MAX_ERROR),
-        epochs=_read_epochs(body),
+        quarantine={name: error for name, error in quarantine.items() if error},
+        seen=_read_epochs(body, version_),
         base=base,
         window=window,
         head=head,
         deliveries=Deliveries(**body.document("deliveries").counts(Deliveries.__slots__)),
-        newest_cloud_ns=body.optional("newest_cloud_ns", body.whole),
+        newest_cloud_ns={name: stamp for name, stamp in newest_cloud_ns.items() if stamp is not None},
         run=body.count("run"),
         software=body.text("software", MAX_SOFTWARE),
     )
+    if len({checkpoint.frame_id(one) for one in window}) != len(window):
+        raise body.wrong("window", "every frame once", "one again")
+    names = {*head.sensors, *base.sensors, *checkpoint.seen, *quarantine, *newest_cloud_ns}
+    if any(bool(name) != fused for name in names) or (fused and base.last and base.last.sensor not in base.sensors):
+        raise body.wrong("sensors", "the streams of its sensors, or none for its own", "others")
+    return checkpoint
 
 
-def _read_epochs(body: Document) -> tuple[SeenNumbers, ...]:
-    epochs = tuple(_read_seen(one) for one in body.rows("epochs", 3))
-    if len(epochs) > EPOCHS or len({one.epoch for one in epochs}) != len(epochs):
-        raise body.wrong("epochs", f"at most {EPOCHS} epochs, each once", f"{len(epochs)}")
-    return epochs
+def _read_sensor(row: Document, name: str = "0") -> str:
+    """Return the name of a sensor; empty for the only one of a stream's own session."""
+    return row.stream(name) if row.text(name, MAX_STREAM) else ""
 
 
-def _read_seen(row: Document) -> SeenNumbers:
-    highest, mask = row.whole("1"), int.from_bytes(row.binary("2"), "big")
+def _read_epochs(body: Document, version_: int) -> dict[str, tuple[SeenNumbers, ...]]:
+    rows = body.rows("epochs", 3 if version_ < FUSED else 4)
+    seen: dict[str, tuple[SeenNumbers, ...]] = {}
+    for row in rows:
+        name, first = ("", 0) if version_ < FUSED else (_read_sensor(row), 1)
+        seen[name] = (*seen.get(name, ()), _read_seen(row, first))
+    for epochs in seen.values():
+        if len(epochs) > EPOCHS or len({one.epoch for one in epochs}) != len(epochs):
+            raise body.wrong("epochs", f"at most {EPOCHS} epochs, each once", f"{len(epochs)}")
+    return seen
+
+
+def _read_seen(row: Document, first: int) -> SeenNumbers:
+    epoch, number, bits = (str(first + at) for at in range(3))
+    highest, mask = row.whole(number), int.from_bytes(row.binary(bits), "big")
     if not mask & 1 or mask.bit_length() > min(WINDOW, highest + 1):
-        raise row.wrong("2", f"which of the {WINDOW} numbers up to {highest} came, with itself", "another mask")
-    return SeenNumbers(row.epoch("0"), highest, mask)
+        raise row.wrong(bits, f"which of the {WINDOW} numbers up to {highest} came, with itself", "another mask")
+    return SeenNumbers(row.epoch(epoch), highest, mask)
 
 
-def _read_recorded(one: Document, stream: str) -> Recorded:
+def _read_recorded(one: Document, stream: str | None) -> Recorded:
+    """Read a frame of the window, of one stream or, without its name, of the stream that it says."""
     points = one.optional("points", one.binary)
     message = schemas.decode(one.binary("detections"), schemas.Detections, limits=schemas.STORED)
     cloud = None if points is None else schemas.decode(points, schemas.Points, limits=schemas.STORED)
+    stream = message.stream if stream is None else stream
     if message.stream != stream:
         raise one.wrong("detections", f"a frame of {stream}", f"one of {message.stream}")
     if cloud is not None:
@@ -313,22 +362,39 @@ def _read_recorded(one: Document, stream: str) -> Recorded:
     return Recorded(message, cloud, one.flag("missed"), one.count("revision"))
 
 
-def _read_state(one: Document, stream: str, parameters: optipmb.Parameters, *, earlier: bool) -> FilterState:
+def _read_state(one: Document, stream: str, parameters: optipmb.Parameters, version_: int) -> FilterState:
     columns = schemas.read_columns(one.map("density"))
     stamp_ns, next_id = one.whole("stamp_ns", low=-1), one.whole("next_id", high=MAX_COUNT)
-    density = optipmb.density_of(stamp_ns, next_id, columns, parameters.labels, earlier=earlier)
+    density = optipmb.density_of(stamp_ns, next_id, columns, parameters.labels, earlier=version_ == 1)
     session = one.identity("session")
     convert.density_of(density, stream=stream, session=session, parameters=parameters)  # it can be asked for
-    cursor = one.row("course", 6)
-    jumped = None if one.absent("jumped") else one.row("jumped", 2)  # an earlier version had none
-    last = None if one.absent("last") else one.row("last", 3)
-    tracked = None if one.absent("tracked") else one.row("tracked", 2)
-    where = one.document("whereabouts")
+    if version_ < FUSED:
+        last = None if one.absent("last") else one.row("last", 3)
+        sensors = {"": _read_sensor_state(one)}
+    else:
+        last, rows = None if one.absent("last") else one.row("last", 4), one.documents("sensors")
+        sensors = {_read_sensor(row, "sensor"): _read_sensor_state(row) for row in rows}
+        if len(rows) > MAX_SENSORS or len(rows) > len(sensors):
+            raise one.wrong("sensors", f"at most {MAX_SENSORS}, each once", f"{len(rows)}")
+    of = "" if last is None or version_ < FUSED else _read_sensor(last, "3")
     return FilterState(
         density=density,
         session=session,
         starts=one.count("starts"),
         generation=one.count("generation"),
+        last=None if last is None else FrameId(last.epoch("0"), last.whole("1"), last.whole("2"), of),
+        tracks=one.whole("tracks"),
+        counts=FrameCounts(**one.document("counts").counts(FrameCounts.__slots__)),
+        sensors=sensors,
+    )
+
+
+def _read_sensor_state(one: Document) -> SensorState:
+    cursor = one.row("course", 6)
+    jumped = None if one.absent("jumped") else one.row("jumped", 2)  # an earlier version had none
+    tracked = None if one.absent("tracked") else one.row("tracked", 2)
+    where = one.document("whereabouts")
+    return SensorState(
         cursor=Cursor(
             cursor.optional("0", cursor.epoch),
             cursor.whole("1"),
@@ -339,10 +405,7 @@ def _read_state(one: Document, stream: str, parameters: optipmb.Parameters, *, e
             0 if jumped is None else jumped.count("0"),
             0 if jumped is None else jumped.whole("1"),
         ),
-        last=None if last is None else FrameId(last.epoch("0"), last.whole("1"), last.whole("2")),
         tracked=None if tracked is None else (tracked.epoch("0"), tracked.whole("1")),
-        tracks=one.whole("tracks"),
-        counts=FrameCounts(**one.document("counts").counts(FrameCounts.__slots__)),
         reported=frozenset(one.texts("reported", MAX_LABELS, MAX_LABEL)),
         pose_history=PoseHistory(
             stamp_ns=where.optional("stamp_ns", where.whole),
@@ -354,7 +417,7 @@ def _read_state(one: Document, stream: str, parameters: optipmb.Parameters, *, e
     )
 
 
-_READERS: Final[dict[int, Callable[[Document], Checkpoint]]] = {1: _read_1, 2: _read_2}
+_READERS: Final[dict[int, Callable[[Document], Checkpoint]]] = {1: _read_1, 2: _read_2, 3: _read_3}
 
 
 def digest_of(checkpoint: Checkpoint) -> str:
@@ -365,4 +428,7 @@ def digest_of(checkpoint: Checkpoint) -> str:
 def forgotten(checkpoint: Checkpoint) -> Checkpoint:
     """Return a checkpoint of a session that was reset, without its counts: what remains of a stream that was closed."""
     state = replace(checkpoint.head, counts=FrameCounts())
-    return replace(checkpoint, base=state, head=state, window=(), deliveries=Deliveries())
+    seen = checkpoint.seen
+    if checkpoint.fused:  # the next frames may have any clock
+        state, seen = replace(state, last=None, sensors={}), {}
+    return replace(checkpoint, seen=seen, base=state, head=state, window=(), deliveries=Deliveries())

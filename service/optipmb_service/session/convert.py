@@ -140,6 +140,7 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
     path_fields = {} if paths is None else schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
     return make(
         stream=stream,
+        sensor=frame_id.sensor or None,
         epoch=frame_id.epoch,
         seq=frame_id.seq,
         stamp_ns=frame_id.stamp_ns,

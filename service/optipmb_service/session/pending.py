@@ -1,4 +1,4 @@
-"""What arrived and was not gone through yet: clouds, and frames that are held until they are ready.
+"""What arrived of a sensor and was not gone through yet: clouds, and frames that are held until they are ready.
 
 A frame is held for its point cloud and, after a restore, for frames before it that may still come. The timeline here is
 that of the past with the frames held: a frame is judged by it when it arrives, and by the past's when its turn comes.
@@ -7,10 +7,11 @@ that of the past with the frames held: a frame is judged by it when it arrives, 
 from __future__ import annotations
 
 from bisect import insort
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from optipmb_service.session.cloud_buffer import CloudBuffer
+from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.state import size_of
 from optipmb_service.session.timeline import FrameId, hold_until
 
@@ -21,10 +22,11 @@ if TYPE_CHECKING:
 
     import optipmb
     from optipmb_service.session.state import FilterState
-    from optipmb_service.session.timeline import Decision, Timeline
+    from optipmb_service.session.timeline import Decision, Order, Timeline
     from optipmb_service.session.values import Policy
 
-    Order = tuple[int, int, int]
+    Judged = tuple[Timeline | FusedTimeline, Decision, Timeline | FusedTimeline]
+
 
 MAX_HELD: Final = 64
 """Frames held for their clouds at once; beyond it the oldest goes on without."""
@@ -55,7 +57,7 @@ class Held:
     ignored: int
     deadline_ns: int | None
     ticket: Any
-    judged: tuple[Timeline, Decision, Timeline]
+    judged: Judged
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,7 @@ class PendingFrames:
         timeline: of the past.
     """
 
-    def __init__(self, policy: Policy, timeline: Timeline) -> None:
+    def __init__(self, policy: Policy, timeline: Timeline | FusedTimeline) -> None:
         self.policy = policy
         self.timeline = timeline
         self.clouds = CloudBuffer(policy.clouds, policy.cloud_bytes)
@@ -96,7 +98,7 @@ class PendingFrames:
         ignored: int,
         arrived_ns: int,
         ticket: Any,
-        judged: tuple[Timeline, Decision, Timeline],
+        judged: Judged,
     ) -> None:
         """Put a frame where it belongs; the arguments are those of `Held`, and when it arrived (monotonic)."""
         deadline_ns = hold_until(
@@ -112,7 +114,7 @@ class PendingFrames:
         held = Held(message, frame_id, order, frame, ignored, deadline_ns, ticket, judged)
         insort(self._held, held, key=lambda one: one.order)
 
-    def follow(self, past: Timeline, base: FilterState, gone: frozenset[FrameId]) -> None:
+    def follow(self, past: Timeline | FusedTimeline, base: FilterState, gone: frozenset[FrameId]) -> None:
         """Take over where the past is now.
 
         Args:
@@ -120,12 +122,17 @@ class PendingFrames:
             base: the state before its window.
             gone: the frames that have left the window.
         """
-        if gone:
-            self.timeline = self.timeline.settle(base.cursor, base.last, gone)
-            if base.last is not None:
-                self.clouds.forget_before(base.last.stamp_ns, self.policy.gap_limit_ns)
+        if gone and base.last is not None:
+            self.clouds.forget_before(base.last.stamp_ns, self.policy.gap_limit_ns)
         if not self._held:
             self.timeline = past
+        elif isinstance(past, FusedTimeline):
+            # Frames of other sensors were processed, of which the timeline with those held knows nothing.
+            self.timeline = past
+            for one in self._held:
+                self.timeline = self.timeline.judge(one.frame_id)[1]
+        elif gone:
+            self.timeline = self.timeline.settle(base.cursors, base.last, gone)
 
     def clear(self) -> int:
         """Drop all; returns how many there were."""
@@ -133,6 +140,11 @@ class PendingFrames:
         self._held.clear()
         self.held_bytes = 0
         return count
+
+    @property
+    def first(self) -> FrameId | None:
+        """The earliest frame held."""
+        return self._held[0].frame_id if self._held else None
 
     def deadline_ns(self, complete: Callable[[FrameId], bool]) -> int | None:
         """Return when `take` is due (monotonic); None while nothing waits.
@@ -156,8 +168,6 @@ class PendingFrames:
             now_ns: monotonic time; None: nothing waits any longer.
             complete: whether no frame is missing before one.
         """
-        if now_ns is not None and self.recovery_ns is not None and now_ns >= self.recovery_ns:
-            self.recovery_ns = None
         if not self._held:
             return None
         head = self._held[0]
@@ -177,7 +187,8 @@ class PendingFrames:
     def _cloud(self, held: Held) -> schemas.Points | None:
         if held.message.has_points is False:
             return None
-        return self.clouds.get(held.frame_id.epoch, held.frame_id.stamp_ns, self.timeline.knows)
+        frame_id, known = held.frame_id, self.timeline.knows
+        return self.clouds.get(frame_id.epoch, frame_id.stamp_ns, lambda one: known(replace(frame_id, epoch=one)))
 
     def _crowded(self, held: Held) -> bool:
         """Whether longer waiting for a cloud would cost the frames behind it theirs.

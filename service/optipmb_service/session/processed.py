@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from optipmb_service.session.checkpoint import Recorded
+from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.reorder_window import ReorderWindow
 from optipmb_service.session.restored_window import window_of
 from optipmb_service.session.state import Entry, size_of
@@ -36,12 +37,14 @@ class ProcessedFrames:
         transition: goes from one state to the next.
         policy: how far back the window reaches.
         life: what an earlier session of the stream left behind.
+        fused: whether the frames are those of several sensors.
     """
 
-    def __init__(self, transition: Transition, policy: Policy, life: Lineage) -> None:
+    def __init__(self, transition: Transition, policy: Policy, life: Lineage, *, fused: bool) -> None:
         self.transition = transition
         self._policy = policy
-        self.timeline = Timeline(policy.gap_limit_ns)
+        gap_limit_ns = policy.gap_limit_ns
+        self.timeline: Timeline | FusedTimeline = FusedTimeline(gap_limit_ns) if fused else Timeline(gap_limit_ns)
         self._history = ReorderWindow(empty(transition, None, life.next_id, life.starts), transition.step)
 
     @property
@@ -61,9 +64,9 @@ class ProcessedFrames:
 
     def complete_until(self, frame_id: FrameId) -> bool:
         """Whether no frame is missing between the last one tracked of its epoch and this one."""
-        return self.timeline.complete_until(frame_id, self.head.tracked)
+        return self.timeline.complete_until(frame_id, self.head.sensor(frame_id.sensor).tracked)
 
-    def placed(self, ready: Ready, decision: Decision, timeline: Timeline) -> list[Entry]:
+    def placed(self, ready: Ready, decision: Decision, timeline: Timeline | FusedTimeline) -> list[Entry]:
         """Return the frames of the window with one more among them.
 
         Args:
@@ -76,9 +79,9 @@ class ProcessedFrames:
         entry = Entry(frame_id, decision.place, message, points, ready.missed, 0, frame, ignored, weight)
         return [*self.entries, entry] if decision.last else self._history.inserted(entry, timeline.places())
 
-    def amended(self, points: schemas.Points) -> list[Entry] | None:
+    def amended(self, points: schemas.Points, frame_id: FrameId) -> list[Entry] | None:
         """Return the frames of the window, a late cloud given to those that lack it; None when none does."""
-        placed = self._history.amended(points, self.timeline.knows)
+        placed = self._history.amended(points, frame_id, published=self.timeline.knows(frame_id))
         return None if all(new is old for new, old in zip(placed, self.entries, strict=True)) else placed
 
     def go(self, placed: Sequence[Entry], *, behind: bool) -> list[Outcome]:
@@ -93,10 +96,10 @@ class ProcessedFrames:
         """
         return self._history.append(placed[-1]) if behind else self._history.redo(placed)
 
-    def settle(self, timeline: Timeline) -> frozenset[FrameId]:
+    def settle(self, timeline: Timeline | FusedTimeline) -> frozenset[FrameId]:
         """Take over the timeline with what was gone through; returns the frames that have left the window by it."""
         gone = self._history.trim(self._policy)
-        self.timeline = timeline.settle(self.base.cursor, self.base.last, gone) if gone else timeline
+        self.timeline = timeline.settle(self.base.cursors, self.base.last, gone) if gone else timeline
         return gone
 
     def note(self, frame_id: FrameId) -> None:
@@ -107,7 +110,7 @@ class ProcessedFrames:
         """Go on from a moment without a way back behind it; with another transition when the profile changes."""
         self.transition = transition or self.transition
         self._history = ReorderWindow(state, self.transition.step)
-        self.timeline = self.timeline.settle(state.cursor, state.last, frozenset(self.timeline.frame_ids))
+        self.timeline = self.timeline.settle(state.cursors, state.last, frozenset(self.timeline.frame_ids))
 
     def report_by(self, transition: Transition) -> None:
         """Go on by a transition that tracks as the one before and reports more or less of the tracks."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.timeline import JUMP_FRAMES
-from optipmb_service.session.values import SECOND
+from optipmb_service.session.values import MAX_SENSORS, SECOND
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 class Refusals:
-    """Makes the problems of one stream.
+    """Makes the problems of one session, on the stream of the sensor that is concerned.
 
     Args:
-        stream: `site/node/sensor`.
+        stream: `site/node/sensor`; that of the tracks, where several sensors feed the session.
         instance: name of the service.
     """
 
@@ -55,6 +55,11 @@ class Refusals:
         expected = f"a stamp near the one before, or {JUMP_FRAMES} frames in a row that agree on the jump"
         return self._problem("time_jump", entry.frame_id, "stamp_ns", expected, received)
 
+    def other_clock(self, frame_id: FrameId, jump_ns: int) -> schemas.Problem:
+        """A stamp far from those of the other sensors of the session."""
+        expected = "a stamp near those of the session's other sensors, or all of them on another clock"
+        return self._problem("time_jump", frame_id, "stamp_ns", expected, f"{jump_ns / SECOND:+.3f} s")
+
     def restarted(self, entry: Entry, begun: Begun) -> schemas.Problem:
         """A session that began anew: all its tracks have ended."""
         received = f"{begun.reason}, {begun.jump_ns / SECOND:+.3f} s"
@@ -63,6 +68,10 @@ class Refusals:
     def effort(self, frame_id: FrameId, error: optipmb.EffortError) -> schemas.Problem:
         """A frame that needs too much computing."""
         return self._problem("overload", frame_id, error.path, error.expected, error.received)
+
+    def too_many(self, frame_id: FrameId) -> schemas.Problem:
+        """A sensor too many for the session."""
+        return self._problem("refused", frame_id, "stream", f"at most {MAX_SENSORS} sensors in a session", "another")
 
     def failed(self, frame_id: FrameId, error: str) -> schemas.Problem:
         """A step that raised."""
@@ -88,7 +97,7 @@ class Refusals:
     def _problem(self, code: str, frame_id: FrameId, path: str, expected: str, received: str) -> schemas.Problem:
         return problem_of(
             code,
-            stream=self._stream,
+            stream=frame_id.sensor or self._stream,
             instance=self._instance,
             path=path,
             expected=expected,

@@ -85,19 +85,20 @@ class ReorderWindow:
         ]
         return sorted([*placed, entry], key=lambda one: one.order)
 
-    def amended(self, points: schemas.Points, publishers: Callable[[bytes], bool]) -> list[Entry]:
-        """Return the frames of the window, a late cloud given to those of its stamp that lack one.
+    def amended(self, points: schemas.Points, frame_id: FrameId, *, published: bool) -> list[Entry]:
+        """Return the frames of the window, a late cloud given to those of its sensor and stamp that lack one.
 
         Args:
             points: the cloud.
-            publishers: whether detections came in an epoch; see `CloudBuffer.get`.
+            frame_id: its epoch, stamp and sensor.
+            published: whether detections came in that epoch; see `CloudBuffer.get`.
         """
         return [
             replace(one, points=points, missed=False, weight=one.weight + points.xyz.nbytes, packed={})
-            if one.frame_id.stamp_ns == points.stamp_ns
+            if (one.frame_id.stamp_ns, one.frame_id.sensor) == (frame_id.stamp_ns, frame_id.sensor)
             and one.points is None
             and one.message.has_points is not False
-            and (one.frame_id.epoch == points.epoch or not publishers(points.epoch))
+            and (one.frame_id.epoch == frame_id.epoch or not published)
             else one
             for one in self._entries
         ]
@@ -128,7 +129,8 @@ class ReorderWindow:
 
     def trim(self, policy: Policy) -> frozenset[FrameId]:
         """Let what no longer belongs to the window go; returns which frames that were."""
-        keep = self._fitting(policy.rewind_ns, policy.rewind_frames, policy.rewind_bytes)
+        sensors = max(1, len(self.head.sensors))
+        keep = self._fitting(policy.rewind_ns, policy.rewind_frames * sensors, policy.rewind_bytes * sensors)
         cut = len(self._entries) - keep
         if not cut:
             return frozenset()
@@ -157,6 +159,8 @@ class ReorderWindow:
         for entry in reversed(self._entries):
             if later is not None and later.place.generation == entry.place.generation:
                 elapsed += later.time_ns - entry.time_ns
+            elif later is not None and entry.frame_id.sensor:
+                break  # the clock of several sensors is not set back
             weight += entry.weight
             if number >= most or weight > most_bytes or (span_ns is not None and elapsed > span_ns) or span_ns == 0:
                 break

@@ -46,6 +46,9 @@ class SessionReporting:
         if decision.verdict is Verdict.RETIRED:
             self.deliveries.refused += 1
             return [self.complain.retired(frame_id)]
+        if decision.verdict is Verdict.JUMPED:
+            self.deliveries.refused += 1
+            return [self.complain.other_clock(frame_id, decision.place.jump_ns)]
         self.deliveries.late += 1
         return [self.complain.late(frame_id, decision.place.jump_ns)]
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import optipmb
 from optipmb_service.session import convert
 from optipmb_service.session.checkpoint import CheckpointError
+from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.state import Entry, size_of
 from optipmb_service.session.timeline import Timeline
 
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
 
 
-def window_of(checkpoint: Checkpoint, gap_limit_ns: int) -> tuple[Timeline, list[Entry]]:
+def window_of(checkpoint: Checkpoint, gap_limit_ns: int) -> tuple[Timeline | FusedTimeline, list[Entry]]:
     """Return the timeline and the frames of the window in the order of processing.
 
     Args:
@@ -25,8 +26,14 @@ def window_of(checkpoint: Checkpoint, gap_limit_ns: int) -> tuple[Timeline, list
         CheckpointError: its frames do not fit together.
     """
     base = checkpoint.base
-    by_frame_id = {one.frame_id: one for one in checkpoint.window}
-    timeline = Timeline.resume(gap_limit_ns, checkpoint.epochs, base.cursor, base.last, frozenset(by_frame_id))
+    by_frame_id = {checkpoint.frame_id(one): one for one in checkpoint.window}
+    timeline: Timeline | FusedTimeline
+    if checkpoint.fused:
+        generation, frame_ids = checkpoint.head.generation, tuple(by_frame_id)
+        timeline = FusedTimeline.resume(gap_limit_ns, checkpoint.seen, base.cursors, base.last, frame_ids, generation)
+    else:
+        epochs, cursor = checkpoint.seen.get("", ()), base.sensor("").cursor
+        timeline = Timeline.resume(gap_limit_ns, epochs, cursor, base.last, frozenset(by_frame_id))
     places = timeline.places()
     entries: list[Entry] = []
     for frame_id, one in by_frame_id.items():

@@ -1,11 +1,14 @@
-"""One session: what decides about a stream's messages. No I/O, no threads, no clock of its own.
+"""One session: what decides about the messages of a stream, or of several sensors that feed one density.
+
+No I/O, no threads, no clock of its own.
 
 Conventions: `now_ns` is the local monotonic clock, handed in by the caller and used for nothing but waiting, for point
 clouds and, after a restore, for frames that were missed; everything else follows from the messages. So the same
 messages give the same tracks, byte for byte, and those of the window give the same state in whatever order they come.
 
-The parts: `pending` holds frames until they are ready, `processed` has those that were gone through, `reporting` says
-and counts what became of them. Here are commands, the state to be written down, and what is done when a step fails.
+The parts: `pending` holds the frames of a sensor until they are ready, `processed` has those that were gone through,
+`reporting` says and counts what became of them. Here are commands, the state to be written down, and what is done when
+a step fails.
 """
 
 from __future__ import annotations
@@ -18,15 +21,16 @@ import optipmb
 from optipmb_service.session import convert
 from optipmb_service.session.checkpoint import Checkpoint
 from optipmb_service.session.dump import dump_of
+from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.pending import PendingFrames
 from optipmb_service.session.processed import ProcessedFrames
 from optipmb_service.session.reporting import SessionReporting
-from optipmb_service.session.state import Entry, FilterState, PoseHistory
-from optipmb_service.session.timeline import FrameId, Timeline
+from optipmb_service.session.timeline import FrameId
 from optipmb_service.session.transition import Transition
 from optipmb_service.session.values import (
     MAX_CLOUD_WAIT_NS,
     MAX_ERROR,
+    MAX_SENSORS,
     SECOND,
     Begun,
     Counters,
@@ -44,16 +48,19 @@ if TYPE_CHECKING:
 
     from optipmb_service.session.pending import Ready
     from optipmb_service.session.reporting import Condition
+    from optipmb_service.session.state import Entry, FilterState
+    from optipmb_service.session.timeline import Timeline
     from optipmb_service.session.values import Steps
 
 
 class Session:
-    """The state of one stream.
+    """The state of one stream, or of several that share a density.
 
     Args:
-        stream: `site/node/sensor`.
+        stream: `site/node/sensor`; that of the tracks, where several sensors feed the session.
         parameters: the profile to track with.
         policy: waiting, restarting, going back.
+        fused: whether frames are those of several sensors, by the streams of the messages.
         instance: name of the service, for problems.
         life: what an earlier session of the stream left behind.
         tracker: makes the tracker; tests put their own here.
@@ -66,21 +73,28 @@ class Session:
         parameters: optipmb.Parameters,
         policy: Policy | None = None,
         *,
+        fused: bool = False,
         instance: str = "session",
         life: Lineage | None = None,
         tracker: Callable[[optipmb.Parameters], Steps] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> None:
         self.stream = stream
-        self._policy = policy or Policy()
+        self._fused = fused
+        self._policy = _of_several(policy or Policy()) if fused else policy or Policy()
         self._cloud_wait_ns: int | None = None
         self._reporting = SessionReporting(stream, instance, self._policy)
         self._clock = clock
         self._make = tracker
-        self._processed = ProcessedFrames(self._transition(parameters), self._policy, life or Lineage())
-        self._pending = PendingFrames(self._policy, self._processed.timeline)
-        self._quarantine = ""
+        self._processed = ProcessedFrames(self._transition(parameters), self._policy, life or Lineage(), fused=fused)
+        self._pending: dict[str, PendingFrames] = {}
+        self._recovery_ns: int | None = None
+        self._began: tuple[int, int] | None = None
+        self._now_ns = 0
+        self._quarantine: dict[str, str] = {}
         self._run = 0
+        if not fused:
+            self._sensor("")
 
     # What arrives
 
@@ -95,28 +109,37 @@ class Session:
             arrived_ns: when the frame arrived, if before now: its wait for a cloud began then.
             ticket: comes back with the tracks of the frame, and with those that it corrects.
         """
-        frame_id = FrameId(message.epoch, message.seq, message.stamp_ns)
+        frame_id = self._frame_id(message)
         outputs: list[Output] = []
-        if self._quarantine:
-            if self._processed.timeline.knows(frame_id.epoch):
+        pending = self._sensor(frame_id.sensor)
+        if pending is None:
+            self._reporting.deliveries.refused += 1
+            return [self._reporting.complain.too_many(frame_id)]
+        if error := self._quarantine.get(frame_id.sensor):
+            if self._processed.timeline.knows(frame_id):
                 self._reporting.deliveries.refused += 1
-                return [self._reporting.complain.quarantined(frame_id, self._quarantine)]
-            outputs += self.reset("quarantine")
-        judged_by = self._pending.timeline
+                return [self._reporting.complain.quarantined(frame_id, error)]
+            outputs += self._released(frame_id.sensor)
+        if self._fused and not (self._run or self.counters.frames or self._began) and self._policy.recovery_wait_ns:
+            self._began = frame_id.stamp_ns, now_ns
+            self._recover_until(now_ns + self._policy.recovery_wait_ns)
+        judged_by = pending.timeline
         decision, arrived = judged_by.judge(frame_id)
         if not decision.verdict.admitted:
+            self._remember(pending, judged_by, arrived)
             return [*outputs, *self._reporting.refused(frame_id, decision)]
         try:
             frame, ignored = convert.frame_of(self.parameters, message)
-        except optipmb.FrameError as error:
+        except optipmb.FrameError as invalid:
             self._reporting.deliveries.refused += 1
             self._processed.note(frame_id)
-            self._pending.timeline = self._pending.timeline.note(frame_id)
-            return [*outputs, self._reporting.complain.invalid(frame_id, error)]
-        self._pending.timeline = arrived
+            pending.timeline = judged_by.note(frame_id)
+            self._follow()
+            return [*outputs, self._reporting.complain.invalid(frame_id, invalid)]
+        pending.timeline = arrived
         since_ns = now_ns if arrived_ns is None else arrived_ns
         judged = judged_by, decision, arrived
-        self._pending.add(message, frame_id, frame, ignored, since_ns, ticket, judged)
+        pending.add(message, frame_id, frame, ignored, since_ns, ticket, judged)
         return [*outputs, *self._advance(now_ns)]
 
     def on_points(self, message: schemas.Points, now_ns: int, *, ticket: Any = None) -> list[Output]:
@@ -127,12 +150,17 @@ class Session:
             now_ns: monotonic time.
             ticket: comes back with the tracks that the cloud corrects.
         """
+        frame_id = self._frame_id(message)
         try:
             convert.cloud_of(message)
         except optipmb.FrameError as error:
-            return [self._reporting.complain.invalid(FrameId(message.epoch, message.seq, message.stamp_ns), error)]
-        self._pending.clouds.add(message)
-        outputs = self._amend(message, ticket) if self._policy.late_clouds and not self._quarantine else []
+            return [self._reporting.complain.invalid(frame_id, error)]
+        pending = self._sensor(frame_id.sensor)
+        if pending is None:
+            return [self._reporting.complain.too_many(frame_id)]
+        pending.clouds.add(message)
+        amends = self._policy.late_clouds and frame_id.sensor not in self._quarantine
+        outputs = self._amend(message, frame_id, ticket) if amends else []
         return [*outputs, *self._advance(now_ns)]
 
     def on_tick(self, now_ns: int) -> list[Output]:
@@ -142,7 +170,8 @@ class Session:
     @property
     def deadline_ns(self) -> int | None:
         """When `on_tick` is due (monotonic, ns); None while nothing is held."""
-        return self._pending.deadline_ns(self._processed.complete_until)
+        due = [one.deadline_ns(self._complete_until) for one in self._pending.values()]
+        return min((one for one in due if one is not None), default=None)
 
     def refuse(self) -> None:
         """Count a message of the stream that was none."""
@@ -157,19 +186,10 @@ class Session:
     def reset(self, reason: str = "reset") -> list[Output]:
         """Forget the density and begin anew; frames seen before stay seen, track ids go on, a quarantine ends."""
         outputs = self.flush()
-        self._quarantine = ""
+        self._quarantine.clear()
         head, starts = self._processed.head, self._processed.head.starts + 1
-        self._begin(
-            replace(
-                head,
-                density=optipmb.Density.empty(self._processed.transition.parameters.labels, head.density.next_id),
-                session=self._processed.transition.name(head.last, starts),
-                starts=starts,
-                tracks=0,
-                reported=frozenset(),
-                pose_history=PoseHistory(),
-            )
-        )
+        density = optipmb.Density.empty(self._processed.transition.parameters.labels, head.density.next_id)
+        self._begin(head.begun_anew(density, self._processed.transition.name(head.last, starts), starts))
         return [*outputs, Begun(self.session, reason)]
 
     def configure(
@@ -233,14 +253,17 @@ class Session:
         return Checkpoint(
             stream=self.stream,
             parameters=self.parameters,
+            fused=self._fused,
             cloud_wait_ns=self._cloud_wait_ns,
-            quarantine=self._quarantine,
-            epochs=self._processed.timeline.epochs,
+            quarantine=dict(self._quarantine),
+            seen=self._processed.timeline.seen,
             base=base,
             window=window,
             head=self._processed.head,
             deliveries=replace(self._reporting.deliveries),
-            newest_cloud_ns=self._pending.clouds.newest_ns,
+            newest_cloud_ns={
+                name: one.clouds.newest_ns for name, one in self._pending.items() if one.clouds.newest_ns is not None
+            },
             run=self._run,
         )
 
@@ -271,18 +294,26 @@ class Session:
         Raises:
             CheckpointError: its frames do not fit together.
         """
-        session = cls(checkpoint.stream, checkpoint.parameters, policy, instance=instance, tracker=tracker, clock=clock)
+        session = cls(
+            checkpoint.stream,
+            checkpoint.parameters,
+            policy,
+            fused=checkpoint.fused,
+            instance=instance,
+            tracker=tracker,
+            clock=clock,
+        )
         session._resume(checkpoint, now_ns)
         return session
 
     @property
     def recovering(self) -> bool:
         """Whether frames behind a gap are held, because those missing may still come from the publisher's cache."""
-        return self._pending.recovery_ns is not None
+        return self._recovery_ns is not None and not self._began
 
     def recovered(self, now_ns: int) -> list[Output]:
         """End the waiting: all that the caches have is here. Returns what was held for it."""
-        self._pending.recovery_ns = None
+        self._recover_until(None)
         return self._advance(now_ns)
 
     # What it is
@@ -320,12 +351,12 @@ class Session:
     def held_bytes(self) -> int:
         """Bytes of the messages that are kept: frames that wait, clouds, and the window; nearly, for any thread."""
         window = sum(entry.weight for entry in self._processed.entries)
-        return window + self._pending.held_bytes + self._pending.clouds.bytes
+        return window + sum(one.held_bytes + one.clouds.bytes for one in tuple(self._pending.values()))
 
     @property
     def quarantine(self) -> str:
-        """The error for which frames are refused; empty while they are not."""
-        return self._quarantine
+        """The error for which frames are refused, of any sensor; empty while none are."""
+        return next(iter(self._quarantine.values()), "")
 
     @property
     def cloud_wait_s(self) -> float:
@@ -345,12 +376,12 @@ class Session:
             self._processed.head,
             condition="closed" if closed else self._condition,
             shed=shed,
-            queue=queue + len(self._pending),
+            queue=queue + sum(map(len, self._pending.values())),
         )
 
     @property
     def _condition(self) -> Condition:
-        if self._quarantine:
+        if self._quarantine and self._quarantine.keys() >= self._pending.keys():
             return "quarantined"
         if self.recovering:
             return "recovering"
@@ -360,10 +391,39 @@ class Session:
 
     def _advance(self, now_ns: int | None) -> list[Output]:
         """Process the frames that are ready, in order; None: all of them."""
+        self._now_ns = self._now_ns if now_ns is None else now_ns
+        if now_ns is not None and self._recovery_ns is not None and now_ns >= self._recovery_ns:
+            self._recover_until(None)
         outputs: list[Output] = []
-        while ready := self._pending.take(now_ns, self._processed.complete_until):
+        while ready := self._ready(now_ns):
             outputs += self._process(ready)
         return outputs
+
+    def _ready(self, now_ns: int | None) -> Ready | None:
+        """Take the earliest of the frames that are ready; no sensor waits for another."""
+        waiting = [one for one in self._pending.values() if len(one)]
+        for one in waiting if len(waiting) < 2 else sorted(waiting, key=_earliest):  # noqa: PLR2004 - one is in order
+            if ready := one.take(now_ns, self._complete_until):
+                return ready
+        return None
+
+    def _complete_until(self, frame_id: FrameId) -> bool:
+        """Whether no frame is missing before one: of its sensor, and after a restore of those that were live.
+
+        When a session of several sensors begins, their caches come one after the other, too: until it is known which
+        sensors there are, none goes ahead of the time that has passed by more than late frames may come.
+        """
+        timeline = self._processed.timeline
+        if self._began:
+            stamp_ns, began_ns = self._began
+            return frame_id.stamp_ns - stamp_ns <= self._now_ns - began_ns + self._policy.rewind_ns
+        if isinstance(timeline, FusedTimeline) and self.recovering:
+            for name, newest_ns in timeline.live().items():
+                held = self._pending[name].first if name in self._pending else None
+                reached_ns = newest_ns if held is None else held.stamp_ns
+                if name != frame_id.sensor and reached_ns < frame_id.stamp_ns:
+                    return False
+        return self._processed.complete_until(frame_id)
 
     def _process(self, ready: Ready) -> list[Output]:
         """Put a frame in its place."""
@@ -372,14 +432,14 @@ class Session:
         if judged_by is not self._processed.timeline:  # others were held when it came
             decision, timeline = self._processed.timeline.judge(frame_id)
         if not decision.verdict.admitted:
+            self._processed.timeline = timeline
             return self._reporting.refused(frame_id, decision)
         placed = self._processed.placed(ready, decision, timeline)
         return self._go(placed, timeline, frame_id, ready.held.ticket, began_ns, behind=decision.last)
 
-    def _amend(self, message: schemas.Points, ticket: Any) -> list[Output]:
+    def _amend(self, message: schemas.Points, frame_id: FrameId, ticket: Any) -> list[Output]:
         """Put a cloud that came after its frame into the window."""
-        began_ns, frame_id = self._clock(), FrameId(message.epoch, message.seq, message.stamp_ns)
-        placed = self._processed.amended(message)
+        began_ns, placed = self._clock(), self._processed.amended(message, frame_id)
         return (
             []
             if placed is None
@@ -387,7 +447,14 @@ class Session:
         )
 
     def _go(
-        self, placed: list[Entry], timeline: Timeline, frame_id: FrameId, ticket: Any, began_ns: int, *, behind: bool
+        self,
+        placed: list[Entry],
+        timeline: Timeline | FusedTimeline,
+        frame_id: FrameId,
+        ticket: Any,
+        began_ns: int,
+        *,
+        behind: bool,
     ) -> list[Output]:
         """Go through frames with what is new among them; when a step raises, the session is quarantined as it was."""
         before = self.session
@@ -396,40 +463,93 @@ class Session:
         except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
             return self._fail(error, placed, frame_id)
         gone = self._processed.settle(timeline)
-        self._pending.follow(self._processed.timeline, self._processed.base, gone)
+        self._follow(gone)
         self._reporting.deliveries.inserted += not behind
         begun = self._reporting.begun(outcomes, before, self.session)
         took_ns = self._clock() - began_ns
         return [*begun, *self._reporting.tracked(outcomes, self.parameters, ticket, took_ns, self._run)]
 
     def _fail(self, error: Exception, placed: list[Entry], frame_id: FrameId) -> list[Output]:
-        """Take no more frames; the one that failed and what is held go, unprocessed."""
-        self._quarantine = f"{type(error).__name__}: {error}"[:MAX_ERROR]
-        self._reporting.deliveries.refused += 1 + self._pending.clear()
+        """Take no more frames of the sensor; the one that failed and what is held go, unprocessed."""
+        reason = self._quarantine[frame_id.sensor] = f"{type(error).__name__}: {error}"[:MAX_ERROR]
+        self._reporting.deliveries.refused += 1 + self._pending[frame_id.sensor].clear()
         self._processed.note(frame_id)
-        self._pending.timeline = self._processed.timeline
+        self._follow()
         dump = dump_of(self._processed.transition, self._processed.base, placed, error)
-        return [self._reporting.complain.failed(frame_id, self._quarantine), Quarantined(self._quarantine, dump)]
+        return [self._reporting.complain.failed(frame_id, reason), Quarantined(reason, dump)]
+
+    def _released(self, sensor: str) -> list[Output]:
+        """End the quarantine of a sensor whose publisher was started anew; the density of others goes on."""
+        if not self._fused:
+            return self.reset("quarantine")
+        del self._quarantine[sensor]
+        return []
 
     def _begin(self, state: FilterState, transition: Transition | None = None) -> None:
         """Go on from a moment without a way back behind it."""
         self._processed.begin(state, transition)
-        self._pending.timeline = self._processed.timeline
+        for one in self._pending.values():
+            one.timeline = self._processed.timeline
 
     def _resume(self, checkpoint: Checkpoint, now_ns: int) -> None:
         if checkpoint.cloud_wait_ns is not None:
             self._wait(checkpoint.cloud_wait_ns)
-        self._quarantine = checkpoint.quarantine
+        self._quarantine = dict(checkpoint.quarantine)
         self._reporting.deliveries = replace(checkpoint.deliveries)
-        self._pending.clouds.newest_ns = checkpoint.newest_cloud_ns
-        self._pending.recovery_ns = now_ns + self._policy.recovery_wait_ns
+        self._recovery_ns = now_ns + self._policy.recovery_wait_ns
         self._run = checkpoint.run + 1
         self._processed.resume(checkpoint)
-        self._pending.timeline = self._processed.timeline
+        self._pending.clear()
+        for name in ("",) if not self._fused else checkpoint.head.sensors:
+            if (pending := self._sensor(name)) is not None:
+                pending.clouds.newest_ns = checkpoint.newest_cloud_ns.get(name)
 
     def _wait(self, cloud_wait_ns: int) -> None:
         self._cloud_wait_ns = cloud_wait_ns
-        self._policy = self._pending.policy = replace(self._policy, cloud_wait_ns=cloud_wait_ns)
+        policy = replace(self._policy, cloud_wait_ns=cloud_wait_ns)
+        self._policy = _of_several(policy) if self._fused else policy
+        for one in self._pending.values():
+            one.policy = self._policy
+
+    def _frame_id(self, message: schemas.Detections | schemas.Points) -> FrameId:
+        return FrameId(message.epoch, message.seq, message.stamp_ns, message.stream if self._fused else "")
+
+    def _sensor(self, name: str) -> PendingFrames | None:
+        """Return what is held of a sensor, nothing for a new one; None when there are too many."""
+        pending = self._pending.get(name)
+        if pending is None and len(self._pending) < MAX_SENSORS:
+            pending = self._pending[name] = PendingFrames(self._policy, self._processed.timeline)
+            pending.recovery_ns = self._recovery_ns
+        return pending
+
+    def _remember(
+        self, pending: PendingFrames, judged_by: Timeline | FusedTimeline, arrived: Timeline | FusedTimeline
+    ) -> None:
+        """Keep what a timeline remembers of a frame that it refused."""
+        pending.timeline = arrived
+        if self._processed.timeline is judged_by is not arrived:
+            self._processed.timeline = arrived
+            self._follow()
+
+    def _recover_until(self, recovery_ns: int | None) -> None:
+        self._recovery_ns = recovery_ns
+        self._began = self._began if recovery_ns else None
+        for one in self._pending.values():
+            one.recovery_ns = recovery_ns
+
+    def _follow(self, gone: frozenset[FrameId] = frozenset()) -> None:
+        for one in self._pending.values():
+            one.follow(self._processed.timeline, self._processed.base, gone)
 
     def _transition(self, parameters: optipmb.Parameters) -> Transition:
         return Transition(self.stream, parameters, self._make(parameters), self._policy)
+
+
+def _of_several(policy: Policy) -> Policy:
+    """Return the policy of several sensors: a frame that waited for its cloud must still find its place."""
+    return replace(policy, cloud_wait_ns=min(policy.cloud_wait_ns, policy.rewind_ns // 2))
+
+
+def _earliest(one: PendingFrames) -> tuple[int, str]:
+    first = one.first
+    return (first.stamp_ns, first.sensor) if first else (0, "")

@@ -6,12 +6,14 @@ two sessions that took the same frames have equal states, whatever came twice, l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from optipmb_service.session.timeline import Cursor, FrameId, Placement
+from optipmb_service.session.timeline import Cursor, FrameId, Order, Placement
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import optipmb_schemas as schemas
 
     import optipmb
@@ -64,6 +66,23 @@ class PoseHistory:
 
 
 @dataclass(frozen=True, slots=True)
+class SensorState:
+    """What the frames of one sensor so far mean for its next.
+
+    Attributes:
+        cursor: its course; see `timeline`.
+        tracked: epoch and highest sequence number of its frames tracked, for counting gaps.
+        reported: its unknown classes that were reported in this life.
+        pose_history: where it was.
+    """
+
+    cursor: Cursor = field(default_factory=Cursor)
+    tracked: tuple[bytes, int] | None = None
+    reported: frozenset[str] = frozenset()
+    pose_history: PoseHistory = PoseHistory()
+
+
+@dataclass(frozen=True, slots=True)
 class FilterState:
     """A session between two frames.
 
@@ -72,26 +91,36 @@ class FilterState:
         session: id of the present life of the density.
         starts: lives so far.
         generation: see `timeline`; of the last frame tracked.
-        course: what the frames so far mean for the next.
         last: the last frame processed, tracked or not.
-        tracked: epoch and highest sequence number of the frames tracked, for counting gaps.
         tracks: number of tracks at the last frame tracked.
         counts: what became of the frames.
-        reported: unknown classes that were reported in this life.
-        whereabouts: of the sensor.
+        sensors: each sensor by its stream; the only one of a stream's own session by an empty name.
     """
 
     density: optipmb.Density
     session: str
     starts: int = 0
     generation: int = 0
-    cursor: Cursor = field(default_factory=Cursor)
     last: FrameId | None = None
-    tracked: tuple[bytes, int] | None = None
     tracks: int = 0
     counts: FrameCounts = FrameCounts()
-    reported: frozenset[str] = frozenset()
-    pose_history: PoseHistory = PoseHistory()
+    sensors: Mapping[str, SensorState] = field(default_factory=dict)
+
+    def sensor(self, name: str) -> SensorState:
+        """Return what is known of a sensor, nothing before its first frame."""
+        return self.sensors.get(name, SensorState())
+
+    @property
+    def cursors(self) -> dict[str, Cursor]:
+        """The courses of the sensors."""
+        return {name: one.cursor for name, one in self.sensors.items()}
+
+    def begun_anew(self, density: optipmb.Density, session: str, starts: int) -> FilterState:
+        """Return the state of a later life of the density, in which nothing was said yet."""
+        sensors = {
+            name: replace(one, reported=frozenset(), pose_history=PoseHistory()) for name, one in self.sensors.items()
+        }
+        return replace(self, density=density, session=session, starts=starts, sensors=sensors, tracks=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +152,7 @@ class Entry:
     packed: dict[str, bytes] = field(default_factory=dict, compare=False)
 
     @property
-    def order(self) -> tuple[int, int, int]:
+    def order(self) -> Order:
         """The key by which frames are processed."""
         return self.place.order(self.frame_id)
 

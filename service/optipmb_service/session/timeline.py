@@ -20,7 +20,10 @@ from __future__ import annotations
 from bisect import bisect
 from dataclasses import dataclass, replace
 from enum import StrEnum, unique
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
 
 WINDOW: Final = 1024
 """How many sequence numbers back a frame of an epoch is remembered; older unseen ones count as late."""
@@ -50,6 +53,8 @@ class Verdict(StrEnum):
     """Frames behind it came before it, and it is inside the window: it is put in its place."""
     DUPLICATE = "duplicate"
     """The same epoch and sequence number came before: dropped."""
+    JUMPED = "jumped"
+    """In a session of several sensors: the stamp is far from the clock on which the others go on: refused."""
     LATE = "late"
     """Frames behind it can no longer be taken back: refused."""
     RETIRED = "retired"
@@ -61,7 +66,7 @@ class Verdict(StrEnum):
         return self not in _REFUSED
 
 
-_REFUSED: Final = frozenset({Verdict.DUPLICATE, Verdict.LATE, Verdict.RETIRED})
+_REFUSED: Final = frozenset({Verdict.DUPLICATE, Verdict.JUMPED, Verdict.LATE, Verdict.RETIRED})
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,11 +77,17 @@ class FrameId:
         epoch: 16 bytes, new at every start of the publisher.
         seq: counts the publisher's frames in the epoch.
         stamp_ns: sensor time, nanoseconds.
+        sensor: its stream, where several sensors feed one session; empty where the session is that of one stream.
     """
 
     epoch: bytes
     seq: int
     stamp_ns: int
+    sensor: str = ""
+
+
+Order = tuple[int, int, str, int, int]
+"""The key by which frames are processed: generation, stamp, sensor, era, sequence number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +115,9 @@ class Placement:
         """Return the stamp by which the frame is ordered."""
         return frame_id.stamp_ns if self.at_ns is None else self.at_ns
 
-    def order(self, frame_id: FrameId) -> tuple[int, int, int]:
+    def order(self, frame_id: FrameId) -> Order:
         """Return the key by which frames are processed."""
-        return self.era, self.time_ns(frame_id), frame_id.seq
+        return self.generation, self.time_ns(frame_id), frame_id.sensor, self.era, frame_id.seq
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,6 +203,31 @@ class SeenNumbers:
         return SeenNumbers(self.epoch, seq, (shifted | 1) & ((1 << WINDOW) - 1))
 
 
+def number_of(epochs: Sequence[SeenNumbers], epoch: bytes | None) -> int:
+    """Return the place of an epoch among those of a publisher, -1 when it is none of them."""
+    for number in range(len(epochs) - 1, -1, -1):
+        if epochs[number].epoch == epoch:
+            return number
+    return -1
+
+
+def remembered(epochs: tuple[SeenNumbers, ...], frame_id: FrameId) -> tuple[SeenNumbers, ...]:
+    """Return the epochs of a publisher with one more frame that came."""
+    number = number_of(epochs, frame_id.epoch)
+    if number < 0:
+        return (*epochs, SeenNumbers(frame_id.epoch, frame_id.seq, 1))[-EPOCHS:]
+    return (*epochs[:number], epochs[number].add(frame_id.seq), *epochs[number + 1 :])
+
+
+def complete_until(epochs: Sequence[SeenNumbers], frame_id: FrameId, processed: tuple[bytes, int] | None) -> bool:
+    """Whether no frame is missing between the last one processed of its epoch and this one."""
+    number = number_of(epochs, frame_id.epoch)
+    first = processed[1] + 1 if processed is not None and processed[0] == frame_id.epoch else 0
+    if frame_id.seq - first > WINDOW or (number < 0 and frame_id.seq > first):
+        return False
+    return all(epochs[number].has(seq) for seq in range(first, frame_id.seq))
+
+
 @dataclass(frozen=True, slots=True)
 class Decision:
     """The verdict on one frame.
@@ -231,14 +267,14 @@ class Timeline:
         """Decide on a frame that arrived; the second result replaces this timeline."""
         number = self._number(frame_id.epoch)
         if number < 0:
-            return self._append(frame_id, number)
+            return self._append(frame_id)
         seen = self.epochs[number]
         if seen.has(frame_id.seq):
             return self._refuse(frame_id, Verdict.DUPLICATE)
         if seen.highest - frame_id.seq >= WINDOW:
             return self._refuse(frame_id, Verdict.LATE)
         newest = number == len(self.epochs) - 1 and frame_id.seq > seen.highest
-        return self._append(frame_id, number) if newest else self._insert(frame_id, number)
+        return self._append(frame_id) if newest else self._insert(frame_id, number)
 
     def places(self) -> dict[FrameId, Placement]:
         """Return where each frame of the window belongs."""
@@ -258,16 +294,22 @@ class Timeline:
         ordered = tuple(sorted(frame_ids, key=lambda one: (timeline._number(one.epoch), one.seq)))
         return replace(timeline, frame_ids=ordered, tip=timeline._arrange(ordered)[1])
 
-    def knows(self, epoch: bytes) -> bool:
+    @property
+    def seen(self) -> Mapping[str, tuple[SeenNumbers, ...]]:
+        """What came, by sensor: there is one, without a name."""
+        return {"": self.epochs}
+
+    def knows(self, frame_id: FrameId) -> bool:
         """Whether frames came in an epoch."""
-        return self._number(epoch) >= 0
+        return self._number(frame_id.epoch) >= 0
 
     def note(self, frame_id: FrameId) -> Timeline:
         """Remember that a frame came which is not to be processed, so that it is not looked at again."""
-        return replace(self, epochs=self._remember(frame_id, self._number(frame_id.epoch)))
+        return replace(self, epochs=remembered(self.epochs, frame_id))
 
-    def settle(self, base: Cursor, floor: FrameId | None, gone: frozenset[FrameId]) -> Timeline:
+    def settle(self, cursors: Mapping[str, Cursor], floor: FrameId | None, gone: frozenset[FrameId]) -> Timeline:
         """Return it with a later beginning of the window: `gone` are the frames that fell out of it."""
+        base = cursors.get("", Cursor())
         frame_ids = self.frame_ids[len(gone) :]  # mostly it was the oldest that went
         if gone != frozenset(self.frame_ids[: len(gone)]):
             frame_ids = tuple(frame_id for frame_id in self.frame_ids if frame_id not in gone)
@@ -275,22 +317,18 @@ class Timeline:
 
     def complete_until(self, frame_id: FrameId, processed: tuple[bytes, int] | None) -> bool:
         """Whether no frame is missing between the last one processed of its epoch and this one."""
-        number = self._number(frame_id.epoch)
-        first = processed[1] + 1 if processed is not None and processed[0] == frame_id.epoch else 0
-        if frame_id.seq - first > WINDOW or (number < 0 and frame_id.seq > first):
-            return False
-        return all(self.epochs[number].has(seq) for seq in range(first, frame_id.seq))
+        return complete_until(self.epochs, frame_id, processed)
 
     # How
 
-    def _append(self, frame_id: FrameId, number: int) -> tuple[Decision, Timeline]:
+    def _append(self, frame_id: FrameId) -> tuple[Decision, Timeline]:
         """Take a frame that is the last one in its publisher's order."""
         place = self.tip.follow(frame_id, self.gap_limit_ns)
         if not self._free(frame_id, place):
             return self._refuse(frame_id, Verdict.LATE)
         behind = place.era == self.tip.era and place.time_ns(frame_id) < self.tip.newest_ns
         epochs, frame_ids, tip = (
-            self._remember(frame_id, number),
+            remembered(self.epochs, frame_id),
             (*self.frame_ids, frame_id),
             self.tip.after(frame_id, place),
         )
@@ -318,7 +356,7 @@ class Timeline:
         order = place.order(frame_id)
         behind = any(other.order(one) > order for one, other in zip(frame_ids, places, strict=True))
         last = not behind and at == len(self.frame_ids)
-        timeline = replace(self, epochs=self._remember(frame_id, number), frame_ids=frame_ids, tip=tip)
+        timeline = replace(self, epochs=remembered(self.epochs, frame_id), frame_ids=frame_ids, tip=tip)
         return Decision(place.opens if last else Verdict.INSERTED, place, last=last), timeline
 
     def _before_successor(self, at: int, places: tuple[Placement, ...]) -> bool:
@@ -342,22 +380,15 @@ class Timeline:
             return False
         if self.floor is None:
             return True
-        return place.order(frame_id) > (self.base.era, self.floor.stamp_ns, self.floor.seq)
+        base = self.base
+        return place.order(frame_id) > (base.generation, self.floor.stamp_ns, "", base.era, self.floor.seq)
 
     def _refuse(self, frame_id: FrameId, verdict: Verdict) -> tuple[Decision, Timeline]:
         jump_ns = 0 if self.tip.epoch is None else frame_id.stamp_ns - self.tip.newest_ns
         return Decision(verdict, Placement(self.tip.era, self.tip.generation, None, verdict, jump_ns)), self
 
     def _number(self, epoch: bytes | None) -> int:
-        for number in range(len(self.epochs) - 1, -1, -1):
-            if self.epochs[number].epoch == epoch:
-                return number
-        return -1
-
-    def _remember(self, frame_id: FrameId, number: int) -> tuple[SeenNumbers, ...]:
-        if number < 0:
-            return (*self.epochs, SeenNumbers(frame_id.epoch, frame_id.seq, 1))[-EPOCHS:]
-        return (*self.epochs[:number], self.epochs[number].add(frame_id.seq), *self.epochs[number + 1 :])
+        return number_of(self.epochs, epoch)
 
 
 def hold_until(

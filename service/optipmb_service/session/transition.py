@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import optipmb
 from optipmb_service.session import convert
 from optipmb_service.session.pose_check import judge, position_of
-from optipmb_service.session.state import Entry, FilterState, FrameCounts, PoseHistory
+from optipmb_service.session.state import Entry, FilterState, FrameCounts, PoseHistory, SensorState
 from optipmb_service.session.timeline import FrameId, Verdict
 from optipmb_service.session.values import MAX_LABELS, SECOND, total
 
@@ -88,7 +88,9 @@ class Transition:
     def name(self, frame_id: FrameId | None, starts: int) -> str:
         """Return the id of a life that begins with or after a frame."""
         digest = hashlib.blake2b(self._digest, digest_size=16, person=b"optipmb-session")
-        where = (frame_id.epoch.hex(), frame_id.seq, frame_id.stamp_ns) if frame_id else ()
+        where = [frame_id.epoch.hex(), frame_id.seq, frame_id.stamp_ns] if frame_id else []
+        if frame_id and frame_id.sensor:
+            where.append(frame_id.sensor)
         digest.update(json.dumps([self.stream, starts, *where]).encode())
         return digest.hexdigest()
 
@@ -101,11 +103,19 @@ class Transition:
         frame_id, place = entry.frame_id, entry.place
         if place.opens is Verdict.UNCONFIRMED:
             # What comes after is judged, and put in order, as if it had not been there.
-            passed = _passed(before, entry, before.pose_history, unconfirmed=1)
+            passed = _passed(before, entry, before.sensor(frame_id.sensor).pose_history, unconfirmed=1)
             return replace(passed, last=before.last), Outcome(entry, None, None, {})
-        begins = _begins(before, entry)
-        known = PoseHistory() if begins else before.pose_history
+        begins, sensor = _begins(before, entry), before.sensor(frame_id.sensor)
+        known = PoseHistory() if begins else sensor.pose_history
         pose_history, where = judge(known, frame_id.stamp_ns, position_of(entry.message), self._policy)
+        if where == "moved" and self._others_stayed(before, frame_id):
+            # The sensors of a session move together: this one waits for the others to say the same.
+            count = sensor.pose_history.astray + 1
+            there = pose_history.position
+            pose_history = replace(
+                sensor.pose_history, astray=count, astray_ns=frame_id.stamp_ns, astray_position=there
+            )
+            where = "astray"
         if where == "astray":
             return _passed(before, entry, pose_history, astray=1), Outcome(entry, None, None, {})
         if where == "moved":
@@ -119,53 +129,65 @@ class Transition:
             if begins is None and before.density.stamp_ns >= 0 and silent_ns > GIVE_UP_NS:
                 with suppress(optipmb.EffortError):
                     return self._track(before, entry, SessionStart("effort", place.jump_ns), pose_history)
-            return _passed(before, entry, before.pose_history, effort=1), Outcome(entry, None, None, {}, error)
+            return _passed(before, entry, sensor.pose_history, effort=1), Outcome(entry, None, None, {}, error)
+
+    def _others_stayed(self, before: FilterState, frame_id: FrameId) -> bool:
+        """Whether another sensor of the session is where it was, as far as was heard lately."""
+        return any(
+            one.pose_history.stamp_ns is not None
+            and not one.pose_history.astray
+            and abs(frame_id.stamp_ns - one.pose_history.stamp_ns) <= self._policy.gap_limit_ns
+            for name, one in before.sensors.items()
+            if name != frame_id.sensor
+        )
 
     def _track(
         self, before: FilterState, entry: Entry, begins: SessionStart | None, pose_history: PoseHistory
     ) -> tuple[FilterState, Outcome]:
-        frame_id, density, session, starts = entry.frame_id, before.density, before.session, before.starts
-        reported = before.reported
+        frame_id = entry.frame_id
         if begins:
-            starts += 1
-            session = self.name(frame_id, starts)
-            reported = frozenset()
+            starts, density = before.starts + 1, before.density
             if begins.reason != "first":
                 density = optipmb.Density.empty(self.parameters.labels, density.next_id)
+            before = before.begun_anew(density, self.name(frame_id, starts), starts)
+        sensor = before.sensor(frame_id.sensor)
         frame = entry.frame
         if entry.points is not None:
             frame = replace(frame, cloud=convert.cloud_of(entry.points))
-        result = self._tracker.step(density, frame)
+        result = self._tracker.step(before.density, frame)
         used = bool(result.diagnostics.cloud_used)
-        same = before.tracked is not None and before.tracked[0] == frame_id.epoch
-        highest = before.tracked[1] if before.tracked is not None and same else frame_id.seq - 1
+        same = sensor.tracked is not None and sensor.tracked[0] == frame_id.epoch
+        highest = sensor.tracked[1] if sensor.tracked is not None and same else frame_id.seq - 1
         gap = max(0, frame_id.seq - highest - 1)
         tracks = convert.tracks_of(
             result.tracks,
             result.paths,
             stream=self.stream,
             frame_id=frame_id,
-            session=session,
+            session=before.session,
             revision=entry.revision,
             parameters=self.parameters,
             cloud_used=used,
             gap=gap,
             ignored=entry.ignored,
         )
-        unknown = self._unknown(entry, reported) if entry.ignored else {}
+        unknown = self._unknown(entry, sensor.reported) if entry.ignored else {}
         repaired = int(result.diagnostics.repaired)
+        known = SensorState(
+            cursor=sensor.cursor.after(frame_id, entry.place),
+            tracked=(frame_id.epoch, max(highest, frame_id.seq)),
+            reported=sensor.reported | unknown.keys() if unknown else sensor.reported,
+            pose_history=pose_history,
+        )
         after = FilterState(
             density=result.density,
-            session=session,
-            starts=starts,
+            session=before.session,
+            starts=before.starts,
             generation=entry.place.generation,
-            cursor=before.cursor.after(frame_id, entry.place),
             last=frame_id,
-            tracked=(frame_id.epoch, max(highest, frame_id.seq)),
             tracks=len(tracks.id),
-            counts=_counted(before.counts, entry, tracked=1, gap=gap, used=used, repaired=repaired),
-            reported=reported | unknown.keys() if unknown else reported,
-            pose_history=pose_history,
+            counts=_counted(before, entry, tracked=1, gap=gap, used=used, repaired=repaired),
+            sensors={**before.sensors, frame_id.sensor: known},
         )
         return after, Outcome(entry, tracks, begins, unknown)
 
@@ -185,13 +207,14 @@ def _passed(
     unconfirmed: int = 0,
 ) -> FilterState:
     """Return the state after a frame that is refused."""
-    counts = _counted(before.counts, entry, astray=astray, effort=effort, unconfirmed=unconfirmed)
-    cursor = before.cursor.after(entry.frame_id, entry.place)
-    return replace(before, cursor=cursor, last=entry.frame_id, counts=counts, pose_history=pose_history)
+    counts = _counted(before, entry, astray=astray, effort=effort, unconfirmed=unconfirmed)
+    frame_id, sensor = entry.frame_id, before.sensor(entry.frame_id.sensor)
+    passed = replace(sensor, cursor=sensor.cursor.after(frame_id, entry.place), pose_history=pose_history)
+    return replace(before, last=frame_id, counts=counts, sensors={**before.sensors, frame_id.sensor: passed})
 
 
 def _counted(  # noqa: PLR0913 - all keywords, each a count
-    before: FrameCounts,
+    state: FilterState,
     entry: Entry,
     *,
     astray: int = 0,
@@ -203,10 +226,13 @@ def _counted(  # noqa: PLR0913 - all keywords, each a count
     repaired: int = 0,
 ) -> FrameCounts:
     """Return the counts with one more frame."""
+    before, epoch = state.counts, state.sensor(entry.frame_id.sensor).cursor.epoch
+    # In a session of several sensors each has its epochs; how one follows another is told by the frames before.
+    succeeds = bool(entry.frame_id.sensor) and epoch not in {None, entry.frame_id.epoch}
     return FrameCounts(
         frames=before.frames + tracked,
         gaps=total(before.gaps, gap),
-        new_epochs=before.new_epochs + (entry.place.opens in _OPENING),
+        new_epochs=before.new_epochs + (entry.place.opens in _OPENING or succeeds),
         clouds_used=before.clouds_used + used,
         clouds_missed=before.clouds_missed + entry.missed,
         astray=before.astray + astray,
@@ -233,6 +259,8 @@ def _begins(before: FilterState, entry: Entry) -> SessionStart | None:
     if before.last is None:
         return SessionStart("first", entry.place.jump_ns)
     if entry.place.generation != before.generation:
+        if entry.frame_id.sensor:
+            return SessionStart("jump", entry.frame_id.stamp_ns - before.last.stamp_ns)
         other = entry.frame_id.epoch != before.last.epoch
         return SessionStart("publisher" if other else "jump", entry.place.jump_ns)
     return None

@@ -18,6 +18,9 @@ MAX_COUNT: Final = 2**61
 MAX_CLOUD_WAIT_NS: Final = 60 * SECOND
 """The longest wait for a cloud that can be asked for."""
 
+MAX_SENSORS: Final = 64
+"""Sensors of one session."""
+
 MAX_ERROR: Final = 400
 """Characters kept of an error."""
 

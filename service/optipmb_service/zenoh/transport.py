@@ -113,10 +113,11 @@ class Transport:
         queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(CHANNEL // 16))
         self._readers.add("queries", queryable, queryable.handler, _answering(answer))
 
-    def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
+    def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:
         """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
 
-        Each topic has a thread of its own, until the result is called.
+        Each topic has a thread of its own, until the result is called. Detections of a session of several streams are
+        those of `detections`, a pattern of streams.
 
         Raises:
             TransportError: the session is closed.
@@ -129,7 +130,7 @@ class Transport:
                     for sample in samples:
                         receive(topic, sample.payload.to_bytes(), str(sample.encoding))
 
-            key = f"{self._prefix}/{stream}/{topic}"
+            key = f"{self._prefix}/{(topic == 'detections' and detections) or stream}/{topic}"
             subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
             taps.append(subscriber)
             threading.Thread(target=hand_over, args=(subscriber.handler,), name=f"viewer-{topic}", daemon=True).start()

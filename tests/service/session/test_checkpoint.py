@@ -139,7 +139,7 @@ def test_large_clouds_shorten_the_window_not_the_checkpoint() -> None:
         feed(one, [seq], SENSOR)
     checkpoint = one.snapshot()
     assert len(one._processed.entries) == 6
-    assert [entry.frame_id.seq for entry in checkpoint.window] == [5, 6]
+    assert [entry.message.seq for entry in checkpoint.window] == [5, 6]
     assert len(encode_checkpoint(checkpoint)) < 130_000
     two = Session.restore(checkpoint, 0, policy)
     assert state_bytes(two.snapshot()) == state_bytes(checkpoint)
@@ -256,16 +256,19 @@ def _set(body: Any, column: str, value: float) -> None:
         (lambda body: body["window"][0].update(detections=b"no"), "msgpack"),
         (lambda body: body["window"].append(body["window"][0]), "window"),
         (lambda body: body["epochs"][0].pop(), "epochs"),
-        (lambda body: body["base"].update(course=[1] * 6), "course"),
+        (lambda body: body["head"]["sensors"][0].update(course=[1] * 6), "course"),
         (lambda body: body["head"].update(session="\x01" * 32), "head.session: expected 32 hexadecimal digits"),
         (lambda body: body["head"]["counts"].update(frames=2**62), "head.counts.frames"),
         (lambda body: body.update(run=2**63 - 1), "run"),
-        (lambda body: body.update(quarantine="x" * 401), "quarantine"),
+        (lambda body: body.update(quarantine=[["", "x" * 401]]), "quarantine"),
         (lambda body: body.update(cloud_wait_ns=2**62), "cloud_wait_ns"),
         (lambda body: body["parameters"].update(name="a b"), "profile"),
         (lambda body: body["epochs"].append(body["epochs"][0]), "epochs"),
-        (lambda body: body["epochs"][0].__setitem__(2, b"\2"), "epochs"),
-        (lambda body: body["head"].update(reported=["x" * 65]), "reported"),
+        (lambda body: body["epochs"][0].__setitem__(3, b"\2"), "epochs"),
+        (lambda body: body["head"]["sensors"][0].update(reported=["x" * 65]), "reported"),
+        (lambda body: body["head"]["sensors"][0].update(sensor="site/node/other"), "sensors"),
+        (lambda body: body.update(fused=True), "sensors"),
+        (lambda body: body["head"].update(sensors=body["head"]["sensors"] * 65), "sensors"),
         (lambda body: body["head"].update(stamp_ns=0), "born_ns"),
         (lambda body: _set(body, "bernoulli.existence", -0.5), "bernoulli.existence"),
         (lambda body: _set(body, "bernoulli.score", 1.5), "bernoulli.score"),

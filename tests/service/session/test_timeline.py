@@ -28,7 +28,7 @@ def judge_all(marks: list[FrameId], *, window: bool = False) -> tuple[list[Decis
         if decision.verdict.admitted and not window:
             cursor = cursor.after(one, decision.place)
             floor = floor if decision.verdict is Verdict.UNCONFIRMED else one
-            timeline = timeline.settle(cursor, floor, frozenset(timeline.frame_ids))
+            timeline = timeline.settle({"": cursor}, floor, frozenset(timeline.frame_ids))
     return decisions, timeline
 
 

@@ -38,10 +38,14 @@ class TableSequence:
 
     has_clouds = False
 
-    def __init__(self, name: str, boxes: Boxes, key: str, truth: tuple[Boxes, str, Path] | None) -> None:
+    def __init__(self, name: str, stem: str, boxes: Boxes, key: str, truth: tuple[Boxes, str, Path] | None) -> None:
         self.name = name
         self.key_columns: dict[str, str] = dict(zip(boxes.key_columns, boxes.keys[key], strict=True))
         self.time_column = boxes.time_column
+        self.sensor_column = boxes.sensor_column
+        self.sensor = self.key_columns.get(boxes.sensor_column, "")
+        self.columns = {column: value for column, value in self.key_columns.items() if column != boxes.sensor_column}
+        self.recording = ".".join(map(_plain, self.columns.values())) or stem
         self._boxes = boxes
         self._truth = truth
         member = boxes.frame_key == key
@@ -198,11 +202,11 @@ class TableDataset:
             self._notes += [f"{file}: {note}" for note in reading.notes]
             own = (boxes, file) if boxes.id is not None else None
             for key in dict.fromkeys(boxes.frame_key.tolist()):
-                name = re.sub(r"[^A-Za-z0-9_.-]+", "_", ".".join(part for part in (_stem(file), key) if part))
+                name = _plain(".".join(part for part in (_stem(file), key) if part))
                 if len(files) == 1 and key:
-                    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", key)
+                    name = _plain(key)
                 where = _truth_of(others or own, key, file)
-                sequence = TableSequence(name, boxes, key, where)
+                sequence = TableSequence(name, _plain(_stem(file)), boxes, key, where)
                 if name in self._sequences:
                     raise DatasetError(file, "names of recordings that differ", f"{name!r} twice")
                 self._sequences[name] = sequence
@@ -236,6 +240,11 @@ def _tables(path: Path) -> list[Path]:
             raise DatasetError(path, "a folder with tables (.csv, .parquet, .jsonl, .feather)", "none in it")
         return files
     return [path]
+
+
+def _plain(text: str) -> str:
+    """Return a text as part of the name of a file."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", text)
 
 
 def _stem(file: Path) -> str:

@@ -60,6 +60,8 @@ class Boxes:
     """(B,) object; None where the table has no such column."""
     time_column: str
     key_columns: tuple[str, ...]
+    sensor_column: str
+    """That of `key_columns` which names the sensor; empty: none does."""
     keys: Mapping[str, tuple[str, ...]]
     """Key -> values of the columns that it stands for."""
 
@@ -167,6 +169,7 @@ class _Table:
             id=None if id_ is None else id_[row],
             time_column=time_column,
             key_columns=key_columns,
+            sensor_column=self._found["sensor"].name if "sensor" in self._found else "",
             keys=keys,
         )
 

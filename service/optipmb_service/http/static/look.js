@@ -38,6 +38,8 @@ function list(status) {
     button.onclick = () => choose(one.stream);
     for (const content of [button, one.state, one.rate_hz.toFixed(1), one.latency_p50_ms.toFixed(1), one.tracks]) row.insertCell().append(content);
     row.setAttribute("aria-selected", one.stream === chosen);
+    const silent = one.silent || [];
+    if (one.sensors && one.sensors.length > 0) button.title = one.sensors.map((name) => silent.includes(name) ? `${name}: silent` : name).join("\n");
     return row;
   }));
   at("problems-title").hidden = !status.problems || status.problems.length === 0;

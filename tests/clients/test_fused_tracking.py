@@ -1,0 +1,124 @@
+"""The sensors of a recording track into one density offline: the bytes of a service with the setting `fuse`."""
+
+from __future__ import annotations
+
+import csv
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from commands import result_of, run_here
+from fusing import FRONT, FUSED, REAR, SIDE, drive
+from optipmb_client.datasets import DatasetError, open_dataset
+from optipmb_client.datasets.fused import FusedSequence
+from optipmb_client.mcap_files.writing import RecordingWriter
+from optipmb_client.offline import track_sequence
+from optipmb_schemas import Keys, Tracks, encode, encoding_of
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Policy
+from sessions import Merged
+
+import optipmb
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from optipmb_schemas import Detections
+
+KITTI = optipmb.load_profile("kitti")
+COLUMNS = ("id", "center", "size", "yaw", "velocity", "existence", "score", "covariance", "age", "detection")
+
+
+def served(frames: list[Detections]) -> list[Tracks]:
+    """The tracks of a service, the last of each frame, in the order of the frames."""
+    one, merged = Session(FUSED, KITTI, Policy(recovery_wait_ns=0), fused=True), Merged()
+    for frame in sorted(frames, key=lambda one: one.stamp_ns):
+        merged.take(one.on_detections(frame, 0))
+    found = [message for _, message in merged.newest.values()]
+    return sorted(found, key=lambda message: (message.stamp_ns, message.sensor or ""))
+
+
+def recorded(path: Path, frames: list[Detections]) -> Path:
+    """Write frames as they are recorded."""
+    with RecordingWriter(path) as writer:
+        for number, frame in enumerate(frames):
+            writer.add(Keys().detections(frame.stream), encode(frame), encoding_of(frame), number)
+    return path
+
+
+def tabled(path: Path, frames: list[Detections]) -> Path:
+    """Write frames as rows with a column of the sensor, those of one sensor below those of another."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["log", "sensor", "stamp_ns", "x", "y", "z", "l", "w", "h", "yaw", "score", "class", "vx", "vy"])
+        for frame in sorted(frames, key=lambda one: one.stream):
+            for i in range(len(frame.label)):
+                box = (frame.center[i], frame.size[i], [frame.yaw[i], frame.score[i]])
+                numbers = [repr(float(value)) for part in box for value in part]
+                assert frame.velocity is not None
+                moving = [repr(float(value)) for value in frame.velocity[i]]
+                rows.writerow(["a", frame.stream.split("/")[2], frame.stamp_ns, *numbers, "car", *moving])
+    return path
+
+
+def same(sequence: FusedSequence, wanted: list[Tracks]) -> None:
+    """Compare the tracks of a sequence with those of a service, byte for byte."""
+    found = [named for _, named, _, _ in track_sequence(KITTI, sequence)]
+    assert len(found) == len(wanted)
+    for ours, theirs in zip(found, wanted, strict=True):
+        for name in COLUMNS:
+            assert np.asarray(getattr(ours, name)).tobytes() == getattr(theirs, name).tobytes(), name
+
+
+def test_a_recording_gives_the_bytes_of_the_service(tmp_path: Path) -> None:
+    """Fields of view and frames of two sensors in whatever order they were received."""
+    frames = drive(40)
+    by_sensor = sorted(frames, key=lambda one: one.stream)
+    dataset = open_dataset("mcap", recorded(tmp_path / "a.mcap", by_sensor), fuse="1")
+    (sequence,) = dataset.sequences(["all"])
+    assert isinstance(sequence, FusedSequence)
+    assert (sequence.name, len(sequence)) == ("site.node.fused", len(frames))
+    same(sequence, served(frames))
+    assert dataset.sequences(["site/node/fused"]) == [sequence]
+
+
+def test_a_table_gives_the_bytes_of_the_service(tmp_path: Path) -> None:
+    """By the column of the sensor; two of them have the same stamps."""
+    frames = [one.detections(seq, has_points=False) for one in (FRONT, REAR, SIDE) for seq in range(12)]
+    dataset = open_dataset("table", tabled(tmp_path / "a.csv", frames), fuse="1")
+    (sequence,) = dataset.sequences(["all"])
+    assert isinstance(sequence, FusedSequence)
+    assert (sequence.name, len(sequence)) == ("a", len(frames))
+    same(sequence, served(frames))
+
+
+def test_tracks_of_a_table_say_the_sensor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each row has the recording, the sensor, the time and the row of the detection in the table."""
+    frames = [one.detections(seq, has_points=False) for one in (FRONT, SIDE) for seq in range(12)]
+    source, out = tabled(tmp_path / "a.csv", frames), tmp_path / "tracks.csv"
+    report = result_of(run_here(capsys, "track", source, "--fuse", "--out", out, "--jobs", 1, "--json"))
+    assert [one["name"] for one in report["sequences"]] == ["a"]
+    with source.open(encoding="utf-8") as file, out.open(encoding="utf-8") as result:
+        given, rows = list(csv.DictReader(file)), list(csv.DictReader(result))
+    assert {row["sensor"] for row in rows} == {"front", "side"}
+    found = [row for row in rows if row["detection_row"]]
+    assert found
+    for row in found:
+        detection = given[int(float(row["detection_row"]))]
+        assert (detection["sensor"], detection["stamp_ns"]) == (row["sensor"], row["stamp_ns"])
+    assert len({row["id"] for row in rows}) == FRONT.objects
+
+
+@pytest.mark.parametrize("name", ["kitti", "nuscenes", "rosbag"])
+def test_data_without_sensors_are_not_fused(tmp_path: Path, name: str) -> None:
+    """What cannot be is said at once."""
+    with pytest.raises(DatasetError, match="--fuse: expected a table with a column `sensor`"):
+        open_dataset(name, tmp_path, fuse="1")
+
+
+def test_a_table_without_the_column_is_not_fused(tmp_path: Path) -> None:
+    """The line names what is missing."""
+    path = tabled(tmp_path / "a.csv", [FRONT.detections(0)])
+    path.write_text(path.read_text(encoding="utf-8").replace("sensor", "other"), encoding="utf-8")
+    with pytest.raises(DatasetError, match="--fuse: expected frames that name their sensor"):
+        open_dataset("table", path, fuse="1")

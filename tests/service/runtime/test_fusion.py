@@ -1,0 +1,174 @@
+"""Sensors of one node in the service: one session, tracks on one key; what is wrong with one is said to it alone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from fusing import FRONT, FUSED, REAR, drive
+from optipmb_schemas import Keys, SessionParameters, SessionState, Tracks, decode
+from optipmb_service.cluster.assignment import Assignment
+from optipmb_service.runtime.fusion import Fusion
+from optipmb_service.runtime.mailbox import Mailbox
+from optipmb_service.runtime.ports import Packet
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Policy
+from optipmb_service.settings import SettingsInvalidError, load
+from router import Node, Sensor, until
+from sessions import Merged, tracks
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from optipmb_schemas import Detections
+
+KEYS = Keys()
+OTHER = Sensor("site/other/lidar", b"o" * 16)
+
+
+def undisturbed(frames: list[Detections]) -> dict[tuple[bytes, int], bytes]:
+    """What a session gives that gets the frames in order."""
+    one, merged = Session(FUSED, optipmb.load_profile("nuscenes"), Policy(recovery_wait_ns=0), fused=True), Merged()
+    for frame in frames:
+        merged.take(one.on_detections(frame, 0))
+    return merged.plain()
+
+
+def test_a_car_keeps_its_id_through_the_service(start: Callable[..., Any]) -> None:
+    """Two sensors publish, each on its key; the tracks on the key of both are those of the frames in order."""
+    _, endpoint = start(fuse=["site/node/*"])
+    frames, merged = drive(), Merged()
+    with Node(endpoint) as node:
+        node.send(*frames, OTHER.detections(0))
+        node.tracks(OTHER.stream, 1)
+        until(lambda: node.ask(KEYS.query(FUSED, "state"), SessionState).frames == len(frames), "all are tracked")
+
+        def complete(items: list[tuple[str, bytes, str]]) -> bool:
+            for key, payload, _ in items:
+                if key == KEYS.tracks(FUSED):
+                    message = decode(payload, Tracks)
+                    where = message.epoch + (message.sensor or "").encode(), message.seq
+                    if where not in merged.newest or message.revision > merged.newest[where][1].revision:
+                        merged.newest[where] = 0, message
+            return merged.plain() == undisturbed(frames)
+
+        node.tracks_seen.wait(complete, "the tracks of the frames in order")
+        assert {key for key, _, _ in node.tracks_seen.items} == {KEYS.tracks(FUSED), KEYS.tracks(OTHER.stream)}
+        owners = node.alive(KEYS.all_owners())
+    found = [message for _, message in merged.newest.values()]
+    assert {int(one) for message in found for one in message.id} == {1}
+    assert {message.sensor for message in found if (message.detection >= 0).any()} == {FRONT.stream, REAR.stream}
+    assert {KEYS.stream_of(one) for one in owners} == {FUSED, OTHER.stream}
+
+
+def test_queries_are_answered_for_the_session(start: Callable[..., Any]) -> None:
+    """State, parameters and a reset on its key; on that of a sensor the reply names it."""
+    service, endpoint = start(fuse=["site/node/*"], profiles={FUSED: "kitti"}, stale_s=0.2)
+    with Node(endpoint) as node:
+        node.send(FRONT.detections(0), REAR.detections(0))
+        until(lambda: node.ask(KEYS.query(FUSED, "state"), SessionState).frames == 2, "both are tracked")
+        assert node.ask(KEYS.query(FUSED, "parameters"), SessionParameters).profile == "kitti"
+        state = node.ask(KEYS.query(FUSED, "reset"), SessionState)
+        assert (state.stream, state.tracks, state.frames) == (FUSED, 0, 2)
+        for what in ("state", "reset", "parameters", "density"):
+            refused = node.refused(KEYS.query(FRONT.stream, what))
+            assert (refused.path, refused.stream) == ("key", FRONT.stream)
+            assert FUSED in refused.expected
+        node.send(FRONT.detections(1))
+
+        def silent() -> bool:
+            service.housekeeping()
+            (line,) = service.status().sessions
+            return bool(line.silent)
+
+        until(silent, "a sensor is silent")
+        (line,) = service.status().sessions
+        assert (line.stream, line.sensors) == (FUSED, (FRONT.stream, REAR.stream))
+
+
+def test_what_is_wrong_is_said_to_the_sensor(start: Callable[..., Any]) -> None:
+    """Bytes that are no message, another's message, a wrong clock: the other sensor is tracked on."""
+    _, endpoint = start(fuse=["site/node/*"])
+    with Node(endpoint) as node:
+        node.send(FRONT.detections(0), REAR.detections(0))
+        node.tracks(FUSED, 2)
+        node.send_raw(KEYS.detections(REAR.stream), b"no message")
+        assert node.problem(REAR.stream, "malformed").stream == REAR.stream
+        node.send(REAR.detections(1, stamp_ns=5))
+        assert node.problem(REAR.stream, "time_jump").seq == 1
+        node.send(REAR.detections(2, score=np.full(3, 0.5), size=np.full((3, 3), 1e-300)), FRONT.detections(3))
+        until(lambda: node.ask(KEYS.query(FUSED, "state"), SessionState).seq == 3, "the front sensor is tracked")
+        node.send_raw(KEYS.detections(FUSED), b"")  # the name of the tracks is none of a sensor
+        until(lambda: node.ask(KEYS.query(FUSED, "state"), SessionState).frames >= 3, "nobody is harmed")
+        assert not [key for key, _, _ in node.problems_seen.items if key == KEYS.problems(FRONT.stream)]
+
+
+def test_no_sensor_takes_the_room_of_another() -> None:
+    """A sensor that floods the mailbox loses its own frames and clouds, and what is lost is counted for it."""
+
+    def packet(origin: str, number: int, *, topic: str = "detections", size: int = 10) -> Packet:
+        return Packet(f"p/{origin}/{topic}", bytes(size), size, "", number, number)
+
+    box = Mailbox(3, 2, 4000)
+    box.offer_frame(packet("a/b/slow", 0))
+    box.offer_cloud(packet("a/b/slow", 0, topic="points"))
+    for number in range(9):
+        box.offer_frame(packet("a/b/fast", number))
+        box.offer_cloud(packet("a/b/fast", number, topic="points"))
+    box.offer_frame(packet("a/b/fast", 9, size=3000))
+    assert box.counts()[0] > 0
+    assert box.shed_since().keys() == {"p/a/b/fast"}
+    assert not box.shed_since()
+    taken = []
+    while (one := box.take()) is not None:
+        taken.append((one[0], getattr(one[1], "origin", "")))
+    assert {("frame", "p/a/b/slow"), ("cloud", "p/a/b/slow")} <= set(taken)
+    assert box.waiting == 0
+
+
+def test_the_sensors_of_a_session_have_one_owner() -> None:
+    """A session is given to a process by its name; a sensor outside the patterns has a session of its own."""
+    fusion = Fusion(("site/*/lidar*", "yard/crane/*"))
+    assert fusion.session_of("site/car-7/lidar-front") == fusion.session_of("site/car-7/lidar-rear")
+    assert fusion.session_of("site/car-7/lidar-front") == "site/car-7/fused"
+    assert fusion.session_of("site/car-7/radar") == "site/car-7/radar"
+    assert fusion.session_of("site/car-8/lidar") == "site/car-8/fused"
+    assert fusion.session_of("yard/crane/x") == fusion.session_of("yard/crane/fused") == "yard/crane/fused"
+    assert fusion.is_session("site/car-7/fused")
+    assert not fusion.is_session("street/car-7/fused")
+    names = [f"yard/crane/s{number}" for number in range(20)]
+    shares = [{Assignment(index, 4).has(fusion.session_of(name)) for name in names} for index in range(4)]
+    assert sorted(map(sorted, shares)) == [[False]] * 3 + [[True]]
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"fuse": ["site/node"]}, "a pattern of streams looks like site/*/lidar*, received 'site/node'"),
+        ({"fuse": ["site/node/*"], "rewind_s": 0}, "rewind_s must not be 0"),
+    ],
+)
+def test_a_wrong_setting_is_named(options: dict[str, Any], text: str) -> None:
+    """A pattern has three parts, and sensors do not come in order."""
+    with pytest.raises(SettingsInvalidError) as caught:
+        load(None, options)
+    assert text in str(caught.value)
+
+
+def test_a_list_of_patterns_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With commas, as other lists do."""
+    monkeypatch.setenv("OPTIPMB_FUSE", "site/*/lidar*, yard/*/*")
+    assert load().settings.fuse == ("site/*/lidar*", "yard/*/*")
+
+
+def test_tracks_of_a_session_are_merged_by_sensor() -> None:
+    """Two sensors may share an epoch and a number: their tracks are those of two frames."""
+    from optipmb_client.merging import Merging, Novelty  # noqa: PLC0415 - of the client
+
+    one, merging = Session(FUSED, optipmb.load_profile("nuscenes"), Policy(recovery_wait_ns=0), fused=True), Merging(10)
+    side = Sensor("site/node/side", FRONT.epoch)
+    found = [*tracks(one.on_detections(FRONT.detections(0), 0)), *tracks(one.on_detections(side.detections(0), 0))]
+    assert [merging.take(message) for message in found] == [Novelty.NEW] * 2
