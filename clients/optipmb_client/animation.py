@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["animate_tracks"]
 
-FRAMES: Final = 200
+FRAMES: Final = 100
 """Of a longer sequence every second frame is drawn, or every third …"""
 TRAIL_S: Final = 3.0
 REACH_M: Final = 45.0
@@ -32,8 +32,9 @@ INSIDE: Final = (0.03, 0.97)
 """The view is as wide as these quantiles of the places of tracks, and"""
 MARGIN_M: Final = 4.0
 NARROWEST_M: Final = 30.0
-WIDTH_PX: Final = 800
-COLOURS: Final = 64
+SCALE_M: Final = 10.0
+WIDTH_PX: Final = 720
+COLOURS: Final = 32
 _INK, _TRUTH, _DETECTION = "#222222", "#C4C4C4", "#5A5A5A"
 
 
@@ -119,6 +120,9 @@ class _View:
         axes.plot(*sensor, "^", color=_INK, markersize=7, zorder=7)
         seconds = (frame.stamp_ns - self._begin_ns) * 1e-9
         axes.text(0.012, 0.975, f"{seconds:.1f} s", transform=axes.transAxes, fontsize=12, va="top", color=_INK)
+        left, bottom = self._low + origin + 0.03 * (self._high - self._low)
+        axes.plot([left, left + SCALE_M], [bottom, bottom], color=_INK, linewidth=1.5)
+        axes.text(left, bottom, f"{SCALE_M:.0f} m", fontsize=9, va="bottom", color=_INK)
         self._canvas.draw()
         return np.array(self._canvas.buffer_rgba())[:, :, :3]
 

@@ -230,6 +230,20 @@ def test_vehicles_do_not_run_over_pedestrians(scenes: list[SceneSequence]) -> No
                 assert not points_in_box(people[frame], center, world.size[car] + [0, 0, 2.0], yaw).any()
 
 
+def test_pedestrians_do_not_walk_through_each_other(scenes: list[SceneSequence]) -> None:
+    """Their middles are hardly ever nearer than a body is wide, and never in one place."""
+    nearest = []
+    for sequence in scenes:
+        world = sequence._world
+        people = world.center[:, world.label == PEDESTRIAN, :2]
+        apart = np.linalg.norm(people[:, :, None] - people[:, None], axis=3)
+        apart[:, np.arange(people.shape[1]), np.arange(people.shape[1])] = np.inf
+        nearest.append(apart.min(axis=2).ravel())
+    distance = np.concatenate(nearest)
+    assert distance.min() > 0.25
+    assert (distance < 0.6).mean() < 0.005
+
+
 def test_returned_points_lie_on_boxes_or_on_the_ground() -> None:
     """Each point is within 15 cm of the surface of its box, or of the ground, whoever else stands near."""
     sequence = scene(3, 40)

@@ -98,7 +98,7 @@ def test_a_gif_shows_every_frame_in_the_time_of_the_sequence(tmp_path: Path) -> 
         for one in range(getattr(picture, "n_frames", 1)):
             picture.seek(one)
             durations.append(picture.info["duration"])
-        assert (picture.width, durations) == (800, [100] * (len(sequence) - 1) + [1000])
+        assert (picture.width, durations) == (720, [100] * (len(sequence) - 1) + [1000])
         shown = {colour for _, colour in picture.convert("RGB").getcolors(1 << 24) or ()}
     assert len(shown) > 10
 

@@ -4,7 +4,8 @@ Conventions: world frame, z up with the ground at 0, metres, seconds. Object 0 o
 
 Vehicles follow one another by the intelligent driver model (Treiber, Hennecke and Helbing, 2000), keep the speed that a
 bend allows, wait at the stop line until nobody whose way conflicts with theirs is on the crossing, and let pedestrians
-cross. A body lies on its path with both axles, as a car does that is steered at its front. None of this is a motion
+cross. A body lies on its path with both axles, as a car does that is steered at its front. Pedestrians step aside for
+each other, as much as a body is wide: two in one place would be one object to any detector. None of this is a motion
 model of a tracker.
 """
 
@@ -28,6 +29,19 @@ _AT_LINE = 0.6
 _LOOK_AHEAD = 45.0
 _FREE = 1e4
 _WALK_ACCELERATION = 1.0
+_APART = 1.1
+"""Distance of two pedestrians, in metres, below which they give way."""
+_FORESIGHT = 3.0
+"""Seconds ahead within which they do so."""
+_GIVE_WAY = 2.5
+"""Acceleration per metre that the distance will be too small."""
+_GIVE_WAY_LIMIT = 1.0
+_BACK_TO_WAY, _DAMPING = 0.5, 1.5
+"""Acceleration back to the own way per metre beside it, and per metre a second."""
+_TO_THE_RIGHT = 0.05
+"""So many metres two that would meet head-on count as right of each other."""
+_SETTLING = 60
+"""Steps before the scene begins in which those who start in one place move apart."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +171,10 @@ class Walkers:
         self._pause = [sum(p.stop < r.start for p in r.pauses) for r in routes]
         self._rest = [0.0] * len(routes)
         self._waited = [0.0] * len(routes)
+        self._aside, self._drift = np.zeros((len(routes), 2)), np.zeros((len(routes), 2))
+        for _ in range(_SETTLING):
+            self._give_way(0.05)
+        self._drift[:] = 0.0
 
     def state(self) -> tuple[Floats, Floats, Floats]:
         """Return centres (N, 2), yaws (N,) and velocities (N, 2)."""
@@ -164,10 +182,12 @@ class Walkers:
         for i, route in enumerate(self._routes):
             before, center[i], after = route.path.at(np.array([self._s[i] - 0.3, self._s[i], self._s[i] + 0.3]))
             along[i] = (after - before) / max(float(np.hypot(*(after - before))), 1e-9)
-        return center, np.arctan2(along[:, 1], along[:, 0]), np.asarray(self._speed)[:, None] * along
+        velocity = np.asarray(self._speed)[:, None] * along + self._drift
+        return center + self._aside, np.arctan2(along[:, 1], along[:, 0]), velocity
 
     def step(self, h: float, crossing: Crossing) -> None:
         """Walk on for h seconds."""
+        self._give_way(h)
         crossing.impatient = set()
         for i, route in enumerate(self._routes):
             s = self._s[i]
@@ -178,6 +198,22 @@ class Walkers:
             new = speed + min(max(wanted - speed, -2.0 * _WALK_ACCELERATION * h), _WALK_ACCELERATION * h)
             self._s[i] = s + 0.5 * h * (speed + new)
             self._speed[i] = new
+
+    def _give_way(self, h: float) -> None:
+        """Step aside, for h seconds, for those who are or will be too near."""
+        center, yaw, velocity = self.state()
+        offset, approach = center[:, None] - center, velocity[:, None] - velocity
+        squared = np.maximum((approach**2).sum(axis=2), 1e-9)
+        ahead = np.clip(-(offset * approach).sum(axis=2) / squared, 0.0, _FORESIGHT)
+        right = np.column_stack([np.sin(yaw), -np.cos(yaw)])
+        nearest = offset + ahead[:, :, None] * approach + _TO_THE_RIGHT * right[:, None]
+        distance = np.maximum(np.linalg.norm(nearest, axis=2), 1e-9)
+        np.fill_diagonal(distance, np.inf)
+        push = (_GIVE_WAY * np.maximum(_APART - distance, 0.0) / distance)[:, :, None] * nearest
+        given = push.sum(axis=1)
+        given *= np.minimum(1.0, _GIVE_WAY_LIMIT / np.maximum(np.linalg.norm(given, axis=1), 1e-9))[:, None]
+        self._drift += h * (given - _BACK_TO_WAY * self._aside - _DAMPING * self._drift)
+        self._aside += h * self._drift
 
     def _kerb(self, i: int, h: float, crossing: Crossing) -> float:
         """Return the arc length at which pedestrian i must stop for traffic."""
