@@ -27,7 +27,6 @@ from optipmb_client import Connection
 from optipmb_client.load import Load, generated, run_load
 from optipmb_client.load.material import FIRST, head, message
 from optipmb_service.app.kernels import warm_up
-from optipmb_service.cluster.ownership import Role, RoleChange
 from optipmb_service.observability import logs
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter
@@ -95,8 +94,6 @@ class Network:
 
     def __init__(self) -> None:
         self.waiting: list[Any] = []
-        self.roles: dict[str, Role] = {}
-        self.asked: list[str] = []
         self.published = 0
         self.problems: list[str] = []
 
@@ -111,27 +108,17 @@ class Network:
             if actor.work():
                 self.waiting.append(actor)
 
-    def role(self, stream: str) -> Role:
-        """Say what this instance is to a stream."""
-        return self.roles.get(stream, Role.NONE)
+    def holds(self, stream: str) -> bool:
+        """Every stream is tracked here."""
+        return bool(stream)
 
-    def may_write(self, stream: str) -> bool:
-        """Every stream that was granted may be written."""
-        return stream in self.roles
+    def fence(self, stream: str) -> int:
+        """Return the fence of all streams."""
+        return len(stream)
 
-    def elsewhere(self, stream: str) -> bool:
-        """No stream is tracked elsewhere."""
-        del stream
-        return False
-
-    def request(self, stream: str) -> None:
-        """Grant a stream soon."""
-        self.roles[stream] = Role.OWNER
-        self.asked.append(stream)
-
-    def release(self, stream: str) -> None:
-        """Forget a stream."""
-        self.roles.pop(stream, None)
+    def may_write(self, stream: str, fence: int | None) -> bool:
+        """All may be published."""
+        return fence == self.fence(stream)
 
     def claim(self, stream: str) -> Network:
         """Be the publisher of a stream."""
@@ -196,7 +183,7 @@ def measured(objects: int, points: int) -> dict[str, float]:
         sink=network,
         reporter=ProblemReporter(network.publish_problem, lambda *_: None),
         scheduler=network,
-        coordinator=network,
+        member=network,
         persistence=NoPersistence(),
         arm=lambda *_: None,
         metrics=Metrics(),
@@ -207,9 +194,6 @@ def measured(objects: int, points: int) -> dict[str, float]:
         for packet in frame:
             (registry.frame if packet.key.endswith("detections") else registry.cloud)(packet)
         network.run()
-        while network.asked:
-            registry.changed(network.asked.pop(), RoleChange.GRANTED)
-            network.run()
         row = parts.taken()
         if k >= WARM:
             rows.append(row)

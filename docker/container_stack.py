@@ -113,11 +113,11 @@ class Stack:
         said = [line.split()[0] for line in text.splitlines() if line.split()[1:2] == ["ready"]]
         return _instant(said[0]) - _instant(self.engine.inspect(container)["State"]["StartedAt"]) if said else 0.0
 
-    def closed(self, service: str) -> list[str]:
-        """The streams whose sessions a service has closed, as its log says."""
+    def restored(self, service: str) -> list[str]:
+        """The streams that a service has continued, as its log says."""
         lines = self.log(service).splitlines()
         events = [json.loads(line) for line in lines if line.startswith("{")]
-        return [one["stream"] for one in events if one["event"] == "session_closed"]
+        return [one["stream"] for one in events if one["event"] == "session_restored"]
 
     def log(self, service: str) -> str:
         """What a container has said on both outputs."""

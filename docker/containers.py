@@ -182,17 +182,20 @@ class Check:
             end = f"kill -KILL {self.engine.inspect(before)['State']['Pid']}"
             self.engine.run(*f"run --rm --pid host --user 0:0 --entrypoint sh {OURS} -c".split(), end)
             result = json.loads(replay.result())
-        ended = [name for name in self.stack.checked for stream in self.stack.closed(name) if stream.endswith("/0001")]
-        if len(ended) != 1 or ended[0] == owner:
-            raise CheckError(f"{owner} was killed, and the replay's stream was closed by {ended}")
+        others = [
+            name
+            for name in self.stack.checked
+            if name != owner and any(stream.endswith("/0001") for stream in self.stack.restored(name))
+        ]
+        if len(others) != 1:
+            raise CheckError(f"{owner} was killed, and the replay's stream was continued by {others}")
         (sequence,) = result["sequences"]
         if (sequence["returned"], sequence["missing"]) != (sequence["frames"], 0):
             raise CheckError(f"frames are missing: {sequence}")
         if not self.engine.works("exec", client, "cmp", *(f"/tmp/{one}/0001.txt" for one in ("track", "replay"))):
             raise CheckError("the tracks are not those of a run without a kill")
-        what = (
-            f"SIGKILL to {owner} in a replay; {ended[0]} goes on: {sequence['frames']} frames of {sequence['frames']}, "
-        )
+        count = sequence["frames"]
+        what = f"SIGKILL to {owner} in a replay; {others[0]} goes on: {count} frames of {count}, "
         waited = f"no frame waited longer than {result['latency']['max_ms'] / 1e3:.2f} s"
         self.show("takeover", f"{what}ids, boxes and times byte-equal to tracking without a service", waited)
         began = time.monotonic()

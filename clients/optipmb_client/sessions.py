@@ -82,13 +82,13 @@ def move_stream(connection: Connection, instance: str, stream: str, worker: int,
 
     Raises:
         MessageError: The stream's name is none.
-        ServiceUnavailable: No such instance, or it has no worker processes.
+        ServiceUnavailable: No such instance.
         ServiceRefused: It has no such worker, or the move was not done in time.
     """
     request = MoveRequest(stream=stream, worker=worker)
     asked = connection.query(Keys(prefix).move(instance), encode(request), encoding_of(MoveRequest), timeout=MOVE_S)
     if not asked:
-        raise ServiceUnavailable(f"no service {instance} with worker processes answers")
+        raise ServiceUnavailable(f"no service {instance} answers")
     _read(asked, MoveRequest)
 
 

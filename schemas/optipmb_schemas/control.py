@@ -51,11 +51,12 @@ class ResetRequest(Message):
 class MoveRequest(Message):
     """Query `service/<instance>/q/move`: give a stream to another worker process. The reply repeats it when it is done.
 
-    The move lasts until the instance is started anew. A stream may be moved before its first message.
+    All streams of its partition go with it, and stay until they are moved again. A stream may be moved before its first
+    message.
     """
 
     stream: Stream = Field(description="Name of the stream.")
-    worker: Count = Field(description="Number of the worker process, from 0.")
+    worker: Count = Field(description="Number of the worker process, from 0; 0 for an instance without.")
 
 
 class SessionState(Message):

@@ -339,20 +339,20 @@ class Settings(BaseSettings):
         default=3.0,
         ge=0.5,
         le=60,
-        description="an instance that is frozen or cut off for this long loses its streams to a standby",
+        description="a process that is frozen or cut off for this long loses its streams to the others",
     )
     standby_s: float = Field(
         default=10.0,
         ge=0,
         le=600,
-        description="time for which a standby keeps messages for a takeover; longer than `lease_s` and `checkpoint_s`"
-        " together",
+        description="time for which messages of streams that others track are kept for a takeover; longer than"
+        " `lease_s` and `checkpoint_s` together",
     )
     standby_mb: int = Field(
         default=256,
         ge=1,
         le=65536,
-        description="megabytes that a standby keeps, over all streams; clouds are dropped first",
+        description="megabytes that are kept so, over all streams; clouds are dropped first",
     )
     stale_s: float = Field(default=2.0, gt=0, description="a stream without a frame for this long is logged as stale")
     stuck_s: float = Field(

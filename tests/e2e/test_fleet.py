@@ -1,17 +1,16 @@
-"""Several service processes on one router, with one store: killed, frozen, ended, cut off."""
+"""A service process beside a router: ended, cut off, without room on its disk."""
 
 from __future__ import annotations
 
 import resource
-import time
 from typing import TYPE_CHECKING
 
 import pytest
-from fleet import Fleet, freeze, thaw
+from fleet import Fleet
 from optipmb_client import Publisher
 from optipmb_schemas import ServiceStatus
 from router import Node, until
-from takeovers import KEYS, SENSOR, check, outage_s, published_by, send
+from takeovers import KEYS, SENSOR, check, send
 
 import optipmb
 
@@ -22,44 +21,6 @@ if TYPE_CHECKING:
 @pytest.fixture(scope="module", autouse=True)
 def _compiled() -> None:
     optipmb.warm_up()
-
-
-@pytest.mark.timeout(300)
-def test_who_stands_by_takes_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Fault 17: SIGKILL of the owner, then SIGSTOP of its successor: each time another goes on, to the byte.
-
-    The frozen one finds its write lease lapsed when it wakes up, publishes nothing more and stands by.
-    """
-    with Fleet(tmp_path) as fleet, Node(fleet.endpoint) as node:
-        first = fleet.service("a")
-        send(node, 0, 10)
-        check(node, 10, owner="a")
-        frozen = fleet.service("b")
-        send(node, 10, 20)
-        check(node, 20, owner="a")
-        first.process.kill()
-        killed_ns = time.monotonic_ns()
-        send(node, 20, 40)
-        check(node, 40, owner="b")
-        at_once_s = outage_s(node, killed_ns)
-        fleet.service("c")
-        send(node, 40, 45)
-        freeze(frozen)
-        frozen_ns = time.monotonic_ns()
-        send(node, 45, 100, 0.1)
-        check(node, 100, owner="c")
-        lease_s = outage_s(node, frozen_ns)
-        before = len(published_by(node, "b"))
-        thaw(frozen)
-        frozen.wait_log("superseded")
-        send(node, 100, 110)
-        state = check(node, 110, owner="c")
-        assert len(published_by(node, "b")) == before
-        assert frozen.end()[0] == 0
-    accounted = state.frames + state.duplicates + state.late + state.refused + state.shed + state.queue
-    assert state.received == accounted
-    with capsys.disabled():
-        print(f"\ntakeover after a kill {at_once_s:.2f} s, after a freeze {lease_s:.2f} s (lease 2 s)")  # noqa: T201 - the figure
 
 
 @pytest.mark.timeout(600)
@@ -92,14 +53,14 @@ def test_terminated_in_the_middle(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(600)
 def test_a_router_that_is_killed(tmp_path: Path) -> None:
-    """Fault 16: no router for longer than the lease: the owner looks, goes on, recovers all, applies nothing twice."""
+    """Fault 16: no router for longer than the lease: the owner goes on, recovers all, applies nothing twice."""
     with Fleet(tmp_path, lease_s=1.0) as fleet, Node(fleet.endpoint) as node:
         service = fleet.service("a")
         send(node, 0, 10)
         node.tracks(SENSOR.stream, 10)
         fleet.router.kill()
         send(node, 10, 40)
-        service.wait_log("write_lease_lapsed")
+        service.wait_log("peer_lost")
         fleet.router.start()
         send(node, 40, 45)
         state = check(node, 45, owner="a")

@@ -20,7 +20,6 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from optipmb_service.cluster.assignment import Assignment
     from optipmb_service.runtime.context import Actor
 
     Start = Callable[..., tuple[Service, str]]
@@ -36,15 +35,15 @@ def _compiled() -> None:
 
 @pytest.fixture
 def start(_compiled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
-    """Start services; each is stopped at the end. Options are settings; `tracker` and `share` are the service's own."""
+    """Start services; each is stopped at the end. Options are settings; `tracker` is the service's own."""
     with contextlib.ExitStack() as stack:
 
-        def begin(*, tracker: Any = None, share: Assignment | None = None, **options: Any) -> tuple[Service, str]:
+        def begin(*, tracker: Any = None, **options: Any) -> tuple[Service, str]:
             endpoint = free_endpoint()
             given = {"listen": [endpoint], "instance": "test", "grace_s": 0.2, "store": "none", "profile": "nuscenes"}
             given |= options
             settings = load(None, given).settings
-            service = Service(settings, Profiles.read(settings.profile, settings.profiles), arm, tracker, share)
+            service = Service(settings, Profiles.read(settings.profile, settings.profiles), arm, tracker)
             stack.callback(service.stop)
             service.start()
             return service, (settings.endpoints or settings.connect)[0]

@@ -14,7 +14,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
-from optipmb_service.cluster.store import MemoryStore, load_newest
+from lease_log import Alone
+from optipmb_service.cluster.store import SqliteStore, load_newest
 from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
@@ -93,7 +94,8 @@ class World:
         self.tracker = tracker
         self.seconds = seconds
         self.now_ns = 0
-        self.store = MemoryStore()
+        self.store = SqliteStore(None)
+        self.leases = Alone(self.store)
         self.streams = [
             Stream(Sensor(stream=f"site/node/s{number}", epoch=self.random.randbytes(16)), number, 10_000 * SECOND)
             for number in range(streams)
@@ -220,14 +222,14 @@ class World:
             self._crash()
 
     def _save(self) -> None:
-        self.store.save({name: encode_checkpoint(one.snapshot()) for name, one in self.sessions.items()})
+        self.leases.save({name: encode_checkpoint(one.snapshot()) for name, one in self.sessions.items()})
 
     def _crash(self) -> None:
         """All sessions are gone; the checkpoints stay, perhaps the newest torn; the caches give all that they hold."""
         self.crashes += 1
         if self.random.random() < self.trouble.torn:
             self.torn += 1
-            self.store.save(
+            self.leases.save(
                 {
                     name: (data := encode_checkpoint(one.snapshot()))[: self.random.randrange(len(data))]
                     for name, one in self.sessions.items()
@@ -237,7 +239,7 @@ class World:
             stream = one.sensor.stream
             session = load_newest(self.store, stream, self._restored, CheckpointError, lambda _: None)
             self.sessions[stream] = session or self._fresh(stream)
-            self.store.save({stream: encode_checkpoint(self.sessions[stream].snapshot())})
+            self.leases.save({stream: encode_checkpoint(self.sessions[stream].snapshot())})
             # Some live frames come before the cached ones, as they do on a network.
             cached = [schemas.encode(message) for _, message in one.cache]
             live = self.random.sample(cached, k=min(3, len(cached)))

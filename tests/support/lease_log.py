@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from optipmb_service.cluster.leases import Record, partition_key
+from optipmb_service.cluster.leases import PARTITIONS, Change, partition_key, partition_of
 from optipmb_service.cluster.member import Member
-from optipmb_service.cluster.store import KEPT, StoreError
+from optipmb_service.cluster.store import KEPT, Fenced, Record, StoreError, Write
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from optipmb_service.cluster.leases import Fenced, LeaseStore, Write
-    from optipmb_service.cluster.port import RoleChange
+    from optipmb_service.cluster.store import LeaseStore
 
 SECOND = 1_000_000_000
 LEASE_S = 2.0
@@ -36,6 +35,7 @@ class MemoryLeases:
     """
 
     max_bytes = 2**20
+    remote = True
 
     def __init__(self, shared: Shared) -> None:
         self.shared = shared
@@ -65,12 +65,17 @@ class MemoryLeases:
         self._reach()
         return revision
 
+    def gone(self, member: str) -> bool:
+        """Never say so."""
+        del member
+        return False
+
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
         """Keep what has the newest fence."""
         self._reach()
         refused = set()
         for stream, one in checkpoints.items():
-            now = self.shared.records.get(partition_key(one.partition))
+            now = self.shared.records.get(one.lease)
             if now is None or now.revision != one.fence:
                 refused.add(stream)
             else:
@@ -83,6 +88,11 @@ class MemoryLeases:
         self._reach()
         kept = self.shared.checkpoints.get(stream)
         return kept[-1] if kept else None
+
+    def expire(self, age_s: float) -> int:
+        """Keep all."""
+        del age_s
+        return 0
 
     def set_aside(self, stream: str, reason: str) -> None:
         """Forget the newest."""
@@ -99,11 +109,38 @@ class MemoryLeases:
             raise StoreError("cut off")
 
 
-class NoNetwork:
-    """Where nobody listens."""
+class Alone:
+    """Leases of all partitions, for the checkpoints of a store that nobody else uses.
 
-    def declare_owner(self, stream: str) -> None:
-        """Say nothing."""
+    Args:
+        store: where they are.
+    """
+
+    def __init__(self, store: LeaseStore) -> None:
+        self.lapsed = False
+        self._store = store
+        self._fences = [self._take(partition_key(number)) for number in range(PARTITIONS)]
+
+    def _take(self, key: str) -> int | None:
+        now = self._store.get(key)
+        return self._store.put(Write(key, "alone", now.revision if now else 0))
+
+    def fence(self, stream: str) -> int | None:
+        """Return the fence of a stream."""
+        return self._fences[partition_of(stream)]
+
+    def may_write(self, stream: str, fence: int | None) -> bool:
+        """Whether it is the newest, and the lease has not lapsed."""
+        return fence == self.fence(stream) and not self.lapsed
+
+    def save(self, checkpoints: Mapping[str, bytes]) -> frozenset[str]:
+        """Save under the leases."""
+        return self._store.save(
+            {
+                stream: Fenced(partition_key(partition_of(stream)), self.fence(stream) or 0, data)
+                for stream, data in checkpoints.items()
+            }
+        )
 
 
 class Clock:
@@ -136,11 +173,14 @@ class HandMember:
         """Turns that it is still to miss."""
         self.clock = Clock(ahead_s)
         self.store = store
-        self.member = Member(name, store, NoNetwork(), LEASE_S, self.clock)
-        self.changes: list[tuple[str, RoleChange]] = []
+        self.member = Member(name, store, LEASE_S, self.clock)
+        self.changes: list[tuple[int, Change]] = []
+        self.occupied: set[int] = set()
+        """Partitions with a stream whose state is not kept."""
         self.resumed = 0
-        self.member._changed = lambda stream, change: self.changes.append((stream, change))
+        self.member._changed = lambda partition, change: self.changes.append((partition, change))
         self.member._resumed = self._resume
+        self.member._occupied = lambda: self.occupied
 
     def turn(self, passed_s: float = 0.0) -> bool:
         """Let time pass and do one turn; False when the store could not be reached."""

@@ -6,7 +6,6 @@ and makes the state `degraded`.
 
 from __future__ import annotations
 
-import asyncio
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final, Protocol
@@ -22,6 +21,7 @@ from optipmb_service.observability.health import STUCK_S
 from optipmb_service.observability.metrics import Collected, ReadOnDemand, families
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.ports import TransportError
+from optipmb_service.runtime.queries import move_asked
 from optipmb_service.session.problems import problem_of
 
 if TYPE_CHECKING:
@@ -37,6 +37,8 @@ ANSWER_S: Final = 1.0
 """How long a worker may take to answer for its part."""
 
 MOVE_S: Final = 20.0
+"""How long a worker may take to have a stream brought to it."""
+
 TEXT: Final = "text/plain;version=0.0.4"
 PROBLEMS: Final = 100
 SESSIONS: Final = 10_000
@@ -57,14 +59,11 @@ class Workers(Protocol):
     def began(self) -> bool:
         """Whether all have been ready at once."""
 
-    async def move(self, stream: str, worker: int) -> None:
-        """Give a stream to a worker."""
-
 
 class Network(Protocol):
     """What is asked of the transport."""
 
-    def ask(self, key: str, timeout: float) -> bytes | None:
+    def ask(self, key: str, timeout: float, payload: bytes = b"", encoding: str = "") -> bytes | None:
         """Return the first answer at a key."""
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:
@@ -78,18 +77,15 @@ class AggregateView:
         settings: of the instance.
         workers: the supervisor.
         network: where the workers are asked.
-        loop: where the supervisor lives.
     """
 
-    def __init__(self, settings: Settings, workers: Workers, network: Network, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, settings: Settings, workers: Workers, network: Network) -> None:
         self._instance = settings.instance
-        self._clustered = bool(settings.cluster)
         self._keys = schemas.Keys(settings.prefix)
         self._fusion = Fusion(settings.fuse)
         self._limits = settings.limits.limits()
         self._workers = workers
         self._network = network
-        self._loop = loop
         self._started_ns = time.time_ns()
         self._began_ns = self._beat_ns = time.monotonic_ns()
         self._ending = False
@@ -206,20 +202,10 @@ class AggregateView:
         Raises:
             MessageError: what was asked cannot be.
         """
-        asked = schemas.decode(
-            request.payload or b"", schemas.MoveRequest, encoding=request.encoding, limits=self._limits
-        )
-        if self._clustered:
-            expected = "a service without `cluster`, whose members share the streams evenly"
-            raise schemas.MessageError("invalid_value", "worker", expected, str(asked.worker))
-        if asked.worker >= self._workers.count:
-            expected = f"a worker from 0 to {self._workers.count - 1}"
-            raise schemas.MessageError("invalid_value", "worker", expected, str(asked.worker))
-        moving = asyncio.run_coroutine_threadsafe(self._workers.move(asked.stream, asked.worker), self._loop)
-        try:
-            moving.result(MOVE_S)
-        except TimeoutError:
-            raise schemas.MessageError("invalid_value", "worker", "workers that answer", "none in time") from None
+        asked = move_asked(request, self._limits, self._workers.count)
+        key = self._keys.move(f"{self._instance}-w{asked.worker}")
+        if self._network.ask(key, MOVE_S, request.payload or b"", request.encoding) is None:
+            raise schemas.MessageError("invalid_value", "worker", "a worker to which the stream comes", "none in time")
         request.answer(request.key, asked)
 
     # The parts

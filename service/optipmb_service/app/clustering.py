@@ -1,26 +1,46 @@
-"""Who decides which streams an instance tracks, and where it keeps their state: by the setting `cluster`."""
+"""Where leases and checkpoints are kept: by the settings `cluster` and `store`."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-from optipmb_service.cluster.coordinator import Coordinator
+import structlog
+
+from optipmb_service.cluster.store import SqliteStore, StoreError
 from optipmb_service.runtime.persistence import DAY_S
 
 if TYPE_CHECKING:
-    from optipmb_service.cluster.port import Ownership
-    from optipmb_service.cluster.store import Store
+    from pathlib import Path
+
+    from optipmb_service.cluster.store import LeaseStore
     from optipmb_service.settings import Settings
-    from optipmb_service.zenoh import Transport
+
+log = structlog.get_logger("optipmb_service")
+
+STORE_FILE: Final = "sessions.db"
+LEASES_FILE: Final = "leases.db"
 
 
-def open_ownership(settings: Settings, transport: Transport) -> tuple[Ownership, Store | None]:
-    """Return what decides on ownership, and the store that goes with it; None: a file in the folder of the state."""
-    if not settings.cluster:
-        return Coordinator(settings.instance, transport, settings.lease_s), None
-    from optipmb_service.cluster.jetstream import JetStream  # noqa: PLC0415 - an extra
-    from optipmb_service.cluster.member import FencedStore, Member  # noqa: PLC0415 - needed with it alone
+def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, str | None]:
+    """Return what the members share, and why it keeps no checkpoints; None: it keeps them.
 
-    shared = JetStream(settings.cluster, settings.prefix, settings.keep_days * DAY_S)
-    member = Member(settings.instance, shared, transport, settings.lease_s)
-    return member, FencedStore(shared, member.fence)
+    Without a folder, or with one that cannot be used, leases are kept for as long as this process lives, or its parent.
+
+    Args:
+        settings: what is in force.
+        private: folder that the workers of one parent share; None: this process has no parent.
+    """
+    if settings.cluster:
+        from optipmb_service.cluster.jetstream import JetStream  # noqa: PLC0415 - an extra
+
+        return JetStream(settings.cluster, settings.prefix, settings.keep_days * DAY_S), None
+    folder, why = settings.folder, ""
+    if folder is not None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            return SqliteStore(folder / STORE_FILE), None
+        except (OSError, StoreError) as error:
+            # Tracking without memory is better than none; the status says that it is so.
+            log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
+            why = str(error)
+    return SqliteStore(private and private / LEASES_FILE), why

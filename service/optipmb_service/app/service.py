@@ -22,16 +22,16 @@ import structlog
 
 import optipmb
 from optipmb_service import __version__
-from optipmb_service.app.clustering import open_ownership
+from optipmb_service.app.clustering import open_store
 from optipmb_service.app.edges import grpc_edge, monitoring
 from optipmb_service.app.kernels import warm_up
 from optipmb_service.app.loops import StopRequest, beat, say_ready, settle, unless
-from optipmb_service.cluster.assignment import Assignment
+from optipmb_service.cluster.member import Member
 from optipmb_service.observability import collectors
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter
-from optipmb_service.runtime.persistence import open_persistence
+from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter, NoPersistence
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.runtime.queries import Queries
 from optipmb_service.runtime.registry import Registry
@@ -41,9 +41,11 @@ from optipmb_service.zenoh import Transport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from optipmb_service.observability.metrics import Value
     from optipmb_service.runtime.context import Actor
+    from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
@@ -63,7 +65,7 @@ class Service:
         profiles: the parameters that can be had.
         arm: has `StreamActor.wake` called at a monotonic time (ns).
         tracker: makes the trackers of sessions; default: trackers bounded as the settings say.
-        share: the streams of this process; all of them where it is the only one.
+        private: folder that the workers of one parent share; default: this process has no parent.
         metrics: what counts; its own by default.
 
     Raises:
@@ -76,7 +78,7 @@ class Service:
         profiles: Profiles,
         arm: Callable[[Actor, int], None],
         tracker: Callable[[optipmb.Parameters], Any] | None = None,
-        share: Assignment | None = None,
+        private: Path | None = None,
         metrics: Metrics | None = None,
     ) -> None:
         self._settings = settings
@@ -87,9 +89,12 @@ class Service:
         self._transport = Transport(settings)
         self._reporter = ProblemReporter(self._transport.publish_problem, _log_problem)
         self._scheduler = Scheduler()
-        self._coordinator, store = open_ownership(settings, self._transport)
-        self._persistence = open_persistence(
-            settings, self._coordinator.may_write, self._unkept, self._coordinator.owns, store
+        store, keeps_nothing = open_store(settings, private)
+        self._member = Member(settings.instance, store, settings.lease_s)
+        self._persistence: Persistence = (
+            CheckpointWriter(store, settings.checkpoint_s, self._member, self._unkept, settings.keep_days * DAY_S)
+            if keeps_nothing is None
+            else NoPersistence(keeps_nothing)
         )
         self._registry = Registry(
             settings,
@@ -97,22 +102,29 @@ class Service:
             sink=self._transport,
             reporter=self._reporter,
             scheduler=self._scheduler,
-            coordinator=self._coordinator,
+            member=self._member,
             persistence=self._persistence,
             arm=arm,
             metrics=self._metrics,
             tracker=tracker or partial(optipmb.Tracker, max_pairs=settings.max_pairs),
-            share=share,
         )
         self._metrics.add(self._figures)
-        self._queries = Queries(self._registry, self.status, self._metrics.text, self._metrics.samples)
+        self._queries = Queries(
+            self._registry,
+            self.status,
+            self._metrics.text,
+            self._metrics.samples,
+            self._member.bring,
+            settings.workers,
+        )
 
     def start(self, *, announce: bool = True) -> None:
         """Receive, answer, and say so."""
         self._transport.watch()
-        self._coordinator.start(self._registry.changed, self._registry.resume)
+        self._transport.watch_owners(self._registry.told_owner)
         self._persistence.start(self._registry.keep)
-        self._transport.subscribe(self._registry.frame, self._registry.cloud, self._registry.wants)
+        self._member.start(self._registry.changed, self._registry.resume, self._registry.occupied)
+        self._transport.subscribe(self._registry.frame, self._registry.cloud)
         self._transport.serve(self._queries.about_streams, self._queries.about_service)
         self._state = "ready"
         if announce:
@@ -137,14 +149,10 @@ class Service:
         if ended:
             self._registry.keep_now()
         self._persistence.close(JOIN_S)
-        self._coordinator.close(JOIN_S)
+        self._member.close(JOIN_S)
         self._reporter.flush(time.monotonic_ns())
         self._transport.close()
         return ended
-
-    def give_up(self, stream: str, then: Callable[[], None]) -> bool:
-        """End the session of a stream after what was received, then call `then`; False when there can be none."""
-        return self._registry.command(stream, lambda actor: actor.hand_over(then), urgent=False)
 
     @property
     def stuck(self) -> bool:
@@ -154,7 +162,7 @@ class Service:
     @property
     def failure(self) -> str:
         """Why the state is `degraded`; empty while it is not."""
-        return self._coordinator.failure or self._persistence.failure
+        return self._member.failure or self._persistence.failure
 
     @property
     def state(self) -> str:
@@ -164,7 +172,7 @@ class Service:
         """
         if self._state != "ready":
             return self._state
-        return "paused" if self._coordinator.failure else "degraded" if self._persistence.failure else "ready"
+        return "paused" if self._member.failure else "degraded" if self._persistence.failure else "ready"
 
     def status(self) -> schemas.ServiceStatus:
         """Return the answer to `q/status`."""
@@ -246,8 +254,8 @@ class Parent(Protocol):
     """What a process that tracks is to the one that started it."""
 
     @property
-    def share(self) -> Assignment:
-        """The streams that it tracks."""
+    def private(self) -> Path | None:
+        """Folder that it shares with the others of the same parent; None: it has no parent."""
 
     @property
     def announces(self) -> bool:
@@ -276,7 +284,7 @@ class NoParent:
     announces: Final = True
 
     def __init__(self, settings: Settings) -> None:
-        self.share = Assignment()
+        self.private = None
         self._settings = settings
 
     def begin(self, asked: StopRequest) -> None:
@@ -301,7 +309,7 @@ async def run(settings: Settings, profiles: Profiles, parent: Parent | None = No
     Args:
         settings: what is in force.
         profiles: the parameters that can be had.
-        parent: the parent and the share of a worker process; default: this process is alone and tracks all streams.
+        parent: the parent of a worker process; default: this process has none.
 
     Returns:
         The exit status: 0, or 1 when the network could not be used.
@@ -343,7 +351,9 @@ async def _serve(
         return 0
     if not settings.is_router:
         log.info("connecting", endpoints=settings.connect)
-    service = await unless(asked, lambda: Service(settings, profiles, arm, metrics=health.metrics, share=parent.share))
+    service = await unless(
+        asked, lambda: Service(settings, profiles, arm, private=parent.private, metrics=health.metrics)
+    )
     if service is None:
         return 0
     service.start(announce=parent.announces)

@@ -5,7 +5,7 @@ no password. Else the workers connect where the parent does. To the network the 
 holds its alive token and answers its queries; the owner tokens of streams carry the names of the workers.
 
 A worker that gives no sign of life for `stuck_s` is killed. One that dies is started again at once; if it dies again
-soon, after a pause that doubles. It has the same share of the streams then. The others do not notice.
+soon, after a pause that doubles. Meanwhile the others have its streams.
 """
 
 from __future__ import annotations
@@ -46,12 +46,6 @@ LATE_S: Final = 2.0
 END_S: Final = 3.0
 """Beyond the grace, how long workers may take to end before they are killed."""
 
-OVERLAP_S: Final = 0.25
-"""How much later than the new worker of a stream the old one may receive a message, without a loss."""
-
-ORDER_S: Final = 9.0
-"""Longest wait for an order to be carried out."""
-
 State = Literal["starting", "ready", "down"]
 
 
@@ -61,10 +55,10 @@ class Supervisor:
     Args:
         settings: what the workers run with, but for their names.
         asked: whether the end was asked for.
-        lock: file by which the workers compile one after the other.
+        private: folder that the workers share.
     """
 
-    def __init__(self, settings: Settings, asked: StopRequest, lock: Path) -> None:
+    def __init__(self, settings: Settings, asked: StopRequest, private: Path) -> None:
         self.count = settings.workers
         self.states: list[State] = ["down"] * self.count
         self.restarts = [0] * self.count
@@ -75,16 +69,12 @@ class Supervisor:
         """Exit status of a worker that could not even start."""
         self._settings = settings
         self._asked = asked
-        self._lock = lock
+        self._private = private
         self._children: list[WorkerProcess | None] = [None] * self.count
         self._tasks: list[asyncio.Task[None]] = []
         self._watching: asyncio.Task[None] | None = None
         self._heard = [0.0] * self.count
         self._changed = asyncio.Event()
-        self._moved: dict[str, int] = {}
-        self._orders: dict[int, asyncio.Future[None]] = {}
-        self._number = 0
-        self._moving = asyncio.Lock()
 
     async def start(self) -> bool:
         """Start the workers and wait until all are ready; False when that will not be."""
@@ -118,38 +108,6 @@ class Supervisor:
         if late:
             await asyncio.wait(late)
         return not late
-
-    async def move(self, stream: str, worker: int) -> None:
-        """Give a stream to a worker, from whichever has it.
-
-        The new one is told first: it keeps what arrives from then on. For a moment both receive, so that a message
-        which reaches one of them later than the other is not lost between them. Then the old one gives the stream up
-        after what it has received, and the new one goes on from there.
-
-        Raises:
-            TimeoutError: a worker did not follow; all are told nevertheless.
-        """
-        async with self._moving:
-            self._moved[stream] = worker
-            others = [index for index in range(self.count) if index != worker]
-            await self._ordered([worker], stream, worker)
-            await asyncio.sleep(OVERLAP_S)
-            await self._ordered(others, stream, worker)
-            log.info("stream_moved", stream=stream, to=worker)
-
-    async def _ordered(self, indices: list[int], stream: str, worker: int) -> None:
-        waits = []
-        for index in indices:
-            child = self._children[index]
-            if child is None or self.states[index] == "down":
-                continue  # it learns of it at its start
-            self._number += 1
-            waits.append(asyncio.get_running_loop().create_future())
-            self._orders[self._number] = waits[-1]
-            child.order(order=self._number, stream=stream, worker=worker)
-        if waits:
-            async with asyncio.timeout(ORDER_S):
-                await asyncio.gather(*waits)
 
     async def _watch(self) -> None:
         """Kill workers that give no sign of life; they are started again."""
@@ -185,9 +143,7 @@ class Supervisor:
             self._set(index, "starting")
             self._was_ready[index] = False
             began = time.monotonic()
-            # As a member of a cluster a worker is alone: of all streams it tracks those of its partitions.
-            count = 1 if settings.cluster else self.count
-            status = await child.run(settings, count, self._moved, self._lock)
+            status = await child.run(settings, self._private)
             lived_s = time.monotonic() - began
             never_ready = not self._was_ready[index]
             self._set(index, "down")
@@ -206,13 +162,9 @@ class Supervisor:
 
     def _take_in(self, index: int, event: dict[str, Any]) -> None:
         self._heard[index] = time.monotonic()
-        match event:
-            case {"event": "ready"}:
-                self._was_ready[index] = True
-                self._set(index, "ready")
-            case {"event": "done", "order": int(number)} if (waits := self._orders.pop(number, None)) is not None:
-                if not waits.done():
-                    waits.set_result(None)
+        if event == {"event": "ready"}:
+            self._was_ready[index] = True
+            self._set(index, "ready")
 
     def _set(self, index: int, state: State) -> None:
         self.states[index] = state
@@ -236,22 +188,22 @@ async def supervise(settings: Settings) -> int:
             transport = await unless(asked, lambda: Transport(own))
             if transport is None:
                 return 0
-            return await _supervised(settings, workers, transport, asked, folder / "lock")
+            return await _supervised(settings, workers, transport, asked, folder)
         except (TransportError, EdgeError) as error:
             print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
             return 1
 
 
 async def _supervised(
-    settings: Settings, workers: Settings, transport: Transport, asked: StopRequest, lock: Path
+    settings: Settings, workers: Settings, transport: Transport, asked: StopRequest, private: Path
 ) -> int:
     """Run the workers until the end is asked for.
 
     Raises:
         HttpError: the address cannot be listened on.
     """
-    supervisor = Supervisor(workers, asked, lock)
-    view = AggregateView(settings, supervisor, transport, asyncio.get_running_loop())
+    supervisor = Supervisor(workers, asked, private)
+    view = AggregateView(settings, supervisor, transport)
     beating = asyncio.create_task(beat(view))
     ended = True
     try:
@@ -293,6 +245,7 @@ def divided(settings: Settings, socket: str) -> tuple[Settings, Settings]:
             # Its name follows from the endpoints, and those of the workers are the parent's own affair.
             "store": "none" if settings.folder is None else str(settings.folder),
             "zenoh_config": None if router else settings.zenoh_config,
+            "standby_mb": max(1, settings.standby_mb // settings.workers),
         }
     )
     return own, workers

@@ -1,9 +1,8 @@
 """A process that tracks: alone, or as one of the workers of a parent (`python -m optipmb_service.app.worker`).
 
-Parent and worker talk in lines of JSON. The parent writes to the worker's stdin: first what it is to run with, then
-orders, and when stdin ends, so does the worker: the parent wants it, or is dead. The worker writes events to its
-stdout: `ready`, a beat twice a second, and the number of every order it has carried out. Logs go to stderr, which both
-share.
+Parent and worker talk in lines of JSON. The parent writes to the worker's stdin what it is to run with; when stdin
+ends, so does the worker: the parent wants it, or is dead. The worker writes events to its stdout: `ready`, and a beat
+twice a second. Logs go to stderr, which both share.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import structlog
 
@@ -25,18 +24,20 @@ import optipmb
 from optipmb_service.app.kernels import warm_up
 from optipmb_service.app.loops import leave
 from optipmb_service.app.service import run
-from optipmb_service.cluster.assignment import Assignment
 from optipmb_service.observability import logs
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.settings import Settings
 
 if TYPE_CHECKING:
     from optipmb_service.app.loops import StopRequest
-    from optipmb_service.app.service import Parent, Service
+    from optipmb_service.app.service import Service
 
 log = structlog.get_logger("optipmb_service")
 
 WRONG_USE: Final = 2
+LOCK: Final = "lock"
+"""File that one worker at a time holds while it compiles."""
+
 LAST_S: Final = 5.0
 """Beyond the grace, how long a worker without a parent may take to end."""
 
@@ -46,26 +47,26 @@ class SupervisingParent:
 
     Args:
         settings: what the worker runs with.
-        share: the streams of the worker.
-        lock: file that one worker at a time holds while it compiles.
+        index: which worker.
+        private: folder that the workers share.
     """
 
     announces: Final = False  # to the network the workers are one instance, and the parent speaks for it
 
-    def __init__(self, settings: Settings, share: Assignment, lock: Path) -> None:
-        self.share = share
-        self._lock = lock
+    def __init__(self, settings: Settings, index: int, private: Path) -> None:
+        self.index = index
+        self.private = private
         self._settings = settings
         self._service: Service | None = None
         self._writing = threading.Lock()
 
     def begin(self, asked: StopRequest) -> None:
-        """Follow the orders that come, and end with them."""
+        """End when the parent says so, or is gone."""
         threading.Thread(target=self._listen, args=(asked,), name="parent", daemon=True).start()
 
     def warm_up(self) -> None:
         """Compile the kernels, or load them: after an installation one worker compiles, and the others wait for it."""
-        with self._lock.open("a") as file:
+        with (self.private / LOCK).open("a") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             warm_up()
 
@@ -80,26 +81,12 @@ class SupervisingParent:
             self._say(event="beat")
 
     def _listen(self, asked: StopRequest) -> None:
-        for line in sys.stdin:
-            try:
-                self._follow(json.loads(line))
-            except Exception:
-                log.exception("internal_error", order=line[:200])
+        for _ in sys.stdin:
+            pass
         asked.ask_threadsafe("parent")
         # Nobody is left who would kill a worker that hangs.
         time.sleep(self._settings.grace_s + LAST_S)
         os._exit(1)
-
-    def _follow(self, order: dict[str, Any]) -> None:
-        """Carry out an order: give a stream to a worker, this one or another."""
-        number, stream, worker = order["order"], order["stream"], order["worker"]
-        self.share.move(stream, worker)
-
-        def done() -> None:
-            self._say(event="done", order=number)
-
-        if self._service is None or worker == self.share.index or not self._service.give_up(stream, done):
-            done()
 
     def _say(self, **event: object) -> None:
         try:
@@ -123,15 +110,14 @@ def main() -> int:
     order = json.loads(line)
     settings = Settings(**order["settings"])
     logs.configure(settings.log_format, settings.log_level, order["index"])
-    share = Assignment(order["index"], order["count"], order["moved"])
-    return _run(settings, SupervisingParent(settings, share, Path(order["lock"])))
+    return _run(settings, SupervisingParent(settings, order["index"], Path(order["private"])))
 
 
-def _run(settings: Settings, parent: Parent | None) -> int:
+def _run(settings: Settings, parent: SupervisingParent | None) -> int:
     try:
         profiles = Profiles.read(settings.profile, settings.profiles)
     except optipmb.ParameterError as error:
-        if parent is None or parent.share.index == 0:  # of all workers one says it
+        if parent is None or parent.index == 0:  # of all workers one says it
             print(f"optipmb-service: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201 - the one line
         return WRONG_USE
     return asyncio.run(run(settings, profiles, parent))

@@ -1,4 +1,4 @@
-"""A worker process, as its parent sees it: started, listened to, given orders, ended in every case.
+"""A worker process, as its parent sees it: started, listened to, ended in every case.
 
 The worker is a fresh interpreter. A fork would copy Zenoh's threads without their life and numba's locks as they were,
 and a worker that is started again after a crash must not inherit what the parent has become by then.
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 LINE_BYTES: Final = 1 << 20
-"""Longest line between the two: the table of moved streams is one."""
+"""Longest line between the two."""
 
 
 class WorkerProcess:
@@ -40,16 +40,17 @@ class WorkerProcess:
         self._event = event
         self._process: asyncio.subprocess.Process | None = None
 
-    async def run(self, settings: Settings, count: int, moved: dict[str, int], lock: Path) -> int:
+    async def run(self, settings: Settings, private: Path) -> int:
         """Start it, and return its exit status when it has ended; below 0: the signal that killed it."""
         process = self._process = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "optipmb_service.app.worker", stdin=PIPE, stdout=PIPE, limit=LINE_BYTES
         )
         log.info("worker_started", worker=self.index, pid=process.pid)
         try:
-            values = settings.model_dump(mode="json")
-            self.order(settings=values, index=self.index, count=count, moved=moved, lock=str(lock))
-            assert process.stdout is not None  # noqa: S101 - it was asked for: said for the type checker
+            order = {"settings": settings.model_dump(mode="json"), "index": self.index, "private": str(private)}
+            assert process.stdin is not None  # noqa: S101 - it was asked for: said for the type checker
+            assert process.stdout is not None  # noqa: S101 - likewise
+            process.stdin.write(json.dumps(order).encode() + b"\n")
             async for line in process.stdout:
                 with contextlib.suppress(ValueError):  # what a library prints is no event
                     self._event(json.loads(line))
@@ -64,12 +65,6 @@ class WorkerProcess:
         """Number of the process; None before it runs and after its end."""
         process = self._process
         return process.pid if process is not None and process.returncode is None else None
-
-    def order(self, **order: object) -> None:
-        """Write a line to the worker; nothing happens when it is gone."""
-        process = self._process
-        if process is not None and process.stdin is not None and not process.stdin.is_closing():
-            process.stdin.write(json.dumps(order).encode() + b"\n")
 
     def end(self) -> None:
         """Ask it to end."""

@@ -1,4 +1,4 @@
-"""Leases and checkpoints in NATS JetStream; implements `leases.LeaseStore`.
+"""Leases and checkpoints in NATS JetStream; implements `store.LeaseStore`.
 
 One JetStream stream for each key prefix holds every record and every checkpoint, each kind under subjects of its own.
 The sequence number that the server gives a message is its revision, and the server compares: a write states the
@@ -23,13 +23,12 @@ import structlog
 from nats.aio.client import Client
 from nats.errors import Error as NatsError
 
-from optipmb_service.cluster.leases import Record
-from optipmb_service.cluster.store import KEPT, StoreError
+from optipmb_service.cluster.store import KEPT, Record, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Mapping, Sequence
 
-    from optipmb_service.cluster.leases import Fenced, Write
+    from optipmb_service.cluster.store import Fenced, Write
 
 log = structlog.get_logger("optipmb_service")
 
@@ -83,6 +82,8 @@ class JetStream:
         keep_s: age at which a checkpoint that nobody has replaced is forgotten; 0: never.
     """
 
+    remote: Final = True
+
     def __init__(self, servers: Sequence[str], prefix: str, keep_s: float = 0.0) -> None:
         self._servers = list(servers)
         self._name = f"OPTIPMB_{_token(prefix)}"
@@ -114,6 +115,11 @@ class JetStream:
             headers["Nats-TTL"] = f"{MEMBER_TTL_S}s"
         return self._call(self._publish(self._record(write.key), write.value.encode(), headers))
 
+    def gone(self, member: str) -> bool:
+        """Return False: whether a process on another machine has ended nobody knows."""
+        del member
+        return False
+
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
         """Write the newest checkpoints of streams; return those that were refused for their fence."""
         return self._call(self._save(checkpoints), len(checkpoints))
@@ -123,12 +129,19 @@ class JetStream:
         found = self._call(self._last(self._subject("checkpoint", stream)))
         return None if found is None else found[1]
 
+    def expire(self, age_s: float) -> int:
+        """Do nothing: the server itself forgets a checkpoint that is old."""
+        del age_s
+        return 0
+
     def set_aside(self, stream: str, reason: str) -> None:
         """Move the newest checkpoint of a stream to those set aside; the one before it is the newest then."""
         self._call(self._set_aside(stream, reason))
 
     def close(self, timeout: float) -> None:
         """Close the connection."""
+        if self._closed:
+            return
         self._closed = True
 
         async def end() -> None:
@@ -142,7 +155,7 @@ class JetStream:
         try:
             asyncio.run_coroutine_threadsafe(end(), self._loop).result(timeout)
         except TimeoutError:
-            log.warning("cluster_failed", error="the connection does not close")
+            log.warning("leases_failed", error="the connection does not close")
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(timeout)
         if not self._thread.is_alive():
@@ -282,7 +295,7 @@ class JetStream:
         turn = asyncio.Semaphore(SAVED_AT_ONCE)
 
         async def save(stream: str, one: Fenced) -> str | None:
-            headers = {EXPECTED: str(one.fence), f"{EXPECTED}-Subject": self._record(f"partition/{one.partition}")}
+            headers = {EXPECTED: str(one.fence), f"{EXPECTED}-Subject": self._record(one.lease)}
             if self._keep_s:
                 headers["Nats-TTL"] = f"{self._keep_s}s"
             async with turn:

@@ -6,8 +6,9 @@ states the revision that it replaces, is refused when that is not the newest, an
 it. No clock is ever compared with another one.
 
 - `member/<id>`: a member renews its record several times within a lease. Who has watched a record for a whole lease,
-  by its own clock, without a new revision, writes `ended` over that revision. The member's next renewal is refused
-  then, or it has come first and the other's write is refused.
+  by its own clock, without a new revision, writes `ended` over that revision; at once where the store knows that the
+  member's process is gone. The member's next renewal is refused then, or it has come first and the other's write is
+  refused.
 - `partition/<number>`: the member that holds the partition, or nobody. The revision of the record is the *fence* of
   the lease; the store refuses a checkpoint whose fence is not the newest revision of its partition. A partition
   whose member has ended, or that nobody holds, is taken by writing over its record.
@@ -15,21 +16,26 @@ it. No clock is ever compared with another one.
   can end it.
 
 Every member computes from the living ones how many partitions each is to have, within one of an equal share, leaves
-what it has beyond that, and takes what is free up to it.
+what it has beyond that, and takes what is free up to it. `wish/<number>` names the instance that an operator wants to
+have a partition: while such a member lives, no other takes it, and who holds it leaves it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import StrEnum, unique
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final
+
+from optipmb_service.cluster.store import ENDED, Write
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Container, Iterable
+
+    from optipmb_service.cluster.store import Record
 
 PARTITIONS: Final = 64
 ALIVE: Final = "alive"
-ENDED: Final = "ended"
 NOBODY: Final = ""
 
 LEAVE_LEASES: Final = 4
@@ -57,57 +63,49 @@ def partition_key(partition: int) -> str:
     return f"partition/{partition}"
 
 
-class Record(NamedTuple):
-    """A record as the store has it: its key, what it says, and its revision."""
-
-    key: str
-    value: str
-    revision: int
+def wish_key(partition: int) -> str:
+    """Return the key of the record of who is to have a partition."""
+    return f"wish/{partition}"
 
 
-class Write(NamedTuple):
-    """A record to be written over a revision; 0: the key is to have none."""
-
-    key: str
-    value: str
-    over: int
+def instance_of(member: str) -> str:
+    """Return the name of the instance whose run a member is."""
+    return member.rpartition("/")[0]
 
 
-class Fenced(NamedTuple):
-    """A checkpoint with the lease under which it is saved."""
+@unique
+class Change(StrEnum):
+    """What becomes of a partition."""
 
-    partition: int
-    fence: int
-    data: bytes
+    HELD = "held"
+    RECALLED = "recalled"
+    """Another member is to have it as soon as the states of its streams are kept."""
+    LOST = "lost"
+    """Another member may continue its streams already: the states here are not the newest, and are not to be kept."""
 
 
-class LeaseStore(Protocol):
-    """Where records and checkpoints are. Any thread may call; every call is bounded in time and raises `StoreError`."""
+class WriteLease:
+    """The time during which a member may publish and save; read by any thread, written by one.
 
-    @property
-    def max_bytes(self) -> int:
-        """Bytes that a checkpoint may have."""
+    Args:
+        length_ns: how long a renewal holds, monotonic time.
+    """
 
-    def follow(self, after: int) -> Sequence[Record]:
-        """Return the newest record of each key that changed after a revision, by revision; perhaps not yet the last."""
+    def __init__(self, length_ns: int) -> None:
+        self._length_ns = length_ns
+        self._until_ns = 0
 
-    def get(self, key: str) -> Record | None:
-        """Return the newest record of a key, certainly the newest; None without one."""
+    def valid(self, now_ns: int) -> bool:
+        """Whether the write lease holds."""
+        return now_ns < self._until_ns
 
-    def put(self, write: Write) -> int | None:
-        """Write a record; return its revision, None when the one to be replaced is not the newest."""
+    def renew(self, now_ns: int) -> None:
+        """Let it hold from now."""
+        self._until_ns = now_ns + self._length_ns
 
-    def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
-        """Write the newest checkpoints of streams; return those that were refused for their fence."""
-
-    def load(self, stream: str) -> bytes | None:
-        """Return the newest checkpoint of a stream, None without one."""
-
-    def set_aside(self, stream: str, reason: str) -> None:
-        """Move the newest checkpoint of a stream to those set aside; the one before it is the newest then."""
-
-    def close(self, timeout: float) -> None:
-        """Leave the store, within `timeout` seconds."""
+    def lapse(self) -> None:
+        """End it."""
+        self._until_ns = 0
 
 
 @dataclass(slots=True)
@@ -137,6 +135,7 @@ class LeaseTable:
     leaving: dict[int, int] = field(default_factory=dict)
     _members: dict[str, _Watched] = field(default_factory=dict)
     _partitions: dict[int, tuple[int, str]] = field(default_factory=dict)
+    _wishes: dict[int, str] = field(default_factory=dict)
     _looked_ns: int | None = None
 
     def take_in(self, records: Iterable[Record], now_ns: int) -> None:
@@ -151,6 +150,8 @@ class LeaseTable:
             kind, _, name = record.key.partition("/")
             if kind == "member":
                 self._take_in_member(name, record, now_ns)
+            elif kind == "wish":
+                self._wishes[int(name)] = record.value
             elif record.revision > self._partitions.get(int(name), (0, NOBODY))[0]:
                 self._set(int(name), record.revision, record.value)
         for _, holder in self._partitions.values():
@@ -177,41 +178,47 @@ class LeaseTable:
         """Return the living members with this one, by id."""
         return sorted([self.member, *(name for name, one in self._members.items() if one.alive)])
 
-    def elsewhere(self, partition: int) -> bool:
-        """Whether another member holds a partition, or is about to; may be called by any thread."""
-        return partition in self._partitions and (partition not in self.held or partition in self.leaving)
+    def holds(self, partition: int) -> bool:
+        """Whether sessions of a partition may begin here; may be called by any thread."""
+        return partition in self.held and partition not in self.leaving
 
-    def taken(self, partition: int) -> bool:
-        """Whether another living member holds a partition; may be called by any thread."""
+    def taken(self, partition: int, instance: str | None = None) -> bool:
+        """Whether another living member holds a partition, of any instance or of one."""
         _, holder = self._partitions.get(partition, (0, NOBODY))
         known = self._members.get(holder)
-        return known is not None and known.alive
+        return known is not None and known.alive and instance in {None, instance_of(holder)}
 
-    def due(self, now_ns: int, occupied: Callable[[], Container[int]]) -> list[Write]:
+    def due(self, now_ns: int, occupied: Callable[[], Container[int]], gone: Callable[[str], bool]) -> list[Write]:
         """Return what is to be written now; `written` is to be told of each.
 
         Args:
             now_ns: monotonic time.
             occupied: returns the partitions with a stream whose state is not kept yet; asked when one is to be left.
+            gone: whether the process of a member has ended for certain.
         """
         writes = [
             Write(member_key(name), ENDED, one.revision)
             for name, one in self._members.items()
-            if one.alive and now_ns - one.seen_ns >= self.lease_ns
+            if one.alive and (now_ns - one.seen_ns >= self.lease_ns or gone(name))
         ]
-        staying = [partition for partition in self.held if partition not in self.leaving]
-        missing = self._share() - len(staying)
-        if missing < 0:
-            self.leaving |= dict.fromkeys(sorted(staying)[missing:], now_ns)
+        mine, others = self._wished()
+        # What is wished goes before an equal share.
+        room = self._share() - len(mine)
+        for partition in sorted(self.held.keys() - self.leaving.keys() - mine):
+            room -= partition not in others
+            if partition in others or room < 0:
+                self.leaving[partition] = now_ns
         first = int.from_bytes(blake2b(self.member.encode(), digest_size=8).digest())
         for offset in range(PARTITIONS):  # each begins elsewhere, so that members seldom want the same one
             partition = (first + offset) % PARTITIONS
-            if missing <= 0:
-                break
-            if partition not in self.held and not self.taken(partition):
-                revision, _ = self._partitions.get(partition, (0, NOBODY))
-                writes.append(Write(partition_key(partition), self.member, revision))
-                missing -= 1
+            if partition in self.held or partition in others or self.taken(partition):
+                continue
+            if partition not in mine:
+                if room <= 0:
+                    continue
+                room -= 1
+            revision, _ = self._partitions.get(partition, (0, NOBODY))
+            writes.append(Write(partition_key(partition), self.member, revision))
         if self.leaving:
             kept = occupied()
             overdue_ns = now_ns - LEAVE_LEASES * self.lease_ns
@@ -233,7 +240,14 @@ class LeaseTable:
             self._set(int(name), revision, write.value)
 
     def _share(self) -> int:
-        """Return how many partitions this member is to hold."""
+        """Return how many of all partitions are an equal share of this member."""
         members = self.members()
         each, rest = divmod(PARTITIONS, len(members))
         return each + (members.index(self.member) < rest)
+
+    def _wished(self) -> tuple[set[int], set[int]]:
+        """Return the partitions that this member is to have by a wish, and those that another living one is to have."""
+        own, living = instance_of(self.member), {instance_of(name) for name in self.members()}
+        mine = {partition for partition, to in self._wishes.items() if to == own and not self.taken(partition, own)}
+        others = {partition for partition, to in self._wishes.items() if to in living}
+        return mine, others - mine

@@ -47,15 +47,12 @@ EVENTS: Final = {
     " The stream continues, other checkpoints are written; the state is `degraded`.",
     "store_failed": "Checkpoints cannot be written (disk full, read-only): tracking goes on, the state is `degraded`.",
     "store_back": "Checkpoints are written again.",
-    "write_lease_lapsed": "This process was frozen, starved or cut off: nothing is published until it has checked"
-    " whether another instance took over.",
-    "write_lease_renewed": "The check is done; streams that it still owns continue.",
-    "partitions_held": "With `cluster`: how many partitions this member holds, and who the `members` are.",
-    "lease_lost": "With `cluster`: this member was frozen, starved or cut off for `lease_s`, and others continue its"
-    " streams. It joins again at once.",
-    "cluster_failed": "The servers of `cluster` cannot be used, for `error`: after half of `lease_s` nothing is"
-    " published, and the state is `paused`.",
-    "cluster_back": "The servers of `cluster` can be used again.",
+    "partitions_held": "How many of 64 partitions, parts of all streams, this member holds, and who the `members` are.",
+    "lease_lost": "This member was frozen, starved or cut off for `lease_s`, and others continue its streams. It joins"
+    " again at once.",
+    "leases_failed": "The servers of `cluster`, or the folder `store`, cannot be used, for `error`: after half of"
+    " `lease_s` nothing is published, and the state is `paused`.",
+    "leases_back": "They can be used again.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames arrive again.",
     "problem": "A message was refused or lost; `count` of this kind since the last line. See the table of problems.",
@@ -73,7 +70,6 @@ EVENTS: Final = {
     "worker_killed": "A worker process did not end or respond in time and was killed.",
     "metrics_unreadable": "The metrics of a worker cannot be read; those of the others are shown.",
     "parent_gone": "A worker noticed that its parent has died, and ends.",
-    "stream_moved": "An operator moved the stream to another worker.",
     "stop_asked": "SIGINT or SIGTERM, or the parent ends its worker; it stops within two seconds.",
     "stop_asked_again": "Another signal, which has no effect.",
     "stopped": "The service has stopped. `drained` is false when a step took too long and was abandoned.",

@@ -11,12 +11,13 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     import optipmb
-    from optipmb_service.cluster.port import Ownership
+    from optipmb_service.cluster.member import Member
     from optipmb_service.observability.metrics import Metrics
     from optipmb_service.observability.problem_reporter import ProblemReporter
     from optipmb_service.runtime.byte_budget import ByteBudget
     from optipmb_service.runtime.persistence import Persistence
-    from optipmb_service.runtime.ports import MessageSink
+    from optipmb_service.runtime.ports import MessageSink, Packet
+    from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
     from optipmb_service.session.values import Lineage, Policy
 
 
@@ -52,10 +53,10 @@ class ActorContext:
         outlet: where results go.
         problem reporter: where problems go.
         parameters_of: profile of a stream.
-        coordinator: says which streams this instance owns.
+        member: says which streams are tracked here.
         checkpoint writer: where checkpoints go and come from.
-        standby_ns: how long packets wait for a takeover.
-        budget: bytes that may wait for takeovers, over all streams.
+        buffer: makes buffers for packets of streams that are not tracked here now.
+        keep: takes a packet of a stream that another instance is to track.
         dump: saves what is needed to see an error of a session again; returns the file.
         room: why a further stream has no room; empty when it has.
         admit: asked before a session begins; returns what the stream had before, None when there is no room.
@@ -80,10 +81,10 @@ class ActorContext:
     sink: MessageSink
     reporter: ProblemReporter
     parameters_of: Callable[[str], optipmb.Parameters]
-    coordinator: Ownership
+    member: Member
     persistence: Persistence
-    standby_ns: int
-    budget: ByteBudget
+    buffer: Callable[[], TakeoverBuffer]
+    keep: Callable[[str, Packet, bool], None]
     dump: Callable[[str, bytes], str]
     room: Callable[[str], str]
     admit: Callable[[str], Lineage | None]

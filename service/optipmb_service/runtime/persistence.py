@@ -20,19 +20,18 @@ from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
 import structlog
 
-from optipmb_service.cluster.store import SqliteStore, Store, StoreError, load_newest
+from optipmb_service.cluster.leases import partition_key, partition_of
+from optipmb_service.cluster.store import Fenced, StoreError, load_newest
 from optipmb_service.session.checkpoint import Checkpoint, CheckpointError, decode_checkpoint, encode_checkpoint
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from optipmb_service.settings import Settings
+    from optipmb_service.cluster.store import LeaseStore
 
 log = structlog.get_logger("optipmb_service")
 
 _T = TypeVar("_T")
-
-STORE_FILE: Final = "sessions.db"
 
 FAILED_NS: Final = 60 * 1_000_000_000
 """How long after the last failure a stream's checkpoint is called failing; it is tried every second while it sends."""
@@ -49,6 +48,9 @@ SHOWN: Final = 3
 SETTLE_S: Final = 0.25
 """Between a checkpoint and its writing, time for the tracks to leave."""
 
+
+RETRY_S: Final = 0.1
+"""Between two tries to read from a store that cannot be reached."""
 
 PAUSE_S: Final = 0.003
 """Between two checkpoints that are encoded; less where there are so many that it would take half the interval."""
@@ -76,8 +78,8 @@ class Persistence(Protocol):
     def start(self, gather: Callable[[], None]) -> None:
         """Begin the rounds; `gather` has every session that changed give its checkpoint to `put`, soon."""
 
-    def put(self, checkpoint: Checkpoint, then: Callable[[], None] | None = None) -> None:
-        """Have a checkpoint written, and `then` called when that was tried."""
+    def put(self, checkpoint: Checkpoint, fence: int | None, then: Callable[[], None] | None = None) -> None:
+        """Have a checkpoint written under a fence, and `then` called when that was tried."""
 
     def recall(self, stream: str, restore: Callable[[Checkpoint], _T], then: Callable[[_T | None], None]) -> None:
         """Call `then` with what `restore` makes of the newest checkpoint of a stream, None without one.
@@ -109,9 +111,9 @@ class NoPersistence:
     def start(self, gather: Callable[[], None]) -> None:
         """Do without rounds."""
 
-    def put(self, checkpoint: Checkpoint, then: Callable[[], None] | None = None) -> None:
+    def put(self, checkpoint: Checkpoint, fence: int | None, then: Callable[[], None] | None = None) -> None:
         """Forget the checkpoint."""
-        del checkpoint
+        del checkpoint, fence
         if then is not None:
             then()
 
@@ -127,39 +129,46 @@ class NoPersistence:
         """Nothing is open."""
 
 
+class Leases(Protocol):
+    """What it needs of the member."""
+
+    def fence(self, stream: str) -> int | None:
+        """Return the fence of the lease under which a stream is tracked here; None without one."""
+
+    def may_write(self, stream: str, fence: int | None) -> bool:
+        """Whether what was made under a fence may be saved now."""
+
+
 class CheckpointWriter:
     """Writes and reads the checkpoints of one process.
 
     Args:
         store: where they go.
         interval_s: time between two rounds.
-        may_write: whether this process owns a stream and may write for it now.
-        owns: whether it owns it, perhaps with a write lease that has lapsed.
-        keep_s: age at which the checkpoints of a stream go; 0: never.
+        leases: says what may be written, and under which fence.
         report: called with a stream whose checkpoint cannot be made, and why.
+        keep_s: age at which the checkpoints of a stream go; 0: never.
     """
 
     durable = True
 
     def __init__(
         self,
-        store: Store,
+        store: LeaseStore,
         interval_s: float,
-        may_write: Callable[[str], bool],
+        leases: Leases,
         report: Callable[[str, str], None] = lambda *_: None,
-        owns: Callable[[str], bool] = lambda _: False,
         keep_s: float = 0.0,
     ) -> None:
         self._keep_s = keep_s
         self._expires_ns = time.monotonic_ns()
-        self._owns = owns
         self._report = report
         self._store = store
         self._interval_s = interval_s
         self._gather: Callable[[], None] = lambda: None
-        self._may_write = may_write
+        self._leases = leases
         self._lock = threading.Lock()
-        self._pending: dict[str, Checkpoint] = {}
+        self._pending: dict[str, tuple[Checkpoint, int | None]] = {}
         self._thens: list[tuple[str, Callable[[], None]]] = []
         self._reading = ThreadPoolExecutor(1, "restore")
         self._hurry = threading.Event()
@@ -190,10 +199,10 @@ class CheckpointWriter:
         )
         return "; ".join(failed[:SHOWN])
 
-    def put(self, checkpoint: Checkpoint, then: Callable[[], None] | None = None) -> None:
+    def put(self, checkpoint: Checkpoint, fence: int | None, then: Callable[[], None] | None = None) -> None:
         """Have a checkpoint written in this round; with `then`, soon, and `then` called when that was tried."""
         with self._lock:
-            self._pending[checkpoint.stream] = checkpoint
+            self._pending[checkpoint.stream] = checkpoint, fence
             if then is not None:
                 self._thens.append((checkpoint.stream, then))
         if then is not None:
@@ -219,26 +228,29 @@ class CheckpointWriter:
             self._pending.pop(stream, None)
 
     def _recalled(self, stream: str, restore: Callable[[Checkpoint], _T]) -> _T | None:
-        """Make a stream this process's own in the store; return what `restore` makes of its newest whole checkpoint.
+        """Return what `restore` makes of the newest whole checkpoint of a stream; None when there is none.
 
-        None when there is none, and also when the store fails: then the stream begins anew.
+        None also when the store fails: then the stream begins anew. A store that cannot be reached is waited for while
+        the stream is to be tracked here: to begin anew would use track ids a second time.
         """
         with self._lock:
-            pending = self._pending.get(stream)
-        try:
-            self._store.claim([stream])
-            if pending is not None:
-                return restore(pending)
-            return load_newest(
-                self._store,
-                stream,
-                lambda data: restore(decode_checkpoint(data)),
-                CheckpointError,
-                lambda reason: log.warning("checkpoint_torn", stream=stream, reason=reason),
-            )
-        except StoreError as error:
-            self._failed(error)
-            return None if pending is None else restore(pending)
+            pending, fence = self._pending.get(stream, (None, None))
+        if pending is not None and fence == self._leases.fence(stream):
+            return restore(pending)
+        while True:
+            try:
+                return load_newest(
+                    self._store,
+                    stream,
+                    lambda data: restore(decode_checkpoint(data)),
+                    CheckpointError,
+                    lambda reason: log.warning("checkpoint_torn", stream=stream, reason=reason),
+                )
+            except StoreError as error:
+                self._failed(error)
+                waits = self._store.remote and self._leases.fence(stream) is not None
+                if not waits or self._ended.wait(RETRY_S):
+                    return None
 
     def close(self, timeout: float) -> None:
         """Write what is pending and end; to be called when nothing is tracked any more."""
@@ -248,7 +260,6 @@ class CheckpointWriter:
         if self._thread.is_alive():
             self._thread.join(timeout)
         self._write()
-        self._store.close()
 
     def _run(self) -> None:
         while not self._ended.is_set():
@@ -276,16 +287,21 @@ class CheckpointWriter:
         with self._lock:
             taken, self._pending = self._pending, {}
             thens, self._thens = self._thens, []
-        mine = {stream: checkpoint for stream, checkpoint in taken.items() if self._may_write(stream)}
+        mine = {stream: one for stream, one in taken.items() if self._leases.may_write(stream, one[1])}
         # A lease that lapsed is renewed, or the stream is lost: until that is known its newest state is kept.
         later = {
-            stream: checkpoint
-            for stream, checkpoint in taken.items()
-            if stream not in mine and self._owns(stream) and not self._ended.is_set()
+            stream: one
+            for stream, one in taken.items()
+            if stream not in mine and one[1] == self._leases.fence(stream) is not None and not self._ended.is_set()
         }
         try:
-            encoded = self._encoded(mine) if mine else {}
-            lost = self._store.save(encoded) if encoded else ()
+            encoded = self._encoded({stream: checkpoint for stream, (checkpoint, _) in mine.items()}) if mine else {}
+            fenced = {
+                stream: Fenced(partition_key(partition_of(stream)), fence, data)
+                for stream, data in encoded.items()
+                if (fence := mine[stream][1]) is not None
+            }
+            lost = self._store.save(fenced) if fenced else ()
         except StoreError as error:
             self._failed(error)
             with self._lock:
@@ -345,28 +361,3 @@ class CheckpointWriter:
         if not self._store_failure:
             log.error("store_failed", error=str(error))
         self._store_failure = str(error)
-
-
-def open_persistence(
-    settings: Settings,
-    may_write: Callable[[str], bool],
-    report: Callable[[str, str], None],
-    owns: Callable[[str], bool],
-    store: Store | None = None,
-) -> Persistence:
-    """Return the checkpoint writer; where its store cannot be opened, one that keeps nothing and says why.
-
-    Without a store that all members of a cluster share, the store is a file in the folder of the state.
-    """
-    folder = settings.folder
-    if store is None:
-        if folder is None:
-            return NoPersistence()
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            store = SqliteStore(folder / STORE_FILE, settings.instance)
-        except (OSError, StoreError) as error:
-            # Tracking without memory is better than none; the status says that it is so.
-            log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
-            return NoPersistence(str(error))
-    return CheckpointWriter(store, settings.checkpoint_s, may_write, report, owns, settings.keep_days * DAY_S)

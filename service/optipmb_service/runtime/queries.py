@@ -17,6 +17,7 @@ import optipmb_schemas as schemas
 import structlog
 
 import optipmb
+from optipmb_service.cluster.store import StoreError
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.convert import density_of
@@ -39,6 +40,9 @@ TEXT = "text/plain;version=0.0.4"
 JSON = "application/json"
 """Zenoh encoding of the metrics as data."""
 
+MOVE_S = 15.0
+"""How long a stream may take to be moved; it takes a second."""
+
 NO_SESSION = "0" * 32
 """Session id in the state of a stream that has none."""
 
@@ -53,6 +57,8 @@ class Queries:
         status: makes the status of the service.
         metrics: makes its metrics, in Prometheus' text format.
         samples: makes its metrics as data for the parent of this process.
+        bring: has a stream brought to this process, within a time (s); False when it was not.
+        workers: how many processes the service has.
     """
 
     def __init__(
@@ -61,17 +67,25 @@ class Queries:
         status: Callable[[], schemas.ServiceStatus],
         metrics: Callable[[], bytes],
         samples: Callable[[], bytes],
+        bring: Callable[[str, float], bool],
+        workers: int,
     ) -> None:
         self._registry = registry
         self._status = status
         self._metrics = metrics
         self._samples = samples
+        self._bring = bring
+        self._workers = workers
         self._keys = registry.keys
+        self._moves = ThreadPoolExecutor(1, "move")
         self._digests = ThreadPoolExecutor(1, "digest")
 
     def about_service(self, request: Request) -> None:
-        """Answer with the status of the service, its metrics, or both when the key has a `*`."""
+        """Answer with the status of the service, its metrics, or both when the key has a `*`; or move a stream here."""
         instance = self._registry.instance
+        if request.key == self._keys.move(instance):
+            self._moves.submit(_guarded, request, lambda: self._move(request))
+            return
         _guarded(request, lambda: self._report(request, self._keys.status(instance), self._keys.metrics(instance)))
 
     def _report(self, request: Request, status: str, metrics: str) -> None:
@@ -82,6 +96,23 @@ class Queries:
             request.answer(status, self._status())
         if request.matches(metrics):
             request.answer_text(metrics, self._metrics(), TEXT)
+
+    def _move(self, request: Request) -> None:
+        """Have a stream brought here, and say so."""
+        try:
+            asked = move_asked(request, self._registry.limits, self._workers)
+        except schemas.MessageError as error:
+            request.refuse(self._problem("", error))
+            return
+        try:
+            received = "" if self._bring(self._registry.fusion.session_of(asked.stream), MOVE_S) else "none in time"
+        except StoreError as error:
+            received = str(error)
+        if received:
+            failed = schemas.MessageError("invalid_value", "worker", "a worker to which the stream comes", received)
+            request.refuse(self._problem(asked.stream, failed))
+        else:
+            request.answer(request.key, asked)
 
     def about_streams(self, request: Request) -> None:
         """Answer what concerns sessions, here or on the worker of the stream."""
@@ -97,8 +128,8 @@ class Queries:
             _guarded(request, lambda: request.refuse(nowhere))
             return
         session = self._registry.fusion.session_of(stream)
-        if not self._registry.share.has(session):
-            request.finish()  # another process has the stream, and answers
+        if self._registry.elsewhere(session):
+            request.finish()  # another instance tracks the stream, and answers
             return
         if session != stream:
             shared = schemas.MessageError("invalid_value", "key", f"{session}, the session that it shares", stream)
@@ -286,6 +317,18 @@ class Queries:
             received=error.received,
             message=f"Query: {error.path or 'payload'}: expected {error.expected}, received {error.received}.",
         )
+
+
+def move_asked(request: Request, limits: schemas.Limits, workers: int) -> schemas.MoveRequest:
+    """Return what a request to move a stream says.
+
+    Raises:
+        MessageError: it is none, or there is no such worker.
+    """
+    asked = schemas.decode(request.payload or b"", schemas.MoveRequest, encoding=request.encoding, limits=limits)
+    if asked.worker >= workers:
+        raise schemas.MessageError("invalid_value", "worker", f"a worker from 0 to {workers - 1}", str(asked.worker))
+    return asked
 
 
 class _Countdown:

@@ -9,20 +9,23 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
 import structlog
 
 import optipmb
-from optipmb_service.cluster.assignment import Assignment
-from optipmb_service.cluster.port import RoleChange
+from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.runtime import dumps
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.context import Actor, ActorContext
 from optipmb_service.runtime.fusion import FUSED, Fusion
+from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
+from optipmb_service.runtime.rivals import Rivals
 from optipmb_service.runtime.stream_actor import StreamActor
+from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import SECOND, Lineage, MessageCounters, Policy
 
@@ -30,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from optipmb_service.cluster.port import Ownership
+    from optipmb_service.cluster.member import Member
     from optipmb_service.observability.metrics import Metrics
     from optipmb_service.observability.problem_reporter import ProblemReporter
     from optipmb_service.runtime.persistence import Persistence
@@ -61,20 +64,14 @@ REFUSED_NS: Final = SECOND // 10
 EVICT_EVERY_NS: Final = SECOND
 """A session is asked to close no more often than this."""
 
+RIVAL_LEASES: Final = 3
+"""Leases for which the token of an instance may stay whose stream has been taken over."""
+
 PARTS: Final = 4
 """What a stream's memory is divided into: mailbox, clouds, frames held, window."""
 
 MAX_KEYS: Final = 8192
 """Keys whose stream is remembered."""
-
-
-ON_CHANGE: Final = {
-    RoleChange.GRANTED: StreamActor.on_granted,
-    RoleChange.DENIED: StreamActor.on_lost,
-    RoleChange.LOST: StreamActor.on_lost,
-    RoleChange.RECALLED: StreamActor.on_recalled,
-}
-"""What a stream's worker does when its role changes."""
 
 
 class Registry:
@@ -86,12 +83,11 @@ class Registry:
         outlet: where results go.
         problem reporter: where problems go.
         scheduler: the workers.
-        coordinator: says which streams this instance owns.
+        member: says which streams this instance tracks.
         checkpoint writer: where checkpoints go and come from.
         arm: has `StreamActor.wake` called at a monotonic time (ns).
         metrics: counts what comes and goes.
         tracker: makes the trackers of sessions.
-        share: the streams of this process; all of them where it is the only one.
     """
 
     def __init__(  # noqa: PLR0913 - the parts that it brings together
@@ -102,14 +98,13 @@ class Registry:
         sink: MessageSink,
         reporter: ProblemReporter,
         scheduler: Scheduler,
-        coordinator: Ownership,
+        member: Member,
         persistence: Persistence,
         arm: Callable[[Actor, int], None],
         metrics: Metrics,
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
-        share: Assignment | None = None,
     ) -> None:
-        self.share = share or Assignment()
+        self._member = member
         self.profiles = profiles
         self.instance = settings.instance
         self.keys = schemas.Keys(settings.prefix)
@@ -132,6 +127,11 @@ class Registry:
             Quota(settings.node_sessions, settings.node_rate, settings.node_mb_s * MEGABYTE),
             Quota(settings.site_sessions, settings.site_rate, settings.site_mb_s * MEGABYTE),
         )
+        self._rivals = Rivals(settings.instance, round(RIVAL_LEASES * settings.lease_s * SECOND))
+        self.told_owner = self._rivals.told
+        foreign = ByteBudget(settings.standby_mb * MEGABYTE)
+        self._foreign: dict[str, TakeoverBuffer] = {}
+        self._foreign_lock = threading.Lock()
         self._mailboxes = ByteBudget(settings.memory_mb * MEGABYTE // 2)
         self._context = ActorContext(
             instance=settings.instance,
@@ -159,11 +159,11 @@ class Registry:
             sink=sink,
             reporter=reporter,
             parameters_of=profiles.of,
-            coordinator=coordinator,
+            member=member,
             persistence=persistence,
-            standby_ns=round(settings.standby_s * SECOND),
             dump=lambda stream, dump: _save(settings.folder, stream, dump),
-            budget=ByteBudget(settings.standby_mb * MEGABYTE),
+            buffer=lambda: TakeoverBuffer(round(settings.standby_s * SECOND), foreign),
+            keep=self._keep,
             room=self._room,
             admit=self._admit,
             release=self._release,
@@ -176,27 +176,52 @@ class Registry:
 
     # Messages, from the readers
 
-    def wants(self, key: str) -> bool:
-        """Whether a message on a key is for this process; asked before its payload is touched."""
-        share = self.share
-        if share.count == 1:
-            return True
-        try:
-            return share.has(self._parsed(key)[1])
-        except schemas.MessageError:
-            return share.index == 0  # a key that is none of a stream is reported by one of the processes
-
     def frame(self, packet: Packet) -> None:
         """Hand detections to their stream; never waits."""
-        self._metrics.received("detections", packet.size)
-        if (session := self._session_of(packet, frame=True)) is not None:
-            self._offer(session, lambda actor: actor.mailbox.offer_frame(packet))
+        self._receive(packet, frame=True)
 
     def cloud(self, packet: Packet) -> None:
         """Hand a point cloud to its stream; never waits."""
-        self._metrics.received("points", packet.size)
-        if (session := self._session_of(packet, frame=False)) is not None:
-            self._offer(session, lambda actor: actor.mailbox.offer_cloud(packet))
+        self._receive(packet, frame=False)
+
+    def _receive(self, packet: Packet, *, frame: bool) -> None:
+        try:
+            stream, session = self._parsed(packet.key)
+        except schemas.MessageError as error:
+            if self._member.holds(packet.key):  # of all instances one reports it
+                self._count_refused()
+                self._report("invalid_value", "", error.expected, error.received)
+            return
+        if not self._kept_for_takeover(session, packet, frame=frame):
+            self._metrics.received("detections" if frame else "points", packet.size)
+            if not self._over_quota(stream, packet, frame=frame):
+                self._hand(session, packet, frame=frame)
+
+    def _hand(self, stream: str, packet: Packet, *, frame: bool) -> None:
+        offered = Mailbox.offer_frame if frame else Mailbox.offer_cloud
+        self._offer(stream, lambda actor: offered(actor.mailbox, packet))
+
+    def _kept_for_takeover(self, stream: str, packet: Packet, *, frame: bool) -> bool:
+        """Keep a packet of a stream that is not tracked here; False where the stream is to be tracked here.
+
+        Once the stream is, what was kept goes first, so packets are kept until that has been handed over.
+        """
+        if self._member.holds(stream) and stream not in self._foreign:
+            return False
+        with self._foreign_lock:
+            buffer = self._foreign.get(stream)
+            if buffer is None:
+                if self._member.holds(stream):
+                    return False
+                buffer = self._foreign[stream] = self._context.buffer()
+            buffer.add(packet, frame=frame)
+            buffer.seen_ns = packet.now_ns
+        return True
+
+    def _keep(self, stream: str, packet: Packet, frame: bool) -> None:  # noqa: FBT001 - as a field of the context
+        """Keep a packet that an actor has no use for, unless the stream has come here again."""
+        if not self._kept_for_takeover(stream, packet, frame=frame):
+            self._hand(stream, packet, frame=frame)
 
     def command(self, stream: str, command: Callable[[StreamActor], None], *, urgent: bool) -> bool:
         """Have a worker run a command for a stream; False when the service takes no more streams."""
@@ -226,10 +251,18 @@ class Registry:
 
     @property
     def standing_by(self) -> int:
-        """Streams of which packets wait here for a takeover."""
+        """Streams that are not tracked here and are known here, for a takeover."""
+        return len(self._foreign)
+
+    def elsewhere(self, stream: str) -> bool:
+        """Whether another instance tracks a stream, and answers for it."""
+        return not self._member.holds(stream) and self.actor(stream) is None
+
+    def occupied(self) -> set[int]:
+        """Return the partitions with a stream whose state is not kept yet."""
         with self._lock:
             actors = list(self._actors.values())
-        return sum(actor.buffers_for_takeover for actor in actors)
+        return {partition_of(actor.stream) for actor in actors if actor.occupied}
 
     @property
     def busy(self) -> bool:
@@ -241,11 +274,11 @@ class Registry:
     # What the control loop has done now and then
 
     def sweep(self, now_ns: int) -> None:
-        """Log streams that fell silent, close sessions that have been idle for long, or are another worker's."""
+        """Log streams that fell silent, close sessions that have been idle for long, or are another instance's."""
         for actor in self.actors():
-            if not self.share.has(actor.stream):
-                # What was on its way while the stream was moved began a session once more.
-                self.command(actor.stream, StreamActor.hand_over, urgent=False)
+            if self._member.fence(actor.stream) is None:
+                # It began at the very moment in which its partition was left.
+                self.command(actor.stream, StreamActor.on_lost, urgent=True)
             for stream, meter in tuple(actor.sensors.items()):
                 age_s = meter.age_s(now_ns)
                 if age_s is not None and age_s > self._settings.stale_s and stream not in actor.stale:
@@ -253,11 +286,15 @@ class Registry:
                     log.warning("stream_stale", stream=stream, age_s=round(age_s, 3))
             if now_ns - actor.meter.active_ns > self._settings.idle_s * SECOND:
                 self.command(actor.stream, self._close_idle, urgent=False)
+        for stream, other in self._rivals.contested([actor.stream for actor in self.actors()], now_ns):
+            self._report("contested", stream, "one `store`, or `cluster`, for all instances", f"{other} tracks it too")
         self._evict()
-        with self._lock:
-            waiting = [actor for actor in self._actors.values() if actor.buffers_for_takeover]
-        for actor in waiting:
-            actor.tell(StreamActor.trim)
+        with self._foreign_lock:
+            for stream, buffer in tuple(self._foreign.items()):
+                buffer.trim(now_ns)
+                forgotten = len(self._foreign) > MAX_LIVES or now_ns - buffer.seen_ns > self._settings.idle_s * SECOND
+                if not buffer and forgotten:
+                    del self._foreign[stream]
 
     def _evict(self) -> None:
         """Close sessions, the least recently used first, while all together keep more than the process may."""
@@ -270,9 +307,23 @@ class Registry:
             self._report("refused", actor.stream, f"messages of at most {self._settings.memory_mb} MB", "more, in all")
             self.command(actor.stream, lambda one: one.close_session("memory"), urgent=False)
 
-    def changed(self, stream: str, change: RoleChange) -> None:
-        """Tell a stream's worker what this instance is to the stream now."""
-        self.command(stream, ON_CHANGE[change], urgent=True)
+    def changed(self, partition: int, change: Change) -> None:
+        """Tell the workers of streams what has become of their partition."""
+        if change is Change.HELD:
+            with self._foreign_lock:
+                for stream in [one for one in self._foreign if partition_of(one) == partition]:
+                    packets = self._foreign.pop(stream).take()
+                    self._offer(stream, partial(_take_up, packets=packets), limited=False)
+            return
+        told = StreamActor.on_recalled if change is Change.RECALLED else StreamActor.on_lost
+        with self._lock:
+            actors = [actor for actor in self._actors.values() if partition_of(actor.stream) == partition]
+        now_ns = time.monotonic_ns()
+        for actor in actors:
+            actor.tell(told)
+            with self._foreign_lock:
+                if actor.session is not None and not self._member.holds(actor.stream):
+                    self._foreign.setdefault(actor.stream, self._context.buffer()).seen_ns = now_ns
 
     def resume(self) -> None:
         """Send workers to all streams: they paused, and need not any longer."""
@@ -339,9 +390,9 @@ class Registry:
             self.command(victim, lambda actor: actor.close_session("evicted"), urgent=True)
         return "a moment: another session is being closed"
 
-    def _offer(self, stream: str, offer: Callable[[StreamActor], bool | None]) -> bool:
+    def _offer(self, stream: str, offer: Callable[[StreamActor], bool | None], *, limited: bool = True) -> bool:
         while True:
-            actor = self._actor(stream)
+            actor = self._actor(stream, limited=limited)
             if actor is None:
                 self._refuse(stream)
                 return False
@@ -354,10 +405,10 @@ class Registry:
             self._scheduler.submit(actor)
         return True
 
-    def _actor(self, stream: str) -> StreamActor | None:
+    def _actor(self, stream: str, *, limited: bool) -> StreamActor | None:
         with self._lock:
             actor = self._actors.get(stream)
-            if actor is None and self._unproven < MAX_UNPROVEN:
+            if actor is None and not (limited and self._unproven >= MAX_UNPROVEN):
                 actor = self._actors[stream] = StreamActor(stream, self._context)
             return actor
 
@@ -366,7 +417,7 @@ class Registry:
         """Actors of streams that have not sent a valid message, as far as is known; called with the lock."""
         if len(self._actors) < MAX_UNPROVEN:
             return 0
-        return sum(not actor.proven for actor in self._actors.values())
+        return sum(not actor.occupied for actor in self._actors.values())
 
     def _discard(self, actor: Actor) -> None:
         with self._lock:
@@ -396,16 +447,6 @@ class Registry:
     def _count_refused(self) -> None:
         with self._lock:
             self._past += MessageCounters(received=1, refused=1)
-
-    def _session_of(self, packet: Packet, *, frame: bool) -> str | None:
-        """Return the name of the session of a message's stream; None when it is refused."""
-        try:
-            stream, session = self._parsed(packet.key)
-        except schemas.MessageError as error:
-            self._count_refused()
-            self._report("invalid_value", "", error.expected, error.received)
-            return None
-        return None if self._over_quota(stream, packet, frame=frame) else session
 
     def _parsed(self, key: str) -> tuple[str, str]:
         """Return the stream of a key and its session, remembered.
@@ -447,6 +488,10 @@ def _save(folder: Path | None, stream: str, dump: bytes) -> str:
     except OSError as error:
         log.warning("store_failed", error=str(error))
         return ""
+
+
+def _take_up(actor: StreamActor, packets: list[tuple[Packet, bool]]) -> bool | None:
+    return actor.mailbox.offer_command(lambda: actor.take_up(packets), urgent=True)
 
 
 def _flush(actor: StreamActor) -> None:

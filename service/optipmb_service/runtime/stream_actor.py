@@ -3,9 +3,8 @@
 Most sessions are those of one stream. Where several streams share one (`fusion`), the actor has its name, and what is
 wrong with a message is said on the stream that it came on.
 
-An actor is made for whatever arrives on a stream's key, its session only for a valid message of a stream that this
-instance owns: garbage costs an actor that is gone when its mailbox is empty. While another instance owns the stream, or
-it is not known yet who does, packets wait for a takeover (`takeover_buffer`). Clocks: `now_ns` monotonic for all
+An actor is made for whatever arrives on the key of a stream whose partition this instance holds, its session only for a
+valid message: garbage costs an actor that is gone when its mailbox is empty. Clocks: `now_ns` monotonic for all
 decisions, the wall clock only for what delivery reports.
 """
 
@@ -17,13 +16,11 @@ from typing import TYPE_CHECKING, Any, Final
 import optipmb_schemas as schemas
 import structlog
 
-from optipmb_service.cluster.port import Role
 from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.decoding import message_of
 from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.stream_counters import StreamCounters
-from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 from optipmb_service.runtime.track_publisher import Arrival, TrackPublisher
 from optipmb_service.session.checkpoint import Checkpoint, CheckpointError, forgotten
 from optipmb_service.session.problems import problem_of
@@ -68,16 +65,16 @@ class StreamActor:
         """Streams that fell silent."""
         self._accounts = StreamCounters(self.mailbox)
         self._context = context
-        self._takeover = TakeoverBuffer(context.standby_ns, context.budget)
-        self._out = TrackPublisher(
-            stream, context.instance, context.sink, self.meter, context.metrics, context.coordinator
-        )
-        self._asking: list[Callable[[StreamActor], None]] = []
+        self._waiting = context.buffer()
+        self._out = TrackPublisher(stream, context.instance, context.sink, self.meter, context.metrics, context.member)
+        self._asking: list[tuple[Callable[[StreamActor], None], bool]] = []
         self._changed = False
         self._armed_ns: int | None = None
         self._degraded_ns: dict[str, int] = {}
         self._opening: Lineage | None = None
-        self._grant = 0
+        self._seeking = False
+        self._closing = False
+        self._fence: int | None = None
 
     def wake(self) -> None:
         """Send a worker though nothing came: frames have waited long enough."""
@@ -105,39 +102,28 @@ class StreamActor:
         if not paused:
             self._out.flush()
             self._guard(self._settle)
-        close = not self._needed
-        if close:
-            self._context.coordinator.release(self.stream)
-        turn = self.mailbox.leave(close=close, urgent=paused)
+        turn = self.mailbox.leave(close=not self.occupied, urgent=paused)
         if turn is None:
             self._context.discard(self)
         return bool(turn)
 
     @property
     def _paused(self) -> bool:
-        """Whether frames have to wait: the write lease lapsed, and the tokens of others are looked at."""
-        return self.session is not None and not self._context.coordinator.may_write(self.stream)
+        """Whether frames have to wait: the write lease has lapsed, or another instance has the stream."""
+        return self.session is not None and not self._context.member.may_write(self.stream, self._fence)
 
     @property
-    def _needed(self) -> bool:
-        """Whether the actor holds anything that the next message of its stream, or the coordinator, will ask for."""
-        coming = self._context.coordinator.role(self.stream) in {Role.CLAIMING, Role.OWNER}
-        return self.session is not None or coming or bool(self._takeover) or bool(self._asking)
+    def occupied(self) -> bool:
+        """Whether there is a session, or one begins, or the state of one is not kept yet; may be called by any thread.
+
+        Such a stream has sent a valid message.
+        """
+        return self.session is not None or self._opening is not None or self._closing
 
     @property
     def elsewhere(self) -> bool:
         """Whether another instance tracks the stream, and answers for it."""
-        return self.session is None and self._context.coordinator.elsewhere(self.stream)
-
-    @property
-    def proven(self) -> bool:
-        """Whether the stream has sent a valid message, as far as is known; may be called by any thread."""
-        return self.session is not None or self._context.coordinator.role(self.stream) is not Role.NONE
-
-    @property
-    def buffers_for_takeover(self) -> bool:
-        """Whether packets wait here for a takeover; may be called by any thread."""
-        return self.session is None and self._opening is None and bool(self._takeover)
+        return self.session is None and not self._context.member.holds(self.stream)
 
     @property
     def held_bytes(self) -> int:
@@ -289,97 +275,60 @@ class StreamActor:
 
     # Who tracks the stream; to be called by the worker alone
 
+    def take_up(self, packets: Sequence[tuple[Packet, bool]]) -> None:
+        """Go on with a stream that has come here, and with what it sent before, each packet with whether it is a frame.
+
+        A session that is kept goes on at once; without one the first valid packet begins it.
+        """
+        if not self.occupied and self._context.member.holds(self.stream) and not self._context.room(self.stream):
+            self._seeking = self._open()
+        self._receive_all(packets)
+
+    def _receive_all(self, packets: Sequence[tuple[Packet, bool]]) -> None:
+        for packet, frame in packets:
+            self._guard(self._receive, packet, frame=frame)
+
     def _buffer(self, packet: Packet, *, frame: bool) -> None:
-        """Keep a packet for the moment when this instance owns the stream, and ask for it if nobody does."""
-        coordinator = self._context.coordinator
-        if coordinator.role(self.stream) is Role.NONE:
-            if coordinator.elsewhere(self.stream):
-                # Another instance tracks it, which decodes and complains; here it is kept for a takeover, if there is
-                # room for one.
-                if not self._context.room(self.stream):
-                    coordinator.request(self.stream)
-                    self._takeover.add(packet, frame=frame)
+        """Keep a packet until there is a session, and begin one if the packet is valid and the stream is to be here."""
+        if not (self._opening or self._closing):
+            if not self._context.member.holds(self.stream):
+                self._context.keep(self.stream, packet, frame)
                 return
             if self._read(packet, frame=frame) is None or not self._admitted(frame=frame):
                 return
-            self._context.coordinator.request(self.stream)
-        self._takeover.add(packet, frame=frame)
+            if not self._open():
+                self._accounts.refuse(None, frame=frame)
+                return
+        self._waiting.add(packet, frame=frame)
 
     def ask(self, command: Callable[[StreamActor], None], *, seek: bool) -> None:
-        """Call `command` as soon as it is known whether this instance owns the stream, perhaps now.
-
-        With `seek` it asks for a stream that nobody owns.
-        """
-        coordinator = self._context.coordinator
-        if seek and self.session is None and coordinator.role(self.stream) is Role.NONE:
-            coordinator.request(self.stream)
-        self._asking.append(command)
-        if self.session is not None or coordinator.role(self.stream) in {Role.NONE, Role.STANDBY}:
-            self._answer()
-
-    def on_granted(self) -> None:
-        """This instance owns the stream: go on where its last owner was, with all that came since."""
-        if self._context.coordinator.role(self.stream) is not Role.OWNER:
-            return  # given up meanwhile, or lost again, which will be told too
-        self._grant += 1
-        if self.session is not None:
-            self._resume()
-        elif self._opening is None:
-            self._opening = self._context.admit(self.stream)
-            if self._opening is not None:
-                self._load()
-                return
-            self._admitted(frame=True)
-            self._context.coordinator.release(self.stream)
-            self._resume()
+        """Call `command`, as soon as no session is about to begin or end; with `seek`, one begins if there is none."""
+        if seek and self.session is None and not self._closing and self._context.member.holds(self.stream):
+            _ = self._opening or self._open()
+        if self._opening or self._closing:
+            self._asking.append((command, seek))
+        else:
+            self._guard(command, self)
 
     def _resume(self) -> None:
-        """Go on with what came while nobody tracked the stream here."""
-        for packet, frame in self._takeover.take():
-            if self.session is not None:
-                self._guard(self._receive, packet, frame=frame)
-            else:
-                self._accounts.refuse(self.session, frame=frame)
-        self._answer()
+        """Go on with what came while a session was about to begin or end."""
+        self._receive_all(self._waiting.take())
+        asking, self._asking = self._asking, []
+        for command, seek in asking:
+            self.ask(command, seek=seek)
 
     def on_lost(self) -> None:
-        """Another instance owns the stream: what is here is no longer the newest state."""
+        """Another instance has the stream: what is here is no longer the newest state."""
+        if self._fence == self._context.member.fence(self.stream):
+            return  # lost and taken again before this was told
         self._context.persistence.forget(self.stream)
         if self.session is not None:
             self._report("superseded", "", "an instance that is neither frozen nor cut off", "another one goes on")
         self._drop_session("superseded")
-        self._answer()
 
     def on_recalled(self) -> None:
         """Another instance is to have the stream: leave it as soon as its state is kept."""
-        if self.session is None:
-            self.release_ownership()
-        else:
-            self.close_session("moved")
-
-    def release_ownership(self) -> None:
-        """The session has ended and its state is kept: whoever gets the next message of the stream may go on."""
-        if self.session is None:
-            self._context.coordinator.release(self.stream)
-            if self._takeover or self._asking:
-                self._context.coordinator.request(self.stream)
-
-    def hand_over(self, then: Callable[[], None] = lambda: None) -> None:
-        """End the session because another worker has the stream now; `then` is called when its state is kept.
-
-        While it is not known yet who owns the stream, its first packets wait here and nowhere else: they are tracked
-        first.
-        """
-        self.ask(lambda actor: actor.close_session("moved", then), seek=False)
-
-    def trim(self) -> None:
-        """Drop what has waited too long for a takeover."""
-        self._takeover.trim(time.monotonic_ns())
-
-    def _answer(self) -> None:
-        asking, self._asking = self._asking, []
-        for command in asking:
-            self._guard(command, self)
+        self.close_session("moved")
 
     # Sessions; to be called by the worker alone
 
@@ -391,9 +340,16 @@ class StreamActor:
         self._report("refused", "", why, "another one; there is room for no more sessions")
         return False
 
+    def _open(self) -> bool:
+        """Begin to open a session; False when there is no room."""
+        self._opening = self._context.admit(self.stream)
+        if self._opening is not None:
+            self._load()
+        return self._opening is not None
+
     def _load(self) -> None:
         """Have the session restored on the thread of the store; packets wait meanwhile."""
-        context, grant = self._context, self._grant
+        context, fence = self._context, self._context.member.fence(self.stream)
 
         def restore(checkpoint: Checkpoint) -> Session:
             now_ns = time.monotonic_ns()
@@ -404,29 +360,28 @@ class StreamActor:
             )
 
         context.persistence.recall(
-            self.stream, restore, lambda restored: self.tell(lambda actor: actor.on_loaded(restored, grant))
+            self.stream, restore, lambda restored: self.tell(lambda actor: actor.on_loaded(restored, fence))
         )
 
-    def on_loaded(self, restored: Session | None, grant: int) -> None:
+    def on_loaded(self, restored: Session | None, fence: int | None) -> None:
         """Begin a session, or go on with the one that was kept; unless the stream was lost meanwhile."""
-        lineage, self._opening = self._opening, None
+        member, lineage = self._context.member, self._opening
         if lineage is None:
             return
-        if self._context.coordinator.role(self.stream) is not Role.OWNER:
+        if fence != member.fence(self.stream) and member.holds(self.stream):
+            self._load()  # lost and taken again: another instance may have gone on in between
+            return
+        if member.holds(self.stream) and not (restored is None and self._seeking):
+            self._begin(restored, lineage, fence)
+        else:
             self._context.release(self.stream, lineage)
-            self._answer()
-            return
-        if grant != self._grant:
-            # Lost and granted again: another instance may have gone on in between.
-            self._opening = lineage
-            self._load()
-            return
-        self._begin(restored, lineage)
+            member.look()
+        self._opening, self._seeking = None, False
         self._resume()
 
-    def _begin(self, restored: Session | None, lineage: Lineage) -> None:
-        context = self._context
-        self._out.open()
+    def _begin(self, restored: Session | None, lineage: Lineage, fence: int | None) -> None:
+        context, self._fence = self._context, fence
+        self._out.open(fence)
         if restored is None:
             session = Session(
                 self.stream,
@@ -443,38 +398,39 @@ class StreamActor:
             context.metrics.restored()
             log.info("session_restored", stream=self.stream, session=session.session, frames=session.counters.frames)
             # Its run has a new number: written soon, so that a crash just now does not give the next run the same one.
-            context.persistence.put(session.snapshot(), lambda: None)
+            context.persistence.put(session.snapshot(), fence, lambda: None)
         self.session, self._changed = session, False
         self._accounts.open(session)
 
-    def close_session(self, reason: str, then: Callable[[], None] = lambda: None) -> None:
+    def close_session(self, reason: str) -> None:
         """End the session and free what it holds; the next valid message of the stream begins another, or goes on.
 
         A session that is idle or moved is kept as it is; one that is closed by a query forgets its density and its
-        counters. `then` is called when its state is kept and the stream left.
+        counters.
         """
         session = self.session
         if session is None:
-            then()
             return
         self._deliver(session.flush())
         state = session.snapshot()
         if reason == "query":
             session.reset()
             state = forgotten(session.snapshot())
+        self._closing = True
         self._drop_session(reason)
+        self._context.persistence.put(state, self._fence, lambda: self.tell(StreamActor.on_kept))
 
-        def leave(actor: StreamActor) -> None:
-            actor.release_ownership()
-            then()
-
-        self._context.persistence.put(state, lambda: self.tell(leave))
+    def on_kept(self) -> None:
+        """Leave the stream: the state of the session that has ended is kept."""
+        self._closing = False
+        self._resume()
+        self._context.member.look()
 
     def keep(self) -> None:
         """Give the state to the checkpoint writer, if it changed."""
         if self.session is not None and self._changed:
             self._changed = False
-            self._context.persistence.put(self.session.snapshot())
+            self._context.persistence.put(self.session.snapshot(), self._fence)
 
     def _drop_session(self, reason: str) -> None:
         session = self.session

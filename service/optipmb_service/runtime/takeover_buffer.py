@@ -1,8 +1,8 @@
-"""What a stream sent while nobody here tracked it: raw packets of the last seconds, for the moment of a takeover.
+"""What a stream sent while it was not tracked here: raw packets of the last seconds, for the moment of a takeover.
 
 Who takes over restores the checkpoint, which is as old as the interval between checkpoints and the time in which the
 death of the owner was noticed, and then hands these packets to the session. Most of them the session has seen; it drops
-them. They wait undecoded, so standing by costs little but memory, which is bounded by time and, over all streams of the
+them. They wait undecoded, so they cost little but memory, which is bounded by time and, over all streams of the
 instance, by bytes.
 """
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class TakeoverBuffer:
-    """The waiting packets of one stream; used by the worker of the stream alone.
+    """The waiting packets of one stream; not for several threads at once.
 
     Args:
         keep_ns: age at which a packet is dropped.
@@ -28,8 +28,8 @@ class TakeoverBuffer:
         self._keep_ns = keep_ns
         self._budget = budget
         self._packets: deque[tuple[Packet, bool]] = deque()
-        self.dropped = 0
-        """Packets that went before they were old, for lack of room."""
+        self.seen_ns = 0
+        """When the stream was last heard of, monotonic; set by whoever keeps the buffer."""
 
     def __len__(self) -> int:
         return len(self._packets)
@@ -38,11 +38,10 @@ class TakeoverBuffer:
         """Keep a packet; when there is no room, the oldest clouds of the stream go first, then its oldest frames."""
         self.trim(packet.now_ns)
         self._packets.append((packet, frame))
-        fits = self._budget.add(_size(packet))
+        fits = self._budget.add(packet.held)
         while not fits and self._packets:
             cloud = next((index for index, (_, is_frame) in enumerate(self._packets) if not is_frame), 0)
             fits = self._drop(cloud)
-            self.dropped += 1
 
     def trim(self, now_ns: int) -> None:
         """Drop what is old."""
@@ -52,15 +51,11 @@ class TakeoverBuffer:
     def take(self) -> list[tuple[Packet, bool]]:
         """Take all packets, the oldest first, each with whether it is a frame."""
         taken = list(self._packets)
-        self._budget.add(-sum(_size(packet) for packet, _ in taken))
+        self._budget.add(-sum(packet.held for packet, _ in taken))
         self._packets.clear()
         return taken
 
     def _drop(self, index: int) -> bool:
         packet, _ = self._packets[index]
         del self._packets[index]
-        return self._budget.add(-_size(packet))
-
-
-def _size(packet: Packet) -> int:
-    return 0 if packet.payload is None else packet.size
+        return self._budget.add(-packet.held)

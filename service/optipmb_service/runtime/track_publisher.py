@@ -36,10 +36,10 @@ class Arrival:
 
 
 class WriteLeaseHolder(Protocol):
-    """What it needs of the coordinator."""
+    """What it needs of the member."""
 
-    def may_write(self, stream: str) -> bool:
-        """Whether this instance may publish for a stream now."""
+    def may_write(self, stream: str, fence: int | None) -> bool:
+        """Whether what was made under a fence may be published now."""
 
 
 class TrackPublisher:
@@ -51,7 +51,7 @@ class TrackPublisher:
         outlet: the network.
         meter: the figures of the stream, told of every publication.
         metrics: the figures of the process, told too.
-        coordinator: says whether the write lease holds; tracks wait while it does not.
+        member: says whether the write lease holds; tracks wait while it does not.
     """
 
     def __init__(
@@ -61,20 +61,22 @@ class TrackPublisher:
         sink: MessageSink,
         meter: StreamMeter,
         metrics: Metrics,
-        coordinator: WriteLeaseHolder,
+        member: WriteLeaseHolder,
     ) -> None:
         self._stream = stream
         self._instance = instance
         self._sink = sink
         self._meter = meter
         self._metrics = metrics
-        self._coordinator = coordinator
+        self._member = member
         self._claim: Publisher | None = None
         self._waiting: list[tuple[bytes, Arrival, int, int]] = []
         self._ids = b""
+        self._fence: int | None = None
 
-    def open(self) -> None:
-        """Open the publisher."""
+    def open(self, fence: int | None) -> None:
+        """Open the publisher, for what is made under a fence."""
+        self._fence = fence
         try:
             self._claim = self._sink.claim(self._stream)
         except TransportError as error:
@@ -115,7 +117,7 @@ class TrackPublisher:
 
     def flush(self) -> None:
         """Publish what waits, if the write lease holds."""
-        if not self._waiting or not self._coordinator.may_write(self._stream):
+        if not self._waiting or not self._member.may_write(self._stream, self._fence):
             return
         waiting, self._waiting = self._waiting, []
         for payload, ticket, waited_ns, step_ns in waiting:

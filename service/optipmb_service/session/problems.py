@@ -51,6 +51,10 @@ CODES: Final = {
         "The instance was frozen or cut off for longer than its lease; another one tracks the stream now.",
         "Nothing. If it happens often, raise `lease_s`, or look for what stops the process.",
     ),
+    "contested": (
+        "Another instance on the network tracks the stream too, for the two have no `store` in common.",
+        "Give them one folder `store`, or servers of `cluster`; or let each have routers of its own.",
+    ),
     "internal": (
         "A bug in the service; the session is quarantined, its last frames are saved.",
         "Report it with the saved file; `optipmb track --dump` replays it.",

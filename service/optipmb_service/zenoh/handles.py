@@ -119,10 +119,11 @@ def publish_problem(session: zenoh.Session, keys: schemas.Keys, problem: schemas
 
 
 class Publisher:
-    """The publisher of a stream's tracks."""
+    """The publisher of a stream's tracks, and the token that says who tracks it."""
 
-    def __init__(self, publisher: Putting, forget: Callable[[Publisher], None]) -> None:
+    def __init__(self, publisher: Putting, token: Undeclared, forget: Callable[[Publisher], None]) -> None:
         self._publisher = publisher
+        self._token = token
         self._forget = forget
 
     def publish(self, payload: bytes) -> None:
@@ -137,20 +138,10 @@ class Publisher:
             raise TransportError(line(error)) from error
 
     def release(self) -> None:
-        """Withdraw the publisher."""
+        """Withdraw both."""
+        undeclare(self._token)
         undeclare(self._publisher)
         self._forget(self)
-
-
-class Token:
-    """A liveliness token; it vanishes with its process and its link too."""
-
-    def __init__(self, declared: Undeclared) -> None:
-        self._declared = declared
-
-    def withdraw(self) -> None:
-        """Take it back."""
-        undeclare(self._declared)
 
 
 class Question:

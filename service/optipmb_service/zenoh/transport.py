@@ -19,7 +19,6 @@ from optipmb_service.zenoh.handles import (
     Publisher,
     Question,
     Readers,
-    Token,
     cached_publisher,
     publish_problem,
     undeclare,
@@ -41,15 +40,6 @@ HISTORY_S: Final = 60.0
 
 TRACKS_CACHE: Final = 50
 """Tracks kept per stream for subscribers that lost some or come late: 5 s at 10 Hz. Most of what a stream holds."""
-
-CLAIM: Final = "/claim"
-"""Ending of the liveliness keys by which instances settle who may have a stream, before one says that it has."""
-
-TOKENS: Final = 2**20
-"""More tokens than there are."""
-
-OWNERS_S: Final = 1.0
-"""How long the network may take to say who owns a stream; it takes less than a millisecond."""
 
 log = structlog.get_logger("optipmb_service")
 
@@ -79,12 +69,10 @@ class Transport:
 
     # Receiving
 
-    def subscribe(
-        self, on_frame: Callable[[Packet], None], on_cloud: Callable[[Packet], None], wanted: Callable[[str], bool]
-    ) -> None:
-        """Hand over the detections and point clouds on all keys that are wanted, each on a thread of its own."""
-        self._subscribe("detections", CHANNEL, lambda sample: self._receive(sample, on_frame, wanted))
-        self._subscribe("points", CHANNEL // 16, lambda sample: self._receive(sample, on_cloud, wanted))
+    def subscribe(self, on_frame: Callable[[Packet], None], on_cloud: Callable[[Packet], None]) -> None:
+        """Hand over the detections and point clouds of all streams, each on a thread of its own."""
+        self._subscribe("detections", CHANNEL, lambda sample: self._receive(sample, on_frame))
+        self._subscribe("points", CHANNEL // 16, lambda sample: self._receive(sample, on_cloud))
 
     def _subscribe(self, topic: schemas.Topic, channel: int, receive: Callable[[zenoh.Sample], None]) -> None:
         """Subscribe to a topic of all streams, with what the publishers' caches hold: also of clouds, if they do."""
@@ -101,10 +89,10 @@ class Transport:
         """Hand over the queries about this instance alone, on a thread of its own."""
         self._serve(f"{self._prefix}/service/{self._instance}/q/*", about_service)
 
-    def ask(self, key: str, timeout: float) -> bytes | None:
+    def ask(self, key: str, timeout: float, payload: bytes = b"", encoding: str = "") -> bytes | None:
         """Ask at a key and return the first answer; None when none comes in time (s)."""
         with contextlib.suppress(zenoh.ZError):  # the session is closed
-            for reply in self._session.get(key, timeout=timeout):
+            for reply in self._session.get(key, timeout=timeout, payload=payload, encoding=encoding or None):
                 if (sample := reply.ok) is not None:
                     return bytes(sample.payload.to_bytes())
         return None
@@ -158,10 +146,8 @@ class Transport:
         )
         self._readers.add("links", listener, listener.handler, _log_link)
 
-    def _receive(self, sample: zenoh.Sample, receive: Callable[[Packet], None], wanted: Callable[[str], bool]) -> None:
+    def _receive(self, sample: zenoh.Sample, receive: Callable[[Packet], None]) -> None:
         key = str(sample.key_expr)
-        if not wanted(key):
-            return
         wall_ns, now_ns = time.time_ns(), time.monotonic_ns()
         size = len(sample.payload)
         payload = sample.payload.to_bytes() if size <= self._max_bytes else None
@@ -174,13 +160,17 @@ class Transport:
         self._alive = self._session.liveliness().declare_token(self._keys.alive(self._instance))
 
     def claim(self, stream: str) -> Publisher:
-        """Open the publisher of a stream's tracks; to be called by the owner of the stream.
+        """Open the publisher of a stream's tracks and say that this instance tracks it.
 
         Raises:
             TransportError: the session is closed.
         """
         publisher = cached_publisher(self._session, self._keys.tracks(stream), schemas.Tracks, TRACKS_CACHE)
-        claim = Publisher(publisher, self._forget)
+        try:
+            token = self._session.liveliness().declare_token(self._keys.owner(stream, self._instance))
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
+        claim = Publisher(publisher, token, self._forget)
         with self._lock:
             self._claims.add(claim)
         return claim
@@ -189,14 +179,8 @@ class Transport:
         """Send a problem on its stream's key; one without a stream has no key and is not sent."""
         publish_problem(self._session, self._keys, problem)
 
-    # Owners
-
-    def linked(self) -> bool:
-        """Whether this session is part of a network: a router always is, a client while it has a router."""
-        return self._is_router or bool(self._session.info.routers_zid())
-
     def watch_owners(self, told: Callable[[str, str, bool], None]) -> None:
-        """Tell which instance claims which stream, or does so no longer (False), from now on."""
+        """Tell which instance tracks which stream, or does so no longer (False), from now on."""
         tokens = self._session.liveliness().declare_subscriber(
             self._keys.all_owners(), zenoh.handlers.FifoChannel(CHANNEL), history=True
         )
@@ -206,41 +190,6 @@ class Transport:
             told(self._keys.stream_of(key), self._keys.instance_of(key), sample.kind == zenoh.SampleKind.PUT)
 
         self._readers.add("owners", tokens, tokens.handler, receive)
-
-    def declare_claim(self, stream: str) -> Token | None:
-        """Say that this instance wants a stream; None at the end, when the session is closed."""
-        return self._declare(f"{self._keys.owner(stream, self._instance)}{CLAIM}")
-
-    def declare_owner(self, stream: str) -> Token | None:
-        """Say that this instance tracks a stream; None at the end, when the session is closed."""
-        return self._declare(self._keys.owner(stream, self._instance))
-
-    def claimants(self, streams: Iterable[str] | None) -> dict[str, set[str]] | None:
-        """Return which instances want or have some streams, or any; None when it cannot be found out.
-
-        Whoever declares a claim and then asks, and whoever does the same at the same time: at least one sees the other.
-        That holds only for tokens that this session does not watch: of those that it watches Zenoh answers at once
-        from what it has been told so far.
-        """
-        owners = [self._keys.all_owners()] if streams is None else [self._keys.owners(stream) for stream in streams]
-        claimants: dict[str, set[str]] = {}
-        try:
-            for pattern in owners:
-                # Its own tokens are put into the channel before anybody reads it: it must not fill up.
-                channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(TOKENS)
-                for reply in self._session.liveliness().get(f"{pattern}{CLAIM}", channel, timeout=OWNERS_S):
-                    if (sample := reply.ok) is None:
-                        return None  # the timeout: nobody can say who else is there
-                    key = str(sample.key_expr).removesuffix(CLAIM)
-                    claimants.setdefault(self._keys.stream_of(key), set()).add(self._keys.instance_of(key))
-        except (zenoh.ZError, schemas.MessageError):
-            return None
-        return claimants
-
-    def _declare(self, key: str) -> Token | None:
-        with contextlib.suppress(zenoh.ZError):
-            return Token(self._session.liveliness().declare_token(key))
-        return None
 
     # The end
 

@@ -1,4 +1,4 @@
-"""Leases of partitions, over a real NATS server and over the store in memory that the simulation below uses."""
+"""Leases of partitions, over SQLite, a real NATS server, and the store in memory that the simulation below uses."""
 
 from __future__ import annotations
 
@@ -11,21 +11,20 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lease_log import LEASE_S, SECOND, HandMember, MemoryLeases, Shared
+from lease_log import LEASE_S, SECOND, Alone, HandMember, MemoryLeases, Shared
 from nats_process import NatsProcess, NatsTrio
 from optipmb_service.cluster import jetstream
 from optipmb_service.cluster.jetstream import JetStream
-from optipmb_service.cluster.leases import PARTITIONS, Fenced, Record, Write, partition_key, partition_of
-from optipmb_service.cluster.member import FencedStore
-from optipmb_service.cluster.port import Role, RoleChange
-from optipmb_service.cluster.store import StoreError
+from optipmb_service.cluster.leases import PARTITIONS, Change, WriteLease, partition_key, partition_of
+from optipmb_service.cluster.store import Fenced, Record, SqliteStore, StoreError, Write
+from optipmb_service.runtime.persistence import CheckpointWriter
 from router import until
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from optipmb_service.cluster.leases import LeaseStore
+    from optipmb_service.cluster.store import LeaseStore
 
     Make = Callable[[], LeaseStore]
 
@@ -49,13 +48,24 @@ def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsProcess]:
         yield server
 
 
-@pytest.fixture(params=["memory", "nats"])
+@pytest.fixture(params=["memory", "sqlite", "nats"])
 def make(request: pytest.FixtureRequest) -> Iterator[Make]:
     """Makes ways to one store, each as that of another process; every test has a store of its own."""
     made: list[LeaseStore] = []
     if request.param == "memory":
         shared = Shared()
         yield lambda: MemoryLeases(shared)
+        return
+    if request.param == "sqlite":
+        folder: Path = request.getfixturevalue("tmp_path")
+
+        def open_store() -> LeaseStore:
+            made.append(SqliteStore(folder / "sessions.db"))
+            return made[-1]
+
+        yield open_store
+        for one in made:
+            one.close(5.0)
         return
     server: NatsProcess = request.getfixturevalue("nats")
 
@@ -135,34 +145,21 @@ def test_a_checkpoint_is_refused_for_its_fence(make: Make) -> None:
     """Who held a partition before saves nothing more; what is kept comes back to the byte, also the one before it."""
     one, other = make(), make()
     data = [random.Random(number).randbytes(200_000) for number in range(3)]
-    partition = partition_of(STREAM)
-    stale = one.put(Write(partition_key(partition), "a", 0))
+    key = partition_key(partition_of(STREAM))
+    stale = one.put(Write(key, "a", 0))
     assert stale is not None
     assert one.load(STREAM) is None
-    assert one.save({STREAM: Fenced(partition, stale, data[0])}) == frozenset()
-    fence = other.put(Write(partition_key(partition), "b", stale))
+    assert one.save({STREAM: Fenced(key, stale, data[0])}) == frozenset()
+    fence = other.put(Write(key, "b", stale))
     assert fence is not None
-    assert one.save({STREAM: Fenced(partition, stale, b"stale")}) == {STREAM}
-    assert other.load(STREAM) == data[0]
+    kept = {STREAM: Fenced(key, stale, b"stale"), "another": Fenced(key, fence, b"fresh")}
+    assert one.save(kept) == {STREAM}
+    assert (other.load(STREAM), other.load("another")) == (data[0], b"fresh")
     for number in (1, 2):
-        assert other.save({STREAM: Fenced(partition, fence, data[number])}) == frozenset()
+        assert other.save({STREAM: Fenced(key, fence, data[number])}) == frozenset()
     assert one.load(STREAM) == data[2]
     other.set_aside(STREAM, "torn\nin the middle")
     assert one.load(STREAM) == data[1]
-
-
-def test_a_store_saves_under_the_fences_that_are_held(make: Make) -> None:
-    """Checkpoints of partitions that a member does not hold are not written, and it says of which."""
-    one, other = HandMember("one", make()), HandMember("other", make())
-    even(one, other)
-    stores = [FencedStore(member.store, member.member.fence) for member in (one, other)]
-    streams = [f"site/node-{number}/lidar" for number in range(20)]
-    mine = {stream for stream in streams if partition_of(stream) in one.held}
-    assert 0 < len(mine) < len(streams)
-    assert stores[0].save(dict.fromkeys(streams, b"one")) == set(streams) - mine
-    assert stores[1].save(dict.fromkeys(streams, b"other")) == mine
-    loaded = {stream: stores[0].load(stream) for stream in streams}
-    assert loaded == {stream: b"one" if stream in mine else b"other" for stream in streams}
 
 
 def test_a_store_that_is_closed_or_cannot_be_reached_says_so(nats: NatsProcess) -> None:
@@ -181,20 +178,26 @@ def test_a_store_that_is_closed_or_cannot_be_reached_says_so(nats: NatsProcess) 
 def test_a_checkpoint_is_waited_for() -> None:
     """While a stream is this member's, a store that is cut off is asked again; at the end it is not."""
     store = MemoryLeases(Shared())
-    one = HandMember("one", store)
-    even(one)
-    fenced = FencedStore(store, one.member.fence)
-    fenced.save({STREAM: b"kept"})
+    leases = Alone(store)
+    leases.save({STREAM: b"kept"})
     store.reachable = False
+    failed = threading.Event()
+    writer = CheckpointWriter(store, 0.05, leases)
+    failing = writer._failed
+    writer._failed = lambda error: (failing(error), failed.set())  # type: ignore[method-assign,assignment]  # told of it
     with ThreadPoolExecutor(1) as thread:
-        loading = thread.submit(fenced.load, STREAM)
-        store.reachable = True
-        assert loading.result(60.0) == b"kept"
-        store.reachable = False
-        loading = thread.submit(fenced.load, STREAM)
-        fenced.close()
-        with pytest.raises(StoreError):
-            loading.result(60.0)
+        for ends in (False, True):
+            failed.clear()
+            loading = thread.submit(writer._recalled, STREAM, lambda _: "restored")
+            assert failed.wait(60.0)
+            assert not loading.done()
+            if ends:
+                writer._ended.set()
+            else:
+                store.shared.checkpoints[STREAM].clear()
+                store.reachable = True
+            assert loading.result(60.0) is None
+            store.reachable = False
 
 
 def test_members_share_evenly_as_they_come_and_go(make: Make) -> None:
@@ -217,9 +220,8 @@ def test_who_is_silent_for_a_lease_loses_all(make: Make) -> None:
     even(sleeper, other)
     partitions = sleeper.held
     stream = next(name for name in map(str, range(1000)) if partition_of(name) in partitions)
-    sleeper.member.request(stream)
-    assert sleeper.turn()
-    assert sleeper.member.role(stream) is Role.OWNER
+    fence = sleeper.member.fence(stream)
+    assert sleeper.member.may_write(stream, fence)
     passed_s = 0.0
     while other.held.isdisjoint(partitions):
         assert other.turn(TICK_S)
@@ -229,32 +231,102 @@ def test_who_is_silent_for_a_lease_loses_all(make: Make) -> None:
         assert passed_s < 3 * LEASE_S
     assert passed_s > LEASE_S * 0.9
     assert other.held == set(range(PARTITIONS))
-    assert not sleeper.member.may_write(stream)
+    assert not sleeper.member.may_write(stream, fence)
+    sleeper.changes.clear()
     assert sleeper.turn()
-    assert sleeper.changes[-1] == (stream, RoleChange.LOST)
+    assert sorted(sleeper.changes) == [(partition, Change.LOST) for partition in sorted(partitions)]
     even(sleeper, other)
+    assert not sleeper.member.may_write(stream, fence)
 
 
 def test_a_partition_is_left_when_the_state_of_its_streams_is_kept(make: Make) -> None:
-    """A stream that another member is to have is recalled; it may still be saved, and only then the other begins."""
+    """What another member is to have is recalled; it may still be saved, and only then the other begins."""
     one, other = HandMember("one", make()), HandMember("other", make())
     even(one)
-    streams = [f"site/node-{number}/lidar" for number in range(12)]
-    for member in (one, other):
-        for stream in streams:
-            member.member.request(stream)
+    one.occupied = set(range(0, PARTITIONS, 2))
+    one.changes.clear()
     for _ in range(10):
         assert one.turn(TICK_S)
         assert other.turn(TICK_S)
-    recalled = {stream for stream, change in one.changes if change is RoleChange.RECALLED}
-    assert recalled
-    assert all(one.member.may_write(stream) and one.member.role(stream) is Role.STANDBY for stream in recalled)
-    assert not any(change is RoleChange.GRANTED for _, change in other.changes)
-    for stream in recalled:
-        one.member.release(stream)
+    recalled = {partition for partition, change in one.changes if change is Change.RECALLED}
+    assert len(recalled) == PARTITIONS // 4
+    assert recalled <= one.occupied & one.held
+    streams = {partition_of(stream): stream for stream in map(str, range(1000))}
+    for stream in map(streams.__getitem__, recalled):
+        assert not one.member.holds(stream)
+        assert one.member.may_write(stream, one.member.fence(stream))
+        assert other.member.fence(stream) is None
+    one.occupied = set()
     even(one, other)
-    assert {stream for stream, change in other.changes if change is RoleChange.GRANTED} == recalled
-    assert all(other.member.role(stream) is Role.OWNER for stream in recalled)
+    assert recalled < other.held
+    assert {partition for partition, change in other.changes if change is Change.HELD} == other.held
+
+
+def test_what_is_wished_for_comes_and_stays(make: Make) -> None:
+    """A partition that an operator wants elsewhere goes there, and the shares stay even, as members come and go."""
+    members = [HandMember(name, make()) for name in "ab"]
+    even(*members)
+    wished = sorted(members[0].held)[:3]
+    streams = {partition_of(stream): stream for stream in map(str, range(1000))}
+    for partition in wished:
+        assert not members[1].member.bring(streams[partition], 0.0)
+    even(*members)
+    assert members[1].held >= set(wished)
+    members.append(HandMember("c", make()))
+    even(*members)
+    assert members[1].held >= set(wished)
+    members.pop(1).end()
+    even(*members)
+    members.append(HandMember("b", make()))
+    even(*members)
+    assert members[-1].held >= set(wished)
+
+
+def test_who_has_been_wished_for_everything_has_it(make: Make) -> None:
+    """What is wished goes before an equal share."""
+    one, other = HandMember("one", make()), HandMember("other", make())
+    even(one, other)
+    streams = {partition_of(stream): stream for stream in map(str, range(1000))}
+    for stream in streams.values():
+        one.member.bring(stream, 0.0)
+    for _ in range(20):
+        for member in (one, other):
+            assert member.turn(TICK_S)
+    assert (len(one.held), len(other.held)) == (PARTITIONS, 0)
+
+
+def test_a_full_disk_costs_no_lease(tmp_path: Path) -> None:
+    """While nothing can be written both members of a machine go on; when it can, none is ended for the time between."""
+    stores = [SqliteStore(tmp_path / "sessions.db") for _ in range(2)]
+    members = [HandMember(name, store) for name, store in zip("ab", stores, strict=True)]
+    even(*members)
+    held = [dict(one.member._table.held) for one in members]
+    for store in stores:
+        assert store._connection is not None
+        store._connection.execute("PRAGMA query_only = 1")
+    for _ in range(100):
+        for one in members:
+            one.turn(TICK_S)
+            assert len(one.held) == PARTITIONS // 2
+            assert not one.member.failure
+    for store in stores:
+        assert store._connection is not None
+        store._connection.execute("PRAGMA query_only = 0")
+    even(*members)
+    assert [one.member._table.held for one in members] == held
+    for store in stores:
+        store.close()
+
+
+def test_a_write_lease_ends_by_itself() -> None:
+    """A write lease holds for its length after a renewal, and not at all before the first one or after a lapse."""
+    write_lease = WriteLease(SECOND)
+    assert not write_lease.valid(1)
+    write_lease.renew(5 * SECOND)
+    assert write_lease.valid(6 * SECOND - 1)
+    assert not write_lease.valid(6 * SECOND)
+    write_lease.lapse()
+    assert not write_lease.valid(5 * SECOND)
 
 
 def test_a_server_that_is_killed(tmp_path_factory: pytest.TempPathFactory) -> None:
@@ -340,7 +412,7 @@ def test_of_three_servers_one_may_be_lost(tmp_path: Path, monkeypatch: pytest.Mo
         partition, fence = next(iter(held[0].items()))
 
         def check(data: bytes) -> None:
-            checkpoint = {STREAM: Fenced(partition, fence, data)}
+            checkpoint = {STREAM: Fenced(partition_key(partition), fence, data)}
             assert patiently(lambda: stores[0].save(checkpoint)) == frozenset()
             assert patiently(lambda: stores[1].load(STREAM)) == data
             for one in members:
@@ -355,7 +427,7 @@ def test_of_three_servers_one_may_be_lost(tmp_path: Path, monkeypatch: pytest.Mo
         servers.kill(0)
         servers.kill(1)
         with pytest.raises(StoreError):
-            stores[0].save({STREAM: Fenced(partition, fence, b"lost")})
+            stores[0].save({STREAM: Fenced(partition_key(partition), fence, b"lost")})
         servers.start(0)
         check(b"two servers again")
         for store in stores:

@@ -11,19 +11,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lease_log import Alone
 from optipmb_schemas import Keys, ServiceStatus, SessionState
-from optipmb_service.cluster.store import MemoryStore, SqliteStore
-from optipmb_service.runtime.persistence import STORE_FILE, CheckpointWriter
+from optipmb_service.app.clustering import STORE_FILE
+from optipmb_service.cluster.store import SqliteStore
+from optipmb_service.runtime.persistence import CheckpointWriter
 from optipmb_service.session.session import Session
-from optipmb_service.zenoh import Transport
 from router import Node, Sensor, plain, until
 
 import optipmb
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Mapping
 
     import pytest
+    from optipmb_service.cluster.store import Fenced, Write
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -80,7 +82,7 @@ def test_a_torn_checkpoint_is_set_aside(start: Callable[..., Any], tmp_path: Pat
     """Fault 2: the newest checkpoint is damaged: the one before it is used, the damaged one is kept for inspection."""
     service, endpoint = start(store=str(tmp_path), checkpoint_s=0.05)
     state = KEYS.query(SENSOR.stream, "state")
-    store = SqliteStore(tmp_path / STORE_FILE, "test")
+    store = SqliteStore(tmp_path / STORE_FILE)
     with Node(endpoint) as node:
         for seq in range(10):
             node.send(SENSOR.detections(seq))
@@ -91,7 +93,7 @@ def test_a_torn_checkpoint_is_set_aside(start: Callable[..., Any], tmp_path: Pat
     assert service.stop()
     whole = store.load(SENSOR.stream)
     assert whole is not None
-    store.save({SENSOR.stream: whole[: len(whole) // 2]})
+    Alone(store).save({SENSOR.stream: whole[: len(whole) // 2]})
     _, endpoint = start(store=str(tmp_path))
     with Node(endpoint) as node:
         node.send(*(SENSOR.detections(seq) for seq in range(10)))
@@ -136,24 +138,25 @@ def test_the_wall_clock_may_jump(start: Callable[..., Any], monkeypatch: pytest.
 def test_nothing_is_published_while_the_write_lease_has_lapsed(
     start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Fault 17: who was away long enough for another to take over publishes only after a look at who has the stream."""
-    look, may_look = Transport.claimants, threading.Event()
-    may_look.set()
+    """Fault 17: who was away long enough for another to take over publishes only when it has renewed its lease."""
+    put, may_put = SqliteStore.put, threading.Event()
+    may_put.set()
 
-    def claimants(transport: Transport, streams: Iterable[str] | None) -> Mapping[str, set[str]] | None:
-        return look(transport, streams) if may_look.is_set() else None
+    def late(store: SqliteStore, write: Write) -> int | None:
+        assert may_put.wait(60.0)
+        return put(store, write)
 
-    monkeypatch.setattr(Transport, "claimants", claimants)
+    monkeypatch.setattr(SqliteStore, "put", late)
     service, endpoint = start(store=str(tmp_path))
     with Node(endpoint) as node:
         node.send(SENSOR.detections(0))
         node.tracks(SENSOR.stream, 1)
-        may_look.clear()
-        service._coordinator._write_lease.lapse()
+        may_put.clear()
+        until(lambda: service.state == "paused", "the write lease lapses")
         node.send(*(SENSOR.detections(seq) for seq in range(1, 4)))
         until(lambda: service.status().sessions[0].queue == 3, "the frames wait")
         assert len(node.tracks_seen.items) == 1
-        may_look.set()
+        may_put.set()
         assert [tracks.seq for tracks in node.tracks(SENSOR.stream, 4)] == [0, 1, 2, 3]
 
 
@@ -166,18 +169,20 @@ def test_what_a_checkpoint_contains_has_had_time_to_leave() -> None:
     taken: list[float] = []
     written: list[float] = []
 
-    class Watched(MemoryStore):
+    class Watched(SqliteStore):
         """Notes when it is written to."""
 
-        def save(self, checkpoints: Mapping[str, bytes]) -> frozenset[str]:
+        def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
             written.append(time.monotonic())
             return super().save(checkpoints)
 
     def gather() -> None:
         taken.append(time.monotonic())
-        persistence.put(session.snapshot())
+        persistence.put(session.snapshot(), leases.fence(SENSOR.stream))
 
-    persistence = CheckpointWriter(Watched("one"), 0.05, lambda _: True)
+    store = Watched(None)
+    leases = Alone(store)
+    persistence = CheckpointWriter(store, 0.05, leases)
     persistence.start(gather)
     until(lambda: len(written) >= 2, "two checkpoints are written")
     delays = [at - before for before, at in zip(taken, written, strict=False)]

@@ -10,16 +10,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from optipmb_schemas import Detections, Keys, MessageError, ServiceStatus, SessionState, decode
-from optipmb_service.cluster.store import MemoryStore, SqliteStore
+from hypothesis import given
+from hypothesis import strategies as st
+from lease_log import Alone
+from optipmb_schemas import Detections, Keys, MessageError, MoveRequest, ServiceStatus, SessionState, decode
+from optipmb_service.app.clustering import STORE_FILE
+from optipmb_service.cluster.leases import PARTITIONS
+from optipmb_service.cluster.store import SqliteStore
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime import persistence, queries
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.mailbox import Mailbox
-from optipmb_service.runtime.persistence import STORE_FILE, CheckpointWriter
+from optipmb_service.runtime.persistence import CheckpointWriter
 from optipmb_service.runtime.ports import PACKET_BYTES, Packet
+from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import MAX_COUNT
+from optipmb_service.session.values import MAX_COUNT, SECOND
 from optipmb_service.settings import LimitSettings
 from router import Node, Sensor, until
 
@@ -148,8 +154,9 @@ def test_a_checkpoint_that_cannot_be_made_is_its_streams_alone(monkeypatch: pyte
         return encode(checkpoint)
 
     monkeypatch.setattr(persistence, "encode_checkpoint", fragile)
-    store, reported = MemoryStore(), []
-    writer = CheckpointWriter(store, 0.05, lambda _: True, lambda stream, why: reported.append((stream, why)))
+    store, reported = SqliteStore(None), []
+    leases = Alone(store)
+    writer = CheckpointWriter(store, 0.05, leases, lambda stream, why: reported.append((stream, why)))
     parameters = optipmb.load_profile("nuscenes")
     snapshots = [Session(sensor.stream, parameters).snapshot() for sensor in (CARELESS, CAREFUL)]
     gathered = [0]
@@ -157,7 +164,7 @@ def test_a_checkpoint_that_cannot_be_made_is_its_streams_alone(monkeypatch: pyte
     def gather() -> None:
         gathered[0] += 1
         for snapshot in snapshots:
-            writer.put(replace(snapshot))
+            writer.put(replace(snapshot), leases.fence(snapshot.stream))
 
     writer.start(gather)
     until(lambda: gathered[0] > 3, "rounds")
@@ -172,19 +179,22 @@ def test_a_checkpoint_that_cannot_be_made_is_its_streams_alone(monkeypatch: pyte
 
 def test_a_checkpoint_waits_for_a_write_lease_that_lapsed() -> None:
     """What is put while the lease has lapsed is written when it holds again, and only then it is done."""
-    holds, done = threading.Event(), threading.Event()
-    store = MemoryStore()
-    writer = CheckpointWriter(store, 0.05, lambda _: holds.is_set(), owns=lambda _: True)
+    done = threading.Event()
+    store = SqliteStore(None)
+    leases = Alone(store)
+    leases.lapsed = True
+    writer = CheckpointWriter(store, 0.05, leases)
     rounds = [0]
 
     def gather() -> None:
         rounds[0] += 1
 
     writer.start(gather)
-    writer.put(Session(CAREFUL.stream, optipmb.load_profile("nuscenes")).snapshot(), done.set)
+    session = Session(CAREFUL.stream, optipmb.load_profile("nuscenes"))
+    writer.put(session.snapshot(), leases.fence(CAREFUL.stream), done.set)
     until(lambda: rounds[0] > 4, "rounds")
     assert (store.streams(), done.is_set()) == ((), False)
-    holds.set()
+    leases.lapsed = False
     until(done.is_set, "it is written")
     assert store.streams() == (CAREFUL.stream,)
     writer.close(5)
@@ -245,23 +255,102 @@ def test_many_small_values_are_refused_by_their_claim() -> None:
     assert refused.value.code == "too_large"
 
 
-def test_a_full_instance_leaves_alone_what_another_one_tracks(start: Callable[..., Any]) -> None:
-    """One instance has no room: it neither decodes nor refuses the stream that the other one tracks."""
-    full, endpoint = start(instance="a", max_sessions=1)
+def test_a_full_instance_leaves_alone_what_another_one_tracks(start: Callable[..., Any], tmp_path: Path) -> None:
+    """One instance has no room: it neither decodes nor refuses the streams that the other one tracks."""
+    full, endpoint = start(instance="a", max_sessions=1, store=str(tmp_path))
+    other, _ = start(instance="b", listen=[], connect=[endpoint], store=str(tmp_path))
+    members = full._member, other._member
+    until(lambda: all(len(one._table.held) == PARTITIONS // 2 for one in members), "each has its share")
+    careful, careless = (
+        next(
+            sensor
+            for sensor in (replace(CAREFUL, stream=f"site/node/{number}") for number in range(1000))
+            if member.holds(sensor.stream)
+        )
+        for member in members
+    )
     with Node(endpoint) as node:
+        node.send(careful.detections(0))
+        node.tracks(careful.stream, 1)
+        node.send(*(careless.detections(seq) for seq in range(10)))
+        node.tracks(careless.stream, 10)
+        node.send(careful.detections(1))
+        node.tracks(careful.stream, 2)
+        assert (full.status().received, full.status().refused) == (2, 0)
+        assert [one.stream for one in other.status().sessions] == [careless.stream]
+
+
+def test_a_stream_is_moved_to_another_instance(start: Callable[..., Any], tmp_path: Path) -> None:
+    """It goes on there with the same tracks, none missing; a worker that there is not is refused."""
+    one, endpoint = start(instance="a", store=str(tmp_path))
+    with Node(endpoint) as node:
+        node.send(*(CAREFUL.detections(seq) for seq in range(5)))
+        session = node.tracks(CAREFUL.stream, 5)[-1].session
+        other, _ = start(instance="b", listen=[], connect=[endpoint], store=str(tmp_path))
+        until(lambda: KEYS.alive("b") in node.alive(KEYS.all_alive()), "the other one is there")
+        request = MoveRequest(stream=CAREFUL.stream, worker=0)
+        until(lambda: len(node.query(KEYS.move("b"), request, 30.0)) == 1, "it is moved")
+        assert (one._member.fence(CAREFUL.stream), other._member.holds(CAREFUL.stream)) == (None, True)
+        node.send(*(CAREFUL.detections(seq) for seq in range(5, 10)))
+        tracks = node.tracks(CAREFUL.stream, 10)
+        assert [(one.seq, one.session) for one in tracks] == [(seq, session) for seq in range(10)]
+        assert tracks[-1].delivery is not None
+        assert tracks[-1].delivery.instance == "b"
+        problem = node.refused(KEYS.move("b"), MoveRequest(stream=CAREFUL.stream, worker=1))
+    assert (problem.path, problem.received) == ("worker", "1")
+
+
+def test_instances_without_a_common_store_are_told_of_each_other(start: Callable[..., Any]) -> None:
+    """Both track the stream, as neither knows of the other; a problem says so while it lasts, and what helps."""
+    one, endpoint = start(instance="a", lease_s=0.5)
+    other, _ = start(instance="b", lease_s=0.5, listen=[], connect=[endpoint])
+    with Node(endpoint) as node:
+        until(lambda: len(node.alive(KEYS.all_alive())) == 2, "both are there")
         node.send(CAREFUL.detections(0))
-        node.tracks(CAREFUL.stream, 1)
-        other, _ = start(instance="b", listen=[], connect=[endpoint])
-        node.send(CARELESS.detections(0))
-        node.tracks(CARELESS.stream, 1)
-        until(lambda: full._coordinator.elsewhere(CARELESS.stream), "the owner is known")
-        refused = full.status().refused
-        node.send(*(CARELESS.detections(seq) for seq in range(1, 11)))
-        node.tracks(CARELESS.stream, 11)
-        node.send(CAREFUL.detections(1))
-        node.tracks(CAREFUL.stream, 2)
-        assert full.status().refused == refused
-        assert [one.stream for one in other.status().sessions] == [CARELESS.stream]
+        until(lambda: len(node.alive(KEYS.all_owners())) == 2, "both track it")
+
+        def reported() -> bool:
+            for service in (one, other):
+                service.housekeeping()
+            return all("contested" in {one.code for one in service.status().problems} for service in (one, other))
+
+        until(reported, "both report it")
+        assert "`cluster`" in node.problem(CAREFUL.stream, "contested").expected
+
+
+@given(st.lists(st.tuples(st.integers(1, 50), st.booleans(), st.floats(0, 2)), max_size=60))
+def test_what_waits_for_a_takeover_is_bounded(arrivals: list[tuple[int, bool, float]]) -> None:
+    """By bytes over all streams and by age; what is left comes in order, clouds go before frames."""
+    most = 4 * PACKET_BYTES
+    budget = ByteBudget(most)
+    waiting = [TakeoverBuffer(5 * SECOND, budget), TakeoverBuffer(5 * SECOND, budget)]
+    now_s = 0.0
+    for number, (size, frame, pause_s) in enumerate(arrivals):
+        now_s += pause_s
+        waiting[number % 2].add(packet(size, now_s), frame=frame)
+        assert 0 <= budget.used <= most
+    for one in waiting:
+        one.trim(round(now_s * SECOND))
+        taken = one.take()
+        times = [entry.now_ns for entry, _ in taken]
+        assert times == sorted(times)
+        assert all(now_s * SECOND - at <= 5 * SECOND + 1 for at in times)
+        assert not one
+    assert budget.used == 0
+
+
+def test_clouds_go_first() -> None:
+    """When there is no room a stream gives up its clouds, then its oldest frames."""
+    one = TakeoverBuffer(5 * SECOND, ByteBudget(6 * PACKET_BYTES))
+    for number in range(5):
+        one.add(packet(10, number / 10), frame=True)
+        one.add(packet(30, number / 10), frame=False)
+    assert sum(frame for _, frame in one.take()) == 5
+
+
+def packet(size: int, at_s: float) -> Packet:
+    """A packet that arrived at a time."""
+    return Packet("k", bytes(size), size, "", 0, round(at_s * SECOND))
 
 
 def test_messages_that_wait_are_bounded_in_bytes(start: Callable[..., Any]) -> None:
