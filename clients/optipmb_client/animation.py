@@ -35,6 +35,7 @@ NARROWEST_M: Final = 30.0
 SCALE_M: Final = 10.0
 WIDTH_PX: Final = 720
 COLOURS: Final = 32
+WHITE: Final = 250
 _INK, _TRUTH, _DETECTION = "#222222", "#C4C4C4", "#5A5A5A"
 
 
@@ -64,7 +65,11 @@ def animate_tracks(path: Path, sequence: DataSequence, tracks: ResultTable, trut
     sample = Image.new("RGB", (pictures[0].width, 3 * pictures[0].height))
     for place, chosen in enumerate((pictures[0], pictures[len(pictures) // 2], pictures[-1])):
         sample.paste(chosen, (0, place * chosen.height))
-    palette = sample.quantize(COLOURS, dither=Image.Dither.NONE)
+    found = sample.quantize(COLOURS, dither=Image.Dither.NONE).getpalette() or []
+    shades = np.array(found, dtype=np.int64).reshape(-1, 3)
+    shades[shades.min(axis=1) >= WHITE] = 255  # the ground; an entry beside white would take its place
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(shades.ravel().tolist())
     first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
     path.parent.mkdir(parents=True, exist_ok=True)
     first.save(path, save_all=True, append_images=others, duration=_durations_ms(given), loop=0, optimize=True)

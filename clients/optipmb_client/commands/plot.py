@@ -29,7 +29,7 @@ def plot(  # noqa: PLR0913  these are the command's options
     *,
     dataset: DatasetName = None,
     tracks: Tracks,
-    out: Annotated[Path, typer.Option("--out", help="The PNG file; a GIF file: a moving picture.")],
+    out: Annotated[Path, typer.Option("--out", help="The PNG file, or a GIF file of a moving picture.")],
     root: Root = None,
     detections: Detections = None,
     sequences: Sequences = None,
