@@ -26,6 +26,7 @@ from optipmb_schemas.pages import fill, table
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "docs" / "messages.md"
 PAGE = FILE.read_text(encoding="utf-8")
+DUMP = (ROOT / "schemas" / "examples" / "detections.hex").read_text(encoding="ascii")
 
 
 def fenced(language: str) -> list[str]:
@@ -76,17 +77,17 @@ def test_every_message_has_its_table() -> None:
 
 
 def test_the_example_is_what_encode_produces() -> None:
-    """The JSON example and the hex dump are the same message, to the byte."""
+    """The JSON example and the hex dump of `schemas/examples` are the same message, to the byte."""
     message = decode(fenced("json")[0].encode(), Detections)
-    payload = dumped(fenced("hex")[0])
+    payload = dumped(DUMP)
     assert encode(message) == payload
     assert decode(payload, Detections, encoding=encoding_of(Detections)) == message
     assert f"{len(payload)} bytes, as the Python package writes it" in PAGE
 
 
 def test_the_explained_bytes_are_where_they_are_said_to_be() -> None:
-    """Every row of the table below the dump quotes the bytes at its offset."""
-    payload = dumped(fenced("hex")[0])
+    """Every row of the table of bytes quotes those of the dump at its offset."""
+    payload = dumped(DUMP)
     rows = re.findall(r"^\| ([0-9a-f]{4}) \| ([0-9a-f ]+) \|", PAGE, re.MULTILINE)
     assert len(rows) > 10
     for offset, codes in rows:
@@ -122,7 +123,7 @@ def test_encodings_on_the_page() -> None:
 
 def test_codes_on_the_page_are_meant() -> None:
     """Each code of an invalid message can be met: a payload for each is refused with it."""
-    example = dumped(fenced("hex")[0])
+    example = dumped(DUMP)
     cases = [
         (example[:-1], "", "malformed"),
         (example, "application/msgpack;optipmb.Tracks.v1", "wrong_type"),
