@@ -9,8 +9,11 @@ import pytest
 from commands import result_of, run_here
 from optipmb_client.datasets import DataSequence, DatasetError, open_dataset
 from optipmb_client.datasets.table import TableDataset, TableSequence, match_stamps
+from optipmb_client.offline import track_sequence
 from optipmb_client.table_files import read_table, write_table
 from own_tables import FRAMES, boxes
+
+from optipmb import load_profile
 
 CLASSES = ("Car", "Pedestrian")
 
@@ -161,6 +164,55 @@ def test_recordings_and_sensors_are_told_apart_by_their_columns(tmp_path: Path) 
         stamps = [frame.stamp_ns for frame in one.frames()]
         assert stamps == sorted(stamps)
         assert len(stamps) == FRAMES
+
+
+def test_columns_of_covariances_are_those_of_the_positions(tmp_path: Path) -> None:
+    """They reach the tracker along the axes of the boxes; a row without values has the noise of the profile."""
+    xx, yy = np.tile([0.5, 2.0, np.nan], FRAMES), np.tile([0.25, 1.0, np.nan], FRAMES)
+    columns = boxes(cov_xx=xx, cov_x_y=np.tile([0.1, 0.0, 0.0], FRAMES), var_y=yy)
+    notes, sequence = notes_and_frames(tmp_path / "a.csv", columns)
+    assert "not used" not in notes
+    for frame in sequence.frames():
+        found = frame.position_covariance
+        assert found is not None
+        assert found[0].tolist() == [[0.5, 0.1, 0.0], [0.1, 0.25, 0.0], [0.0, 0.0, 0.375]]
+        assert found[1].tolist() == [[2.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.5]]
+        assert np.isnan(found[2]).all()
+    kitti = load_profile("kitti")
+    noisy, plain = (
+        [named for _, named, _, _ in track_sequence(kitti, one)]
+        for one in (sequence, only(TableDataset(table(tmp_path / "b.csv", boxes()))))
+    )
+    assert noisy[-1].covariance[1, 0, 0] > 1.2 * plain[-1].covariance[1, 0, 0]
+    np.testing.assert_array_equal(noisy[-1].covariance[2], plain[-1].covariance[2])
+
+
+@pytest.mark.parametrize(
+    ("columns", "options", "error"),
+    [
+        ({"cov_xx": 1.0}, {}, "a column cov_yy"),
+        ({"cov_xx": 1.0, "cov_yy": -1.0}, {}, "csv:2: expected variances of x and y from 1e-08"),
+        ({"cov_xx": 1.0, "cov_yy": 1.0, "cov_xy": 1.0}, {}, "variances of x and y"),
+        ({"cov_xx": 1.0, "cov_yy": np.inf}, {}, "variances of x and y"),
+        ({"cov_xx": 1.0, "cov_yy": np.nan}, {}, "variances of x and y"),
+        ({"cov_xx": 1.0, "cov_yy": 1.0}, {"axes": "camera"}, "z up"),
+    ],
+)
+def test_what_is_no_covariance_is_refused(
+    tmp_path: Path, columns: dict[str, float], options: dict[str, str], error: str
+) -> None:
+    """With the line and what was expected."""
+    changed = boxes(**{name: np.full(3 * FRAMES, value) for name, value in columns.items()})
+    with pytest.raises(DatasetError, match=error):
+        TableDataset(table(tmp_path / "a.csv", changed), options)
+
+
+def test_rows_with_wrong_covariances_are_left_out_when_asked(tmp_path: Path) -> None:
+    """As rows with other wrong values are, and counted."""
+    columns = boxes(cov_xx=np.tile([1.0, -1.0, 1.0], FRAMES), cov_yy=np.ones(3 * FRAMES))
+    notes, sequence = notes_and_frames(tmp_path / "a.csv", columns, invalid="skip")
+    assert f"{FRAMES} rows with covariances that are none are left out" in notes
+    assert {len(frame) for frame in sequence.frames()} == {2}
 
 
 def test_poses_carry_boxes_to_the_world(tmp_path: Path) -> None:

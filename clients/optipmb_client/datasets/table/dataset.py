@@ -102,6 +102,7 @@ class TableSequence:
                 yaw=boxes.yaw[chosen],
                 score=boxes.score[chosen],
                 velocity=None if boxes.velocity is None else boxes.velocity[chosen],
+                position_covariance=None if boxes.position_covariance is None else boxes.position_covariance[chosen],
             )
 
     def truth(self) -> Truth | None:

@@ -26,6 +26,9 @@ NO_CLASS: Final = "object"
 """Class of all boxes of a table without classes."""
 _UNIT: Final = 1e-3
 _MOST_SHOWN: Final = 6
+LEAST_VARIANCE: Final = 1e-8
+LARGEST_VARIANCE: Final = 1e8
+"""Variances of a position along any axis, m^2, as `Detections` have them."""
 _POSE: Final = ("pose_x", "pose_y", "pose_z")
 _TURNS: Final = ("w", "x", "y", "z")
 
@@ -52,6 +55,8 @@ class Boxes:
     """(B,)"""
     velocity: Floats | None
     """(B, 2); rows of NaN where unknown."""
+    position_covariance: Floats | None
+    """(B, 3, 3) of the errors of the centres along the axes of the boxes, m^2; of NaN where unknown, None without."""
     score: Floats
     """(B,) in (0, 1]"""
     name: NDArray[np.str_]
@@ -141,6 +146,7 @@ class _Table:
             if zero.any():
                 reading.note(f"{int(zero.sum())} detections with a score of 0 are left out")
                 kept &= ~zero
+        covariance = self._covariances(kept) if scored else None
         row = np.flatnonzero(kept)
         stated = found["l"].base in {"l", "length", "box_length"} or found["l"].base.endswith("_l")
         size = read_sizes(reading, size[row], names[row], stated=stated)
@@ -164,6 +170,7 @@ class _Table:
             size=size,
             yaw=wrap_angle(angle),
             velocity=velocity,
+            position_covariance=None if covariance is None else covariance[row],
             score=score[row],
             name=names[row],
             id=None if id_ is None else id_[row],
@@ -253,6 +260,35 @@ class _Table:
         bad = np.asarray(~np.isfinite(translation).all(axis=1))
         self._reading.first(bad, self._line, "a pose of finite numbers", translation[:, 0])
         return np.column_stack([translation, quaternion])
+
+    def _covariances(self, kept: NDArray[np.bool_]) -> Floats | None:
+        """Return the covariances (R, 3, 3) of the centres, if the table has them; rows without values are unknown.
+
+        Rows with others are taken out of `kept`, if the user leaves such rows out.
+        The height has no column: its variance is the mean of the others, and nothing depends on it.
+        """
+        if not {"cov_xx", "cov_yy"} & self._found.keys():
+            return None
+        if self._reading.options.get("axes") == "camera":
+            expected = "covariances of positions along axes with z up"
+            raise DatasetError(self._reading.path, expected, "columns of them, and camera axes")
+        xx, xy, yy = self._numbers("cov_xx"), self._numbers("cov_xy", 0.0), self._numbers("cov_yy")
+        unknown = np.isnan(xx) & np.isnan(yy)
+        with np.errstate(invalid="ignore"):  # of infinite ones NaN comes, which is not fine either
+            least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
+        fine = unknown | ((least >= LEAST_VARIANCE) & (np.maximum(xx, yy) <= LARGEST_VARIANCE))
+        expected = f"variances of x and y from {LEAST_VARIANCE:g} to {LARGEST_VARIANCE:g} m^2 along every axis, or none"
+        bad = np.asarray(kept & ~fine)
+        if self._reading.chosen("invalid", ("skip", "refuse")) != "skip":
+            self._reading.first(bad, self._line, expected, np.column_stack((xx, xy, yy)))
+        if bad.any():
+            self._reading.note(f"{int(bad.sum())} rows with covariances that are none are left out")
+            kept &= ~bad
+        covariance = np.zeros((self._rows, 3, 3))
+        covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 2, 2] = xx, yy, 0.5 * (xx + yy)
+        covariance[:, 0, 1] = covariance[:, 1, 0] = xy
+        covariance[unknown] = np.nan
+        return covariance
 
     def _valid(
         self, kept: NDArray[np.bool_], center: Floats, size: Floats, yaw: Floats, score: Floats
