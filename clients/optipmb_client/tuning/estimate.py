@@ -249,13 +249,14 @@ def _birth(errors: Residuals, pairs: Sequence[Pairs], paths: Sequence[dict[int, 
 
 
 def _lasting(errors: Residuals, period: float) -> float:
-    """Return the correlation of position errors of neighbouring frames."""
+    """Return the correlation of position errors of neighbouring frames; NaN of too few, or of none but zeros."""
     pair = np.flatnonzero(errors.gap < 1.5 * period)  # NaN is not less
     if len(pair) < LEAST_PAIRS:
         return math.nan
     limit = 3.0 * usual(errors.position)
     here = np.clip(errors.position, -limit, limit)
-    return float((here[pair] * here[pair - 1]).sum() / (here[pair] ** 2).sum())
+    squared = float((here[pair] ** 2).sum())
+    return float((here[pair] * here[pair - 1]).sum()) / squared if squared else math.nan
 
 
 def _longest_gap(pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]], period: float) -> float:
