@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from fleet import Fleet
 from fusing import FUSED, drive
-from optipmb_schemas import Keys, SessionState, Tracks, decode
+from optipmb_schemas import Keys, MoveRequest, ServiceStatus, SessionState, Tracks, decode
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
 from router import Node, until
@@ -45,6 +45,23 @@ def state(node: Node) -> SessionState | None:
     return decode(answers[0][2], SessionState) if answers and answers[0][0] else None
 
 
+def moved_with_its_sensor(node: Node, before: SessionState) -> None:
+    """Move a sensor's stream to the other worker: the session goes there as it is."""
+
+    def worker() -> int | None:
+        return {one.stream: one.worker for one in node.ask(KEYS.status("one"), ServiceStatus).sessions}.get(FUSED)
+
+    here = worker()
+    assert here is not None
+    request = MoveRequest(stream="site/node/front", worker=1 - here)
+    until(lambda: node.query(KEYS.move("one"), request, timeout=60.0)[0][0], "the session is moved", RESTART_S)
+    node.send(drive(41)[80])
+    until(lambda: worker() == 1 - here, "the other worker has it", RESTART_S)
+    after = state(node)
+    assert after is not None
+    assert (after.session, after.frames >= before.frames) == (before.session, True)
+
+
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("workers", [1, 2])
 def test_killed_while_two_sensors_feed_one_session(tmp_path: Path, workers: int) -> None:
@@ -71,4 +88,6 @@ def test_killed_while_two_sensors_feed_one_session(tmp_path: Path, workers: int)
         found = state(node)
         assert found is not None
         assert (found.gaps, found.late) == (0, 0)
+        if workers > 1:
+            moved_with_its_sensor(node, found)
         assert service.end()[0] == 0

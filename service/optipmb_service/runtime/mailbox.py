@@ -78,13 +78,14 @@ class Mailbox:
         with self._lock:
             if self._closed:
                 return None
-            if self._frames_of[packet.origin] >= self._most_frames:
-                self._shed_frame(packet.origin)
-            if self._fits(packet):
+            origin = packet.origin
+            if self._frames_of[origin] >= self._most_frames:
+                self._shed_frame(origin)
+            if self._fits(packet, origin):
                 self._frames.append(packet)
-                self._frames_of[packet.origin] += 1
+                self._frames_of[origin] += 1
             else:
-                self._count_shed(packet.origin)
+                self._count_shed(origin)
             return self._schedule()
 
     def offer_cloud(self, packet: Packet) -> bool | None:
@@ -92,11 +93,12 @@ class Mailbox:
         with self._lock:
             if self._closed:
                 return None
-            if self._clouds_of[packet.origin] >= self._most_clouds:
-                self._shed_cloud(packet.origin)
-            if self._fits(packet):
+            origin = packet.origin
+            if self._clouds_of[origin] >= self._most_clouds:
+                self._shed_cloud(origin)
+            if self._fits(packet, origin):
                 self._clouds.append(packet)
-                self._clouds_of[packet.origin] += 1
+                self._clouds_of[origin] += 1
             else:
                 self.shed_clouds += 1
             return self._schedule()
@@ -159,9 +161,8 @@ class Mailbox:
         first, self._scheduled = not self._scheduled, True
         return first
 
-    def _fits(self, packet: Packet) -> bool:
+    def _fits(self, packet: Packet, origin: str) -> bool:
         """Make room for a message, by what its stream sent before; False when there is none even so."""
-        origin = packet.origin
         while self._bytes[origin] + packet.held > self._most_bytes or not self._budget.take(packet.held):
             if not (self._shed_cloud(origin) or self._shed_frame(origin)):
                 return False
@@ -172,10 +173,12 @@ class Mailbox:
         """Count a message that leaves; what counts nothing is forgotten, for names of streams are anybody's choice."""
         origin = packet.origin
         self._budget.add(-packet.held)
-        for counter, less in ((self._bytes, packet.held), (counts, 1)):
-            counter[origin] -= less
-            if not counter[origin]:
-                del counter[origin]
+        counts[origin] -= 1
+        self._bytes[origin] -= packet.held
+        if not counts[origin]:
+            del counts[origin]
+            if not self._bytes[origin]:
+                del self._bytes[origin]
         return packet
 
     def _shed_cloud(self, origin: str) -> bool:

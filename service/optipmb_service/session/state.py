@@ -82,6 +82,9 @@ class SensorState:
     pose_history: PoseHistory = PoseHistory()
 
 
+_UNKNOWN: Final = SensorState()
+
+
 @dataclass(frozen=True, slots=True)
 class FilterState:
     """A session between two frames.
@@ -108,7 +111,7 @@ class FilterState:
 
     def sensor(self, name: str) -> SensorState:
         """Return what is known of a sensor, nothing before its first frame."""
-        return self.sensors.get(name, SensorState())
+        return self.sensors.get(name, _UNKNOWN)
 
     @property
     def cursors(self) -> dict[str, Cursor]:

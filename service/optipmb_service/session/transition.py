@@ -226,9 +226,9 @@ def _counted(  # noqa: PLR0913 - all keywords, each a count
     repaired: int = 0,
 ) -> FrameCounts:
     """Return the counts with one more frame."""
-    before, epoch = state.counts, state.sensor(entry.frame_id.sensor).cursor.epoch
+    before, frame_id = state.counts, entry.frame_id
     # In a session of several sensors each has its epochs; how one follows another is told by the frames before.
-    succeeds = bool(entry.frame_id.sensor) and epoch not in {None, entry.frame_id.epoch}
+    succeeds = bool(frame_id.sensor) and state.sensor(frame_id.sensor).cursor.epoch not in {None, frame_id.epoch}
     return FrameCounts(
         frames=before.frames + tracked,
         gaps=total(before.gaps, gap),
