@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from fleet import Fleet, RouterProcess, freeze, thaw
 from nats_process import NatsProcess
-from optipmb_schemas import MoveRequest, ServiceStatus
+from optipmb_schemas import ServiceStatus
 from router import Node, Sensor, until
 from takeovers import KEYS, check, outage_s, published_by, send
 
@@ -186,8 +186,7 @@ def test_the_server_is_gone_for_longer_than_a_lease(cluster: Cluster) -> None:
     cluster.check(30, "pair-w0", "pair-w1")
     assert "lease_lost" not in service.errors
     for worker in (1, 0):
-        request = MoveRequest(stream=SENSORS[0].stream, worker=worker)
-        until(lambda request=request: len(node.query(KEYS.move("pair"), request, 30.0)) == 1, "it is moved")  # type: ignore[misc]
+        node.move("pair", SENSORS[0].stream, worker)
         send(node, 40 - 10 * worker, 50 - 10 * worker, sensors=SENSORS)
         cluster.check(50 - 10 * worker, "pair-w0", "pair-w1")
         assert cluster.owners()[SENSORS[0].stream] == f"pair-w{worker}"

@@ -115,14 +115,15 @@ def test_workers_share_the_streams(service: ServiceProcess) -> None:
 
 def one_each(node: Node, site: str) -> dict[int, Sensor]:
     """A stream of each worker that has tracked its first frame."""
-    sensors = {f"{site}/{number}/lidar": Sensor(stream=f"{site}/{number}/lidar") for number in range(12)}
+    sensors = {worker: Sensor(stream=f"{site}/{worker}/lidar") for worker in range(2)}
+    for worker, sensor in sensors.items():
+        node.move("pair", sensor.stream, worker)
     node.send(*(sensor.detections(0) for sensor in sensors.values()))
-    for stream in sensors:
-        node.tracks(stream, 1)
-    status = status_when(node, lambda status: sensors.keys() <= workers_of(status).keys())
-    found = {worker: sensors[stream] for stream, worker in workers_of(status).items() if stream in sensors}
-    assert found.keys() == {0, 1}
-    return {worker: sensor for worker, sensor in found.items() if worker is not None}
+    for sensor in sensors.values():
+        node.tracks(sensor.stream, 1)
+    expected = {sensor.stream: worker for worker, sensor in sensors.items()}
+    status_when(node, lambda status: expected.items() <= workers_of(status).items())
+    return sensors
 
 
 def goes_on(node: Node, sensor: Sensor, seq: int) -> None:
@@ -143,7 +144,6 @@ def test_the_streams_of_a_killed_worker_go_on(service: ServiceProcess) -> None:
             goes_on(node, sensor, 1)
         status_when(node, lambda status: status.state == "ready")
         assert pid_of(service, 1) != first
-        assert "lease_lost" not in service.errors
         for sensor in sensors.values():
             goes_on(node, sensor, 2)
 
@@ -172,8 +172,7 @@ def test_a_stream_can_be_moved(service: ServiceProcess) -> None:
         status = status_when(node, lambda status: sensor.stream in workers_of(status))
         source = workers_of(status)[sensor.stream] or 0
         for number, target in enumerate((1 - source, source), 1):
-            request = MoveRequest(stream=sensor.stream, worker=target)
-            until(lambda: len(node.query(KEYS.move("pair"), request, 30.0)) == 1, "it is moved")  # noqa: B023 - called here
+            node.move("pair", sensor.stream, target)
             node.send(*(sensor.detections(seq) for seq in range(number * FRAMES, (number + 1) * FRAMES)))
             status_when(node, lambda status: workers_of(status).get(sensor.stream) == target)  # noqa: B023 - called here
         received = node.tracks(sensor.stream, 3 * FRAMES)

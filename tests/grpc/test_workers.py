@@ -9,6 +9,7 @@ import pytest
 from gateway import detections, frame
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
+from router import Node
 from routers import free_endpoint
 from service_process import ServiceProcess
 
@@ -22,7 +23,7 @@ STREAMS = tuple(f"garage/robot-{number}/lidar" for number in range(4))
 def workers() -> Iterator[tuple[ServiceProcess, str]]:
     """A service of two workers and its address for gRPC."""
     address = f"127.0.0.1:{free_endpoint().rpartition(':')[2]}"
-    with ServiceProcess("--workers", "2", "--grpc", address) as process:
+    with ServiceProcess("--workers", "2", "--grpc", address, "--instance", "garage") as process:
         process.wait_ready()
         yield process, address
 
@@ -30,6 +31,9 @@ def workers() -> Iterator[tuple[ServiceProcess, str]]:
 def test_streams_of_all_workers(workers: tuple[ServiceProcess, str]) -> None:
     """Streams of both workers are tracked, listed with their worker, asked about, reset and queried at one address."""
     stub = rpc.TrackingServiceStub(grpc.insecure_channel(workers[1]))
+    with Node(workers[0].endpoint) as node:
+        for number, stream in enumerate(STREAMS):
+            node.move("garage", stream, number % 2)
     for stream in STREAMS:
         responses = list(stub.Track((detections(frame(seq, stream)) for seq in range(10)), timeout=60))
         assert [one.tracks.seq for one in responses] == list(range(10))
@@ -38,7 +42,7 @@ def test_streams_of_all_workers(workers: tuple[ServiceProcess, str]) -> None:
         assert kept == list(range(10))
     listed = stub.ListStreams(pb.ListStreamsRequest()).streams
     assert [one.session.stream for one in listed] == list(STREAMS)
-    assert {one.session.worker for one in listed} == {0, 1}
+    assert [one.session.worker for one in listed] == [0, 1, 0, 1]
     assert {one.instance for one in listed} == {listed[0].instance}
     before = stub.GetState(pb.GetStateRequest(stream=STREAMS[0])).state.session
     assert stub.Reset(pb.ResetRequest(stream=STREAMS[0])).state.session not in {"", before}

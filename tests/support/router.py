@@ -18,6 +18,7 @@ from optipmb_schemas import (
     Detections,
     Keys,
     Message,
+    MoveRequest,
     Points,
     Pose,
     Problem,
@@ -185,6 +186,15 @@ class Node:
         answers = self.query(key, message)
         assert [ok for ok, _, _ in answers] == [False], answers
         return decode(answers[0][2], Problem)
+
+    def move(self, instance: str, stream: str, worker: int = 0) -> None:
+        """Have a stream moved to a worker of an instance, asking until it is done."""
+        request = MoveRequest(stream=stream, worker=worker)
+
+        def moved() -> bool:
+            return [ok for ok, _, _ in self.query(self.keys.move(instance), request, 30.0)] == [True]
+
+        until(moved, f"{stream} is moved to worker {worker} of {instance}")
 
     def alive(self, pattern: str) -> list[str]:
         """Keys of the liveliness tokens under a pattern."""

@@ -288,8 +288,7 @@ def test_a_stream_is_moved_to_another_instance(start: Callable[..., Any], tmp_pa
         session = node.tracks(CAREFUL.stream, 5)[-1].session
         other, _ = start(instance="b", listen=[], connect=[endpoint], store=str(tmp_path))
         until(lambda: KEYS.alive("b") in node.alive(KEYS.all_alive()), "the other one is there")
-        request = MoveRequest(stream=CAREFUL.stream, worker=0)
-        until(lambda: len(node.query(KEYS.move("b"), request, 30.0)) == 1, "it is moved")
+        node.move("b", CAREFUL.stream)
         assert (one._member.fence(CAREFUL.stream), other._member.holds(CAREFUL.stream)) == (None, True)
         node.send(*(CAREFUL.detections(seq) for seq in range(5, 10)))
         tracks = node.tracks(CAREFUL.stream, 10)
