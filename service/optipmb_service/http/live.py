@@ -9,10 +9,20 @@ import asyncio
 import json
 import threading
 import time
-from typing import Any, Final
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import optipmb_schemas as schemas
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_SENSORS: Final = 8
+"""Detections of so many sensors are kept for a viewer of tracks that several share."""
+
+_BYTES: Final = 2**22
+"""And so many bytes of them, or one message."""
 
 _MOST: Final = 1000
 """Tracks, and detections, in one frame at most."""
@@ -32,7 +42,7 @@ class Newest:
         self._loop = loop
         self._lock = threading.Lock()
         self._tracks: Sample | None = None
-        self._detections: Sample | None = None
+        self._detections: deque[Sample] = deque(maxlen=_SENSORS)
         self._event = asyncio.Event()
         self._heard = time.monotonic()
 
@@ -40,7 +50,9 @@ class Newest:
         """Take a message, on any thread."""
         with self._lock:
             if topic == "detections":
-                self._detections = (payload, encoding)
+                self._detections.appendleft((payload, encoding))
+                while len(self._detections) > 1 and sum(len(one) for one, _ in self._detections) > _BYTES:
+                    self._detections.pop()
                 return  # it is shown with its tracks
             waits = self._tracks is not None
             self._tracks = (payload, encoding)
@@ -55,13 +67,13 @@ class Newest:
             return False
         return True
 
-    def take(self) -> tuple[Sample | None, Sample | None]:
-        """Return the newest tracks, once, and the newest detections."""
+    def take(self) -> tuple[Sample | None, *tuple[Sample, ...]]:
+        """Return the newest tracks, once, and the newest detections, the latest first."""
         self.heard()
         with self._lock:
             self._event.clear()
             tracks, self._tracks = self._tracks, None
-            return tracks, self._detections
+            return tracks, *self._detections
 
     def heard(self) -> None:
         """Begin to count silence anew."""
@@ -73,8 +85,11 @@ class Newest:
         return time.monotonic() - self._heard
 
 
-def live_frame(tracks: Sample | None, detections: Sample | None) -> str | None:
-    """Return what the page draws, as JSON; None for what is no valid message."""
+def live_frame(tracks: Sample | None, *detections: Sample) -> str | None:
+    """Return what the page draws, as JSON; None for what is no valid message.
+
+    Of detections, the latest first, those of each stream are drawn that come before another of the same stream.
+    """
     if tracks is None:
         return None
     try:
@@ -111,14 +126,27 @@ def live_frame(tracks: Sample | None, detections: Sample | None) -> str | None:
     return json.dumps(frame, separators=(",", ":"))
 
 
-def _seen(sample: Sample | None) -> tuple[list[float] | None, list[list[float]]]:
+def _seen(samples: Sequence[Sample]) -> tuple[list[float] | None, list[list[float]]]:
+    """Return x, y, heading of the newest sensor, where it is known, and x, y of all detections, in the world frame."""
+    sensor: list[float] | None = None
+    found: list[list[float]] = []
+    streams: set[str] = set()
+    for number, sample in enumerate(samples):
+        try:
+            message = schemas.decode(sample[0], schemas.Detections, encoding=sample[1])
+        except schemas.MessageError:
+            continue
+        if message.stream in streams:
+            break
+        streams.add(message.stream)
+        place, centers = _placed(message)
+        sensor = sensor if number else place
+        found += centers
+    return sensor, found
+
+
+def _placed(message: schemas.Detections) -> tuple[list[float] | None, list[list[float]]]:
     """Return x, y, heading of the sensor, where it is known, and x, y of the detections, in the world frame."""
-    if sample is None:
-        return None, []
-    try:
-        message = schemas.decode(sample[0], schemas.Detections, encoding=sample[1])
-    except schemas.MessageError:
-        return None, []
     center, sensor = message.center[:_MOST], None
     if message.pose is not None:
         w, x, y, z = message.pose.quaternion

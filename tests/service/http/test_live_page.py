@@ -272,8 +272,14 @@ def test_a_frame_holds_what_is_drawn() -> None:
     assert frame["unconfirmed"] == 1
     assert frame["sensor"] == [10.0, 20.0, 1.571]
     assert frame["detections"] == [[9.0, 25.0]]
-    assert live_frame((b"\xc1", ""), None) is None
-    assert live_frame(None, None) is None
+    rear = detections.model_copy(update={"stream": "site/node/rear", "pose": None, "frame": "world"})
+    older = detections.model_copy(update={"center": np.zeros((1, 3))})
+    both = live_frame((tracks(1), ""), *((encode(one), encoding_of(one)) for one in (detections, rear, older)))
+    assert both is not None
+    assert json.loads(both)["detections"] == [[9.0, 25.0], [5.0, 1.0]]
+    assert json.loads(both)["sensor"] == [10.0, 20.0, 1.571]
+    assert live_frame((b"\xc1", "")) is None
+    assert live_frame(None) is None
 
 
 async def test_only_the_newest_is_kept() -> None:
@@ -281,9 +287,11 @@ async def test_only_the_newest_is_kept() -> None:
     newest = Newest(asyncio.get_running_loop())
     for seq in range(3):
         newest.put("tracks", bytes([seq]), "")
-    newest.put("detections", b"d", "x")
+    newest.put("detections", bytes(2**22), "large")
+    for number in range(20):
+        newest.put("detections", bytes([number]), "x")
     assert await newest.came(1.0)
-    assert newest.take() == ((b"\x02", ""), (b"d", "x"))
+    assert newest.take() == ((b"\x02", ""), *((bytes([number]), "x") for number in range(19, 11, -1)))
     assert not await newest.came(0.01)
     newest.put("tracks", b"3", "")
     assert await newest.came(1.0)
