@@ -8,6 +8,7 @@ too small. Both are mended where tracks leave the tracker, so that the recursion
     evidence    e_k = lambda e_{k-1} + (1 - lambda) l_k,     l_k = ln[z_s / (1 - z_s)], or -l_miss where missed
     existence   f(e_k)
     covariance  P + U diag(along(e_k), across(e_k))^2 U'     on x and y, U turned by the heading
+    score       (1 - w) x_s + w (1 + e_k / e_max) / 2        e_max the bound of l_k
 
 The evidence is the mean of the log odds of the track's latest detections, with weights that fade. f, along and across
 are piecewise linear and were measured on training data: how often tracks with such evidence are of an object, and how
@@ -51,7 +52,7 @@ def calibrate_rows(
     knot_existence: Array,
     knot_along: Array,
     knot_across: Array,
-    score_of_evidence: NDArray[np.bool_],
+    score_of_evidence: Array,
     existence: Array,
     score: Array,
     covariance: Array,
@@ -67,7 +68,7 @@ def calibrate_rows(
         knot_existence: (C, K) f there.
         knot_along: (C, K) standard deviation of the lasting error along the heading, m.
         knot_across: (C, K) across it, m.
-        score_of_evidence: (C,) whether the score is the evidence, brought to [0, 1].
+        score_of_evidence: (C,) w, the weight of the evidence in the score.
         existence: (K,) in: r, out: f(e_k).
         score: (K,) in: x_s, out: the score that is told.
         covariance: (K, 6, 6) in: P, out: with the lasting error.
@@ -94,5 +95,5 @@ def calibrate_rows(
         mixed = (along * along - across * across) * cos * sin
         covariance[row, 0, 1] += mixed
         covariance[row, 1, 0] += mixed
-        if score_of_evidence[c]:
-            score[row] = 0.5 + 0.5 * e / SURE
+        w = score_of_evidence[c]
+        score[row] = (1.0 - w) * score[row] + w * (0.5 + 0.5 * e / SURE)

@@ -42,7 +42,7 @@ class Tracks:
         yaw_rate: (N,) rad/s.
         acceleration: (N,) along the heading, m/s^2.
         existence: (N,) existence probability: calibrated (`optipmb.calibration`), or r without a calibration.
-        score: (N,) confidence score x_s, zero while missed; or the evidence, where the profile asks for it.
+        score: (N,) confidence score x_s, zero while missed; with a weight of the evidence where the profile has one.
         covariance: (N, 6, 6) of [x, y, v, phi, omega, a], with the lasting error of the detector, and with the doubt
             which way the object faces.
         age: (N,) s since the first detection.
@@ -264,7 +264,7 @@ def read_tracks(
     knot_existence: Array,
     knot_along: Array,
     knot_across: Array,
-    score_of_evidence: NDArray[np.bool_],
+    score_of_evidence: Array,
     confirm_from: Array,
     confirm_until: Array,
     confirmed: NDArray[np.bool_],

@@ -133,8 +133,9 @@ class Calibration(_Table):
 
     memory: OpenProbability = Field(description="lambda: weight that the evidence keeps over one nominal period")
     missed: NonNegative = Field(description="l_miss: log odds against a track that a missed detection counts for")
-    score_of_evidence: bool = Field(
-        default=False, description="true: the score is the evidence, brought to [0, 1]; false: x_s of the paper"
+    score_of_evidence: Probability = Field(
+        default=0.0,
+        description="w: weight of the evidence, brought to [0, 1], in the score; the rest is x_s of the paper",
     )
     evidence: Annotated[tuple[float, ...], Field(min_length=1, max_length=32)] = Field(
         description="mean log odds of the latest detections, ascending"

@@ -45,7 +45,7 @@ class ClassTable:
         sign_speed: (C,) v_0.
         memory: (C,) lambda; one without a calibration, and so the evidence stays zero.
         missed_evidence: (C,) l_miss.
-        score_of_evidence: (C,) whether the score is the evidence.
+        score_of_evidence: (C,) weight of the evidence in the score.
         knots: (C,) number of knots of the calibration, zero without one.
         knot_evidence: (C, K) and the other columns at the knots, zero from `knots` on.
     """
@@ -97,7 +97,7 @@ class ClassTable:
     sign_speed: Array
     memory: Array
     missed_evidence: Array
-    score_of_evidence: NDArray[np.bool_]
+    score_of_evidence: NDArray[np.float64]
     knots: NDArray[np.int64]
     knot_evidence: Array
     knot_existence: Array
@@ -193,7 +193,7 @@ class ClassTable:
             sign_speed=np.array([one.speed if one else 0.0 for one in signs]),
             memory=np.array([one.memory if one else 1.0 for one in calibrations]),
             missed_evidence=np.array([one.missed if one else 0.0 for one in calibrations]),
-            score_of_evidence=np.array([one is not None and one.score_of_evidence for one in calibrations], np.bool_),
+            score_of_evidence=np.array([one.score_of_evidence if one else 0.0 for one in calibrations]),
             knots=np.array(knots, np.int64),
             knot_evidence=curve(lambda one: one.evidence),
             knot_existence=curve(lambda one: one.existence),

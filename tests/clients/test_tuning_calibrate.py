@@ -104,15 +104,15 @@ def test_whatever_the_detector_a_calibration_is_valid(seed: int, found: float, f
 
 
 def test_tracks_are_ranked_by_the_score_that_the_tracker_gives() -> None:
-    """The first row is the paper's score, the last one the evidence: their figures are those of tracks so scored."""
+    """Paper's score, evidence and the mean of both: the figures are those of tracks so scored."""
     clips = clips_of(range(3), Habits(false=2.0))
     told = with_calibration(CARS, "Car", calibrate(clips, SCORER, CARS, 0.8))
     rows = rank(clips, SCORER, told, "combination")
-    assert [one.score for one in rows][:: len(rows) - 1] == ["x_s", "evidence"]
-    for row, by_evidence in ((rows[0], False), (rows[-1], True)):
-        parameters = with_values(told, "Car", {"calibration.score_of_evidence": by_evidence})
+    for row, weight in ((rows[0], 0.0), (rows[-2], 0.5), (rows[-1], 1.0)):
+        parameters = with_values(told, "Car", {"calibration.score_of_evidence": weight})
         wanted = SCORER.figures([SCORER.measure(clip, track_clip(clip, parameters)) for clip in clips])
         assert row.figures == wanted
+    assert [rows[i].score for i in (0, -2, -1)] == ["x_s", "(x_s + evidence) / 2", "evidence"]
     assert rows[0].gain == 0.0
     assert all(one.error >= 0.0 for one in rows)
 

@@ -340,4 +340,5 @@ def calibrate(c: Any, b: Any, m: Array, P: Array) -> tuple[float, float, Array]:
     turn = np.array([[math.cos(m[3]), -math.sin(m[3])], [math.sin(m[3]), math.cos(m[3])]])
     covariance = P.copy()
     covariance[:2, :2] += turn @ np.diag([along**2, across**2]) @ turn.T
-    return existence, (b.evidence + 14.0) / 28.0 if known.score_of_evidence else b.score, covariance
+    w = known.score_of_evidence
+    return existence, (1 - w) * b.score + w * (b.evidence + 14.0) / 28.0, covariance

@@ -84,16 +84,20 @@ def test_the_lasting_error_lies_along_and_across_the_heading() -> None:
 
 
 def test_a_calibration_leaves_the_recursion_alone() -> None:
-    """Positions, ids, scores and what is extracted are those without it; only the scores when they are asked for."""
+    """Positions, ids, scores and what is extracted are those without it; the score takes the weight of the evidence."""
     scores = [0.4, 0.9, None, 0.8, None, None, 0.7]
     plain, told = follow(PAPER, scores), follow(with_calibration(), scores)
     for one, other in zip(plain, told, strict=True):
         for name in ("id", "center", "size", "yaw", "velocity", "score", "detection"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    ranked = follow(with_calibration(score_of_evidence=True), scores)
-    values = [float(one.score[0]) for one in ranked if len(one)]
-    assert all(0.0 <= value <= 1.0 for value in values)
-    assert values != [float(one.score[0]) for one in plain if len(one)]
+    paper, half, evidence = (
+        [float(one.score[0]) for one in follow(with_calibration(score_of_evidence=weight), scores) if len(one)]
+        for weight in (False, 0.5, True)
+    )
+    assert paper == [float(one.score[0]) for one in plain if len(one)]
+    assert all(0.0 <= value <= 1.0 for value in evidence)
+    assert evidence != paper
+    np.testing.assert_allclose(half, np.mean([paper, evidence], axis=0), rtol=1e-15)
 
 
 @pytest.mark.parametrize(

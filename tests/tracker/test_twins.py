@@ -152,8 +152,8 @@ def test_rows_are_calibrated_as_numpy_interpolates(seed: int) -> None:
     rows = np.arange(30)
     existence, score, covariance = (rng.normal(0, 1, (rows.size, *shape)) for shape in ((), (), (6, 6)))
     told, ranked, widened = existence.copy(), score.copy(), covariance.copy()
-    told_by_evidence = np.array([True, True, False])
-    curves = knots, bends, existence_at, along_at, across_at, told_by_evidence
+    weight = np.array([0.3, 1.0, 0.0])
+    curves = knots, bends, existence_at, along_at, across_at, weight
     calibrate_rows(label, evidence, yaw, *curves, told, ranked, widened)
     for k, n in enumerate(rows):
         c = label[n]
@@ -165,8 +165,7 @@ def test_rows_are_calibrated_as_numpy_interpolates(seed: int) -> None:
             cos, sin = np.cos(yaw[n]), np.sin(yaw[n])
             turn = np.array([[cos, -sin], [sin, cos]])
             covariance[k, :2, :2] += turn @ np.diag([along**2, across**2]) @ turn.T
-            if told_by_evidence[c]:
-                score[k] = 0.5 + 0.5 * evidence[n] / SURE
+            score[k] = np.average([score[k], 0.5 + 0.5 * evidence[n] / SURE], weights=[1 - weight[c], weight[c]])
     np.testing.assert_allclose(told, existence, rtol=1e-12)
     np.testing.assert_allclose(ranked, score, rtol=1e-15)
     np.testing.assert_allclose(widened, covariance, rtol=1e-12, atol=1e-15)

@@ -133,7 +133,7 @@ def _rows(clip: Clip, scorer: Scorer, parameters: Parameters, memory: float) -> 
     probe = Calibration(
         memory=memory,
         missed=MISSED,
-        score_of_evidence=True,
+        score_of_evidence=1.0,
         evidence=(0.0,),
         existence=(1.0,),
         along=(0.0,),

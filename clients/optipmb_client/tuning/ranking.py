@@ -2,7 +2,7 @@
 
 Benchmarks rank a track by the mean of its scores. The same tracks are ranked by several scores that are known when a
 frame is told: that of the paper, x_s = [1 - exp(-x_len)] z_s; the mean of the detections' scores so far; the existence
-probability; the product and the mean of it and x_s; and the evidence (`optipmb.calibration`).
+probability; the product and the mean of it and x_s; the evidence (`optipmb.calibration`), and the mean of it and x_s.
 """
 
 import math
@@ -49,7 +49,7 @@ def rank(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters, objectiv
         objective: one of `optipmb_client.tuning.objective.METRICS`.
 
     """
-    probe = with_values(parameters, scorer.name, {"calibration.score_of_evidence": True})
+    probe = with_values(parameters, scorer.name, {"calibration.score_of_evidence": 1.0})
     tracked = [track_fully(clip, probe) for clip in clips]
     told = [_scores(clip, full, parameters.nominal_period) for clip, (_, full) in zip(clips, tracked, strict=True)]
     scores = {
@@ -90,6 +90,7 @@ def _scores(clip: Clip, full: FullTable, period: float) -> dict[str, Floats]:
         "existence": full.existence,
         "x_s * existence": paper * full.existence,
         "(x_s + existence) / 2": 0.5 * (paper + full.existence),
+        "(x_s + evidence) / 2": 0.5 * (paper + full.score),
         "evidence": full.score,
     }
 

@@ -9,6 +9,7 @@ import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -182,7 +183,7 @@ def refine(
     first = calibrate(clips, scorer, base)
     work = _Work(bench, base, plan, storage, dict(context), watch, first.memory if first else None)
     told = work.told(base, everyone).classes[name].calibration
-    work = replace(work, by_evidence=told is not None and told.score_of_evidence)
+    work = replace(work, evidence_weight=told.score_of_evidence if told else 0.0)
     folds: list[FoldResult] = []
     crossed: dict[int, list[Measured]] = {}
     for number, group in enumerate(groups):
@@ -239,8 +240,8 @@ class _Work:
     watch: Watch
     memory: float | None
     """Of the evidence, for all searches; None where there is too little to calibrate."""
-    by_evidence: bool | None = None
-    """What ranks tracks, for all searches: tracks that are ranked by different scores cannot be ranked together."""
+    evidence_weight: float | None = None
+    """In the score, for all searches: tracks that are ranked by different scores cannot be ranked together."""
 
     @property
     def name(self) -> str:
@@ -313,10 +314,9 @@ class _Work:
         plain = self._calibrated(with_calibration(base, self.name, None), clips)
         if plain.classes[self.name].calibration is None:
             return plain
-        other = with_values(plain, self.name, {"calibration.score_of_evidence": True})
-        if self.by_evidence is not None:
-            return other if self.by_evidence else plain
-        return self._better(plain, other, clips)
+        weights = _EVIDENCE_WEIGHTS if self.evidence_weight is None else (self.evidence_weight,)
+        each = [with_values(plain, self.name, {"calibration.score_of_evidence": weight}) for weight in weights]
+        return reduce(partial(self._better, clips=clips), each)
 
     def _behind(self, parameters: Parameters, rival: Parameters, clips: tuple[int, ...]) -> float | None:
         """Return by how much parameters lose to the best so far where that shows early; None where it does not.
@@ -371,6 +371,7 @@ class _Choice:
     parameters: Parameters
 
 
+_EVIDENCE_WEIGHTS = (0.0, 0.5, 1.0)
 _EARLY, _LATE = 0.004, 0.002
 """By how much a trial may be behind, on half of the sequences and on all, and still be tried on degraded detections."""
 _SETTLED = ("metric", "copies", "degradation", "seed", "everything", "penalty", "caution")
