@@ -1,8 +1,8 @@
-"""The tracker beside two simple ones, same detections, same evaluator: `python benchmarks/accuracy.py --root data`.
+"""The profiles with every detector, and two simple trackers: `python benchmarks/accuracy.py --root data`.
 
-Prints the table of docs/tuning.md as Markdown. Simple are a greedy tracker of nearest centres and AB3DMOT's Kalman
-filters (`tests/support/greedy.py`, `kalman.py`); their parameters are the published ones. The tracker runs with the
-values of the paper's table and with the profile that ships. KITTI counts at a 3D overlap of 0.25, ten sequences.
+Prints the tables of docs/tuning.md as Markdown: the profiles with each detector and class, and beside them, for some of
+these, a greedy tracker of nearest centres and AB3DMOT's Kalman filters (`tests/support/greedy.py`, `kalman.py`) with
+their published parameters. The same detections and evaluator; KITTI counts at a 3D overlap of 0.25, ten sequences.
 """
 
 from __future__ import annotations
@@ -18,44 +18,66 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"
 from greedy import greedy_tracks
 from kalman import HABITS, kalman_tracks
 from optipmb_client.datasets import open_dataset
+from optipmb_client.evaluation.errors import evaluate_errors
 from optipmb_client.tuning.degrade import Degradation, degrade
-from optipmb_client.tuning.material import Clip, load, of_class, track_clip
+from optipmb_client.tuning.material import Clip, load, of_class, track_clip, track_fully
 from optipmb_client.tuning.scoring import rules_of, scorer_of
 from optipmb_client.tuning.values import only
 
 import optipmb
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
+    from optipmb_client.datasets import DataSequence
+    from optipmb_client.evaluation.cases import Rules
     from optipmb_client.results import ResultTable
 
     Way = tuple[str, Callable[[Clip], ResultTable]]
 
+CARS, ROAD_USERS = ("Car",), ("Car", "Pedestrian", "Cyclist")
 SETS = (
-    ("kitti", "pointrcnn", ("Car", "Pedestrian", "Cyclist")),
+    ("kitti", "pointrcnn", ROAD_USERS),
+    ("kitti", "second_iou", ROAD_USERS),
+    ("kitti", "pvrcnn", ROAD_USERS),
+    ("kitti", "casa", CARS),
+    ("kitti", "virconv", CARS),
     ("nuscenes", "centerpoint", ("car", "pedestrian")),
     ("nuscenes", "pointpillars", ("car",)),
 )
-SHOWN = ("sAMOTA", "AMOTA", "MOTA", "HOTA", "HOTA, all", "IDS")
+"""Datasets, detectors and the classes that they detect."""
+SIMPLE = ("pointrcnn", "centerpoint")
+"""Detectors whose detections go through the simple trackers too."""
+SHOWN = ("sAMOTA", "AMOTA", "MOTA", "HOTA", "HOTA, all", "IDS", "FP", "FN")
 
 
-def ways(dataset: str, name: str) -> Iterator[Way]:
+def ways(dataset: str, detections: str, name: str) -> Iterator[Way]:
     """Yield the trackers by name."""
-    yield "greedy", partial(greedy_tracks, name=name)
-    if name in HABITS:
-        yield "Kalman filters (AB3DMOT)", partial(kalman_tracks, name=name)
+    if detections in SIMPLE:
+        yield "greedy", partial(greedy_tracks, name=name)
+        if name in HABITS:
+            yield "Kalman filters (AB3DMOT)", partial(kalman_tracks, name=name)
     for profile in (f"{dataset}-paper", dataset):
         yield f"`{profile}`", partial(track_clip, parameters=only(optipmb.load_profile(profile), name))
 
 
+def backward(sequences: Sequence[DataSequence], clips: Sequence[Clip], profile: str, name: str, rules: Rules) -> str:
+    """Return the shares of boxes that face backwards, of tracks and of their detections, in percent."""
+    parameters = only(optipmb.load_profile(profile), name)
+    parts = ((one, clip.world, *track_fully(clip, parameters)) for one, clip in zip(sequences, clips, strict=True))
+    found = evaluate_errors(parts, name, rules)
+    shares = found.figures(found.detected)["backward"]
+    return f"{100 * shares['track']:.2f} | {100 * shares['detection']:.2f}"
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, required=True, help="folder with kitti/ and nuscenes/")
     parser.add_argument("--degrade", action="store_true", help="of detections made worse, as `optipmb tune` does")
     given = parser.parse_args()
-    print("| | tracker | " + " | ".join(SHOWN) + " |\n| --- | --- |" + " ---: |" * len(SHOWN))
+    columns = (*SHOWN, "backward %", "of the detections")
+    print("| | tracker | " + " | ".join(columns) + " |\n| --- | --- |" + " ---: |" * len(columns))
     for dataset, detections, names in SETS:
         options = {"z_bottom": True} if detections == "pointpillars" else {}
         opened = open_dataset(dataset, given.root / dataset, detections, clouds=False, **options)
@@ -67,9 +89,11 @@ def main() -> None:
             if given.degrade:
                 clips = [degrade(clip, Degradation(), 0) for clip in clips]
             scorer = scorer_of(dataset, name, sequences)
-            for way, run in ways(dataset, name):
+            for way, run in ways(dataset, detections, name):
                 found = scorer.figures([scorer.measure(clip, run(clip)) for clip in clips]).to_json()
-                print(f"| {detections} {name} | {way} | " + " | ".join(_shown(found[key]) for key in SHOWN) + " |")
+                profile = way.strip("`")
+                sides = backward(sequences, clips, profile, name, scorer.near) if profile != way else "- | -"
+                print(f"| {detections} {name} | {way}", *(_shown(found[key]) for key in SHOWN), sides, "", sep=" | ")
 
 
 def _shown(value: float | None) -> str:

@@ -30,6 +30,8 @@ OpenProbability = Annotated[float, Field(gt=0.0, lt=1.0)]
 Positive = Annotated[float, Field(ge=1e-9, le=1e9)]
 """Far enough from zero and from infinity that squares and quotients of such numbers stay finite."""
 NonNegative = Annotated[float, Field(ge=0.0, le=1e9)]
+Periods = Annotated[int, Field(ge=0, le=10**9)]
+"""Nominal periods of the stream; as many as that are for ever."""
 
 
 def _printable(name: str) -> str:
@@ -208,17 +210,15 @@ class ClassParameters(_Table):
     )
     clutter_rate: Positive = Field(description="mu_c: expected false detections in a frame")
     area: Positive = Field(description="A: area of the region of observation, m^2")
-    poisson_steps: Annotated[int, Field(ge=0)] = Field(
-        description="eta_step: nominal periods a Poisson component survives"
-    )
+    poisson_steps: Periods = Field(description="eta_step: nominal periods a Poisson component survives")
     extract_new: Probability = Field(
         description="eta_ext1: existence from which a track is extracted for the first time"
     )
     extract_known: Probability = Field(description="eta_ext2: existence from which a known track is extracted again")
-    extract_misses: Annotated[int, Field(ge=0)] = Field(
+    extract_misses: Periods = Field(
         description="eta_cnt: missed nominal periods from which a known track is no longer extracted"
     )
-    max_misses: Annotated[int, Field(ge=0)] = Field(
+    max_misses: Periods = Field(
         description="missed nominal periods after which a Bernoulli is removed; with p_s = 1 nothing else does"
     )
     min_existence: OpenProbability = Field(description="existence probability below which a Bernoulli is removed")

@@ -188,6 +188,9 @@ def test_a_bad_value_is_refused_by_its_path(path: str, value: Any) -> None:
         ("classes.Car.poisson_steps", -1),
         ("classes.Car.poisson_steps", 1.5),
         ("classes.Car.max_misses", -1),
+        ("classes.Car.max_misses", 2**63),
+        ("classes.Car.poisson_steps", 2**63),
+        ("classes.Car.extract_misses", 2**63),
         ("classes.Car.nms_iou", 1.1),
         ("classes.Car.measurement_noise.position", 0.0),
         ("classes", {}),
@@ -195,7 +198,7 @@ def test_a_bad_value_is_refused_by_its_path(path: str, value: Any) -> None:
         ("nominal_period", 0.0),
     ],
 )
-def test_values_at_which_the_filter_would_divide_by_zero_are_refused(path: str, value: Any) -> None:
+def test_values_with_which_the_filter_cannot_compute_are_refused(path: str, value: Any) -> None:
     """Bounds are checked where the profile is read, not in the filter."""
     assert refused(document_with(path, value)).path == path
 
