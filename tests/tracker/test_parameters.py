@@ -80,6 +80,8 @@ def test_the_profiles_that_ship_are_listed_and_load() -> None:
         "generic",
         "kitti",
         "kitti-paper",
+        "kitti-second-iou",
+        "kitti-virconv",
         "nuscenes",
         "nuscenes-megvii",
         "nuscenes-paper",
