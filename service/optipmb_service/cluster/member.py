@@ -34,8 +34,8 @@ log = structlog.get_logger("optipmb_service")
 
 SECOND: Final = 1_000_000_000
 LOOKS_PER_LEASE: Final = 20
-LONGEST_LOOK_S: Final = 0.05
-"""Of a store on the same machine, where a look costs microseconds."""
+LONGEST_LOOK_S: Final = 0.1
+"""Of a store on the same machine: how late a killed member may be noticed."""
 
 RENEWALS_PER_LEASE: Final = 10
 WRITE_LEASES_PER_LEASE: Final = 2
