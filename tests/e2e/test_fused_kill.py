@@ -72,7 +72,7 @@ def test_killed_while_two_sensors_feed_one_session(tmp_path: Path, workers: int)
     for frame in frames:
         merged.take(one.on_detections(frame, 0))
     wanted = merged.plain()
-    settings = {"fuse": "site/node/*", "recovery_wait_s": 10, "checkpoint_s": 0.2, "workers": workers}
+    settings = {"fuse": "site/node/*", "recovery_wait_s": 30, "checkpoint_s": 0.2, "workers": workers}
     with Fleet(tmp_path, **settings) as fleet, Node(fleet.endpoint) as node:
         service = fleet.service("one")
         node.send(*frames[:40])
