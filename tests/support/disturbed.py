@@ -120,6 +120,7 @@ class World:
         self._until(self.now_ns + 5 * SECOND)
         for stream, session in self.sessions.items():
             self.merged[stream].take([*session.recovered(self.now_ns), *session.flush()], session.run)
+        self.store.close()
         self.compare()
 
     def compare(self) -> None:

@@ -168,8 +168,10 @@ class Member:
         """Renew, look, write what is due."""
         if not self._keep():
             return
-        self._table.take_in(self._store.follow(self._table.position), self._clock())
-        for write in self._table.due(self._clock(), self._occupied, self._store.gone):
+        records, now_ns = self._store.follow(self._table.position), self._clock()
+        self._table.take_in(records, now_ns)
+        # At the same time: after a pause of the machine in between all the others would look frozen.
+        for write in self._table.due(now_ns, self._occupied, self._store.gone):
             if not self._keep():
                 return
             self._table.written(write, self._store.put(write))

@@ -38,6 +38,8 @@ ENDED_KEPT: Final = 64
 BUSY_S: Final = 5.0
 """How long a transaction waits for those of other processes; each takes milliseconds."""
 
+BUSY_PAUSE_S: Final = 0.01
+
 
 class StoreError(Exception):
     """The store cannot do what was asked: full, read-only, locked, not there. Tracking goes on without it."""
@@ -161,7 +163,7 @@ class SqliteStore:
             self._connection = sqlite3.connect(
                 path or ":memory:", timeout=BUSY_S, isolation_level=None, check_same_thread=False
             )
-            self._connection.execute("PRAGMA journal_mode = WAL")
+            self._begin_log(self._connection)
             self._connection.execute("PRAGMA synchronous = NORMAL")
             self._connection.execute(f"PRAGMA journal_size_limit = {64 * 2**20}")
             self._connection.executescript(_SCHEMA)
@@ -169,6 +171,20 @@ class SqliteStore:
         except (sqlite3.Error, OSError) as error:
             self.close()
             raise StoreError(f"{path}: {error}") from error
+
+    @staticmethod
+    def _begin_log(connection: sqlite3.Connection) -> None:
+        """Have the journal be a write-ahead log; SQLite itself does not wait there for a process that does the same."""
+        until_s = time.monotonic() + BUSY_S
+        while True:
+            try:
+                connection.execute("PRAGMA journal_mode = WAL")
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > until_s:
+                    raise
+                time.sleep(BUSY_PAUSE_S)
+            else:
+                return
 
     def follow(self, after: int) -> list[Record]:
         """Return the newest record of each key that changed after a revision, by revision."""

@@ -312,8 +312,9 @@ class Registry:
         if change is Change.HELD:
             with self._foreign_lock:
                 for stream in [one for one in self._foreign if partition_of(one) == partition]:
-                    packets = self._foreign.pop(stream).take()
+                    packets = self._foreign[stream].take()
                     self._offer(stream, partial(_take_up, packets=packets), limited=False)
+                    del self._foreign[stream]  # from now on readers hand over newer ones
             return
         told = StreamActor.on_recalled if change is Change.RECALLED else StreamActor.on_lost
         with self._lock:

@@ -412,6 +412,7 @@ class StreamActor:
         if session is None:
             return
         self._deliver(session.flush())
+        self._out.flush()  # what waited for the write lease is in the state that is kept
         state = session.snapshot()
         if reason == "query":
             session.reset()

@@ -90,6 +90,8 @@ class Session:
         self._pending: dict[str, PendingFrames] = {}
         self._recovery_ns: int | None = None
         self._began: tuple[int, int] | None = None
+        self._backlog = False
+        self._young_ns: int | None = None
         self._now_ns = 0
         self._quarantine: dict[str, str] = {}
         self._run = 0
@@ -416,8 +418,13 @@ class Session:
         timeline = self._processed.timeline
         if self._began:
             stamp_ns, began_ns = self._began
-            return frame_id.stamp_ns - stamp_ns <= self._now_ns - began_ns + self._policy.rewind_ns
+            ahead_ns = frame_id.stamp_ns - stamp_ns - self._policy.rewind_ns
+            # Stamps that pass faster than time come from a cache, and the other caches begin as early.
+            self._backlog |= ahead_ns > self._now_ns - began_ns
+            return ahead_ns <= (0 if self._backlog else self._now_ns - began_ns)
         if isinstance(timeline, FusedTimeline) and self.recovering:
+            if self._young_ns is not None and frame_id.stamp_ns - self._young_ns > self._policy.rewind_ns:
+                return False
             for name, newest_ns in timeline.live().items():
                 held = self._pending[name].first if name in self._pending else None
                 reached_ns = newest_ns if held is None else held.stamp_ns
@@ -497,6 +504,9 @@ class Session:
         self._quarantine = dict(checkpoint.quarantine)
         self._reporting.deliveries = replace(checkpoint.deliveries)
         self._recovery_ns = now_ns + self._policy.recovery_wait_ns
+        if self._fused and checkpoint.base.last is None:
+            # Of the beginning of a session: other sensors may have been there that it does not know yet.
+            self._young_ns = min((one.message.stamp_ns for one in checkpoint.window), default=None)
         self._run = checkpoint.run + 1
         self._processed.resume(checkpoint)
         self._pending.clear()
@@ -533,7 +543,8 @@ class Session:
 
     def _recover_until(self, recovery_ns: int | None) -> None:
         self._recovery_ns = recovery_ns
-        self._began = self._began if recovery_ns else None
+        if not recovery_ns:
+            self._began, self._backlog, self._young_ns = None, False, None
         for one in self._pending.values():
             one.recovery_ns = recovery_ns
 
