@@ -3,6 +3,7 @@
 import base64
 import json
 import struct
+import time
 from typing import Any
 
 import websocket
@@ -11,6 +12,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 SUBPROTOCOL = "foxglove.sdk.v1"
 MESSAGE = 1
+PATIENCE_S = 10.0
 
 
 class FoxgloveClient:
@@ -21,13 +23,19 @@ class FoxgloveClient:
     """
 
     def __init__(self, address: str) -> None:
-        self._socket = websocket.create_connection(address, timeout=30, subprotocols=[SUBPROTOCOL])
-        self.channels: dict[int, dict[str, Any]] = {}
+        self._address = address
+        self._connect()
 
     def collect(self, topics: set[str]) -> dict[str, tuple[int, Any]]:
         """Subscribe to topics as they are advertised; give log time and content of the first message of each."""
         found: dict[str, tuple[int, Any]] = {}
+        patient_until_s = time.monotonic() + PATIENCE_S
         while set(found) != topics:
+            if time.monotonic() > patient_until_s:
+                # Once in hundreds of runs the server's library sent nothing of a channel that it had just announced.
+                self.close()
+                self._connect()
+                patient_until_s = time.monotonic() + PATIENCE_S
             data = self._socket.recv()
             if isinstance(data, str):
                 about = json.loads(data)
@@ -41,6 +49,10 @@ class FoxgloveClient:
                 channel = self.channels[number]
                 found.setdefault(channel["topic"], (log_time, _decoded(channel, data[13:])))
         return found
+
+    def _connect(self) -> None:
+        self._socket = websocket.create_connection(self._address, timeout=30, subprotocols=[SUBPROTOCOL])
+        self.channels: dict[int, dict[str, Any]] = {}
 
     def close(self) -> None:
         """Hang up."""
