@@ -94,6 +94,8 @@ def test_workers_share_the_streams(service: ServiceProcess) -> None:
     """
     sensors = [Sensor(stream=stream) for stream in STREAMS]
     with Node(service.endpoint) as node:
+        for number, stream in enumerate(STREAMS):
+            node.move("pair", stream, number % 2)  # else the worker that begins later may take them while they come
         for seq in range(FRAMES):
             node.send(*(sensor.detections(seq) for sensor in sensors))
         for sensor in sensors:
