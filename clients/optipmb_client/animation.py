@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["animate_tracks"]
 
-FRAMES: Final = 100
+FRAMES: Final = 70
 """Of a longer sequence every second frame is drawn, or every third …"""
 TRAIL_S: Final = 3.0
 REACH_M: Final = 45.0
@@ -33,8 +33,8 @@ INSIDE: Final = (0.03, 0.97)
 MARGIN_M: Final = 4.0
 NARROWEST_M: Final = 30.0
 SCALE_M: Final = 10.0
-WIDTH_PX: Final = 720
-COLOURS: Final = 32
+WIDTH_PX: Final = 560
+COLOURS: Final = 16
 WHITE: Final = 250
 _INK, _TRUTH, _DETECTION = "#222222", "#C4C4C4", "#5A5A5A"
 
@@ -171,17 +171,15 @@ class _View:
     def _legend(self, figure: "Figure") -> None:
         from matplotlib.lines import Line2D  # noqa: PLC0415 - matplotlib is an extra
 
-        track = colour_of(0)
-        path = f"track: box, id, path of {TRAIL_S:.0f} s"
-        kinds = {
-            "detection": {"marker": "+", "linestyle": "", "color": _DETECTION, "markersize": 6},
-            "truth": {"marker": "s", "linestyle": "", "color": _TRUTH, "markersize": 8},
-            path: {"marker": "s", "color": track, "markerfacecolor": f"{track}66"},
-            "sensor": {"marker": "^", "linestyle": "", "color": _INK, "markersize": 7},
-        }
+        colour, path = colour_of(0), f"track: box, id, path of {TRAIL_S:.0f} s"
+        handles = [
+            Line2D([], [], label="detection", marker="+", linestyle="", color=_DETECTION, markersize=6),
+            Line2D([], [], label="truth", marker="s", linestyle="", color=_TRUTH, markersize=8),
+            Line2D([], [], label=path, marker="s", color=colour, markerfacecolor=f"{colour}66"),
+            Line2D([], [], label="sensor", marker="^", linestyle="", color=_INK, markersize=7),
+        ]
         if self._truth is None:
-            del kinds["truth"]
-        handles = [Line2D([], [], label=name, **style) for name, style in kinds.items()]  # type: ignore[arg-type]  # each key has its own type
+            del handles[1]
         figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False, fontsize=9)
 
 

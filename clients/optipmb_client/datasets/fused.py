@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,26 @@ class OfSensor(DataSequence, Protocol):
         """The column with the name of the sensor."""
 
 
+class OfTable(OfSensor, Protocol):
+    """A sequence of a table, which has columns of its own."""
+
+    @property
+    def time_column(self) -> str:
+        """The column with the times."""
+
+    @property
+    def times(self) -> NDArray[Any]:
+        """(F,) as the table has them."""
+
+
+def _of_sensor(one: DataSequence) -> TypeGuard[OfSensor]:
+    return bool(getattr(one, "sensor", ""))
+
+
+def _of_table(one: OfSensor) -> TypeGuard[OfTable]:
+    return bool(one.columns)
+
+
 class FusedSequence:
     """The sequences of several sensors as one.
 
@@ -54,9 +74,9 @@ class FusedSequence:
         self.name = self.sensors[0].recording
         self.labels = tuple(dict.fromkeys(label for one in self.sensors for label in one.labels))
         self.has_clouds = any(one.has_clouds for one in self.sensors)
-        if columns := self.sensors[0].columns:
-            self.key_columns = columns
-            self.time_column: str = self.sensors[0].time_column  # type: ignore[attr-defined]  # a table has it
+        first = self.sensors[0]
+        if _of_table(first):
+            self.key_columns, self.time_column = first.columns, first.time_column
 
     def __len__(self) -> int:
         return sum(map(len, self.sensors))
@@ -86,7 +106,7 @@ class FusedSequence:
     @cached_property
     def times(self) -> NDArray[Any]:
         """(F,) as the table has them."""
-        times: list[NDArray[Any]] = [one.times for one in self.sensors]  # type: ignore[attr-defined]  # a table has them
+        times = [one.times for one in self.sensors if _of_table(one)]
         return np.array([times[number][index] for number, index in self._places])
 
     @property
@@ -128,11 +148,11 @@ class FusedDataset:
     def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
         self.name = dataset.name
-        found: dict[str, list[Any]] = {}
+        found: dict[str, list[OfSensor]] = {}
         for one in dataset.sequences(["all"]):
-            if not getattr(one, "sensor", ""):
+            if not _of_sensor(one):
                 raise DatasetError("--fuse", "frames that name their sensor: a column `sensor`, streams", one.name)
-            found.setdefault(one.recording, []).append(one)  # type: ignore[attr-defined]  # it has a sensor
+            found.setdefault(one.recording, []).append(one)
         self._fused = {name: FusedSequence(sensors) for name, sensors in found.items()}
 
     @property

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from optipmb_service.cluster.store import SqliteStore, StoreError
+from optipmb_service.cluster.store import SqliteStore, StoreError, in_use
 from optipmb_service.runtime.persistence import DAY_S
 
 if TYPE_CHECKING:
@@ -29,6 +29,9 @@ def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, st
     Args:
         settings: what is in force.
         private: folder that the workers of one parent share; None: this process has no parent.
+
+    Raises:
+        StoreError: the folder cannot be used, and others use it: a store of its own would give its streams two owners.
     """
     if settings.cluster:
         from optipmb_service.cluster.jetstream import JetStream  # noqa: PLC0415 - an extra
@@ -40,6 +43,8 @@ def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, st
             folder.mkdir(parents=True, exist_ok=True)
             return SqliteStore(folder / STORE_FILE), None
         except (OSError, StoreError) as error:
+            if in_use(folder / STORE_FILE):
+                raise StoreError(str(error)) from error
             # Tracking without memory is better than none; the status says that it is so.
             log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
             why = str(error)

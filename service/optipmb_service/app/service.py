@@ -27,6 +27,7 @@ from optipmb_service.app.edges import grpc_edge, monitoring
 from optipmb_service.app.kernels import warm_up
 from optipmb_service.app.loops import StopRequest, beat, say_ready, settle, unless
 from optipmb_service.cluster.member import Member
+from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import collectors
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.observability.metrics import Metrics
@@ -70,6 +71,7 @@ class Service:
 
     Raises:
         TransportError: the network cannot be used.
+        StoreError: the store cannot be used, and others use it.
     """
 
     def __init__(
@@ -86,10 +88,14 @@ class Service:
         self._began_ns = time.monotonic_ns()
         self._state = "starting"
         self._metrics = metrics or Metrics()
-        self._transport = Transport(settings)
+        store, keeps_nothing = open_store(settings, private)
+        try:
+            self._transport = Transport(settings)
+        except TransportError:
+            store.close(JOIN_S)
+            raise
         self._reporter = ProblemReporter(self._transport.publish_problem, _log_problem)
         self._scheduler = Scheduler()
-        store, keeps_nothing = open_store(settings, private)
         self._member = Member(settings.instance, store, settings.lease_s)
         self._persistence: Persistence = (
             CheckpointWriter(store, settings.checkpoint_s, self._member, self._unkept, settings.keep_days * DAY_S)
@@ -312,7 +318,7 @@ async def run(settings: Settings, profiles: Profiles, parent: Parent | None = No
         parent: the parent of a worker process; default: this process has none.
 
     Returns:
-        The exit status: 0, or 1 when the network could not be used.
+        The exit status: 0, or 1 when the network or the store could not be used.
     """
     parent = parent or NoParent(settings)
     loop = asyncio.get_running_loop()
@@ -327,7 +333,7 @@ async def run(settings: Settings, profiles: Profiles, parent: Parent | None = No
                 return await _serve(settings, profiles, asked, health, parent)
             finally:
                 beating.cancel()
-    except (TransportError, EdgeError) as error:
+    except (TransportError, EdgeError, StoreError) as error:
         print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
         return 1
 
@@ -339,6 +345,7 @@ async def _serve(
 
     Raises:
         TransportError: the network cannot be used.
+        StoreError: the store cannot be used, and others use it.
     """
     loop = asyncio.get_running_loop()
 

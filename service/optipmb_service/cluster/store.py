@@ -224,13 +224,11 @@ class SqliteStore:
         if member == self._member or self._members is None:
             return False
         try:
-            with self._lock_of(member).open("rb") as file:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            return not _locked(self._lock_of(member))
         except FileNotFoundError:
             return True
-        except OSError:  # it is held, or it cannot be found out
+        except OSError:  # it cannot be found out
             return False
-        return True
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
         """Write the newest checkpoints of streams in one transaction; return those that were refused."""
@@ -344,6 +342,24 @@ class SqliteStore:
                 if connection.in_transaction:
                     connection.execute("ROLLBACK")
                 raise
+
+
+def in_use(path: Path) -> bool:
+    """Whether a member lives that keeps its leases in a file."""
+    for lock in path.with_name(MEMBERS).glob("*"):
+        with contextlib.suppress(OSError):  # it has gone meanwhile
+            if _locked(lock):
+                return True
+    return False
+
+
+def _locked(path: Path) -> bool:
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 _T = TypeVar("_T")

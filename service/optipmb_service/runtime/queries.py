@@ -43,6 +43,9 @@ JSON = "application/json"
 MOVE_S = 15.0
 """How long a stream may take to be moved; it takes a second."""
 
+MOVES = 16
+"""Moves that wait for each other."""
+
 NO_SESSION = "0" * 32
 """Session id in the state of a stream that has none."""
 
@@ -78,13 +81,18 @@ class Queries:
         self._workers = workers
         self._keys = registry.keys
         self._moves = ThreadPoolExecutor(1, "move")
+        self._moving = threading.BoundedSemaphore(MOVES)
         self._digests = ThreadPoolExecutor(1, "digest")
 
     def about_service(self, request: Request) -> None:
         """Answer with the status of the service, its metrics, or both when the key has a `*`; or move a stream here."""
         instance = self._registry.instance
         if request.key == self._keys.move(instance):
-            self._moves.submit(_guarded, request, lambda: self._move(request))
+            if self._moving.acquire(blocking=False):
+                self._moves.submit(self._move_in_turn, request)
+            else:
+                many = schemas.MessageError("invalid_value", "worker", f"at most {MOVES} moves at a time", "more")
+                _guarded(request, lambda: request.refuse(self._problem("", many)))
             return
         _guarded(request, lambda: self._report(request, self._keys.status(instance), self._keys.metrics(instance)))
 
@@ -96,6 +104,12 @@ class Queries:
             request.answer(status, self._status())
         if request.matches(metrics):
             request.answer_text(metrics, self._metrics(), TEXT)
+
+    def _move_in_turn(self, request: Request) -> None:
+        try:
+            _guarded(request, lambda: self._move(request))
+        finally:
+            self._moving.release()
 
     def _move(self, request: Request) -> None:
         """Have a stream brought here, and say so."""

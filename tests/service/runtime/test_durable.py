@@ -11,10 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pytest
 from lease_log import Alone
 from optipmb_schemas import Keys, ServiceStatus, SessionState
 from optipmb_service.app.clustering import STORE_FILE
-from optipmb_service.cluster.store import SqliteStore
+from optipmb_service.cluster.leases import ALIVE, member_key
+from optipmb_service.cluster.store import SqliteStore, StoreError, Write
 from optipmb_service.runtime.persistence import CheckpointWriter
 from optipmb_service.session.session import Session
 from router import Node, Sensor, plain, until
@@ -24,8 +26,7 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    import pytest
-    from optipmb_service.cluster.store import Fenced, Write
+    from optipmb_service.cluster.store import Fenced
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -112,6 +113,19 @@ def test_a_store_that_cannot_be_opened_degrades(start: Callable[..., Any], tmp_p
         node.send(SENSOR.detections(0))
         node.tracks(SENSOR.stream, 1)
         assert node.ask(KEYS.status("test"), ServiceStatus).state == "degraded"
+
+
+def test_a_store_that_others_use_is_no_reason_for_one_of_its_own(start: Callable[..., Any], tmp_path: Path) -> None:
+    """While a member lives on a store, who cannot open it does not start: its streams would have two owners."""
+    other = SqliteStore(tmp_path / STORE_FILE)
+    assert other.put(Write(member_key("other/1"), ALIVE, 0))
+    for path in tmp_path.glob(f"{STORE_FILE}*"):
+        path.unlink()
+    (tmp_path / STORE_FILE).write_text("no database, and longer than the hundred bytes that are the head of one" * 2)
+    with pytest.raises(StoreError, match="not a database"):
+        start(store=str(tmp_path))
+    other.close()
+    start(store=str(tmp_path))
 
 
 def test_the_wall_clock_may_jump(start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
