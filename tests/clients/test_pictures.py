@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from optipmb_client.animation import animate_tracks
+from optipmb_client.animation import WIDTH_PX, animate_tracks
 from optipmb_client.datasets import DataSequence, Truth, open_dataset
 from optipmb_client.errors import ClientError
 from optipmb_client.evaluation import ClearResult, Rules, evaluate_clear
@@ -98,7 +98,7 @@ def test_a_gif_shows_every_frame_in_the_time_of_the_sequence(tmp_path: Path) -> 
         for one in range(getattr(picture, "n_frames", 1)):
             picture.seek(one)
             durations.append(picture.info["duration"])
-        assert (picture.width, durations) == (720, [100] * (len(sequence) - 1) + [1000])
+        assert (picture.width, durations) == (WIDTH_PX, [100] * (len(sequence) - 1) + [1000])
         shown = {colour for _, colour in picture.convert("RGB").getcolors(1 << 24) or ()}
     assert len(shown) > 10
 
