@@ -15,6 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 from optipmb_client.arguments import filled, spread
 from optipmb_client.commands.ablate import ablate
 from optipmb_client.commands.demo import demo
+from optipmb_client.commands.drain import drain
 from optipmb_client.commands.evaluate import evaluate
 from optipmb_client.commands.load import load
 from optipmb_client.commands.move import move
@@ -83,6 +84,7 @@ for command in (
     profiles,
     load,
     move,
+    drain,
     warm_up,
 ):
     paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")

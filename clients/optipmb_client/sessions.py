@@ -5,6 +5,7 @@ from typing import TypeVar
 
 from optipmb_schemas import (
     PREFIX,
+    DrainRequest,
     Keys,
     MessageError,
     MoveRequest,
@@ -22,13 +23,13 @@ from optipmb_client.errors import ServiceRefused, ServiceUnavailable
 from optipmb_client.links import Link
 from optipmb_client.transport import Answer, Connection
 
-__all__ = ["close_session", "find_services", "move_stream", "session_state", "set_parameters"]
+__all__ = ["close_session", "drain_service", "find_services", "move_stream", "session_state", "set_parameters"]
 
 QUERY_S = 2.0
 MOVE_S = 25.0
 RETRY_S = 0.1
 
-Message = TypeVar("Message", SessionParameters, SessionState, ServiceStatus, MoveRequest)
+Message = TypeVar("Message", SessionParameters, SessionState, ServiceStatus, MoveRequest, DrainRequest)
 
 
 def set_parameters(
@@ -90,6 +91,20 @@ def move_stream(connection: Connection, instance: str, stream: str, worker: int,
     if not asked:
         raise ServiceUnavailable(f"no service {instance} answers")
     _read(asked, MoveRequest)
+
+
+def drain_service(connection: Connection, member: str, *, drains: bool = True, prefix: str = PREFIX) -> None:
+    """Have a service, or a worker of one, give all its streams to others; with `drains` false, take a share again.
+
+    Raises:
+        ServiceUnavailable: No such service.
+        ServiceRefused: There is no other one, or it did not take all streams in time.
+    """
+    request = DrainRequest(drain=drains)
+    asked = connection.query(Keys(prefix).drain(member), encode(request), encoding_of(DrainRequest), timeout=MOVE_S)
+    if not asked:
+        raise ServiceUnavailable(f"no service {member} answers")
+    _read(asked, DrainRequest)
 
 
 def find_services(connection: Connection, *, prefix: str = PREFIX, patience_s: float = 1.0) -> list[ServiceStatus]:

@@ -1,13 +1,13 @@
-"""The services and streams of a network as a table."""
+"""The services, streams and members of a network as tables."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
-from optipmb_schemas import Problem, ServiceStatus, SessionSummary
+from optipmb_schemas import MemberSummary, Problem, ServiceStatus, SessionSummary
 from rich.console import Group, JustifyMethod, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-__all__ = ["duration", "render"]
+__all__ = ["duration", "members_of", "render"]
 
 COLUMNS = ("stream", "profile", "state", "frames/s", "p50 ms", "p99 ms", "frames", "tracks", "queue")
 COUNTED = ("refused", "shed", "gaps", "last frame")
@@ -15,6 +15,9 @@ TEXTS = 3
 """Columns of texts; the others are of numbers."""
 
 SHOWN_PROBLEMS = 5
+
+NAME = 32
+"""Characters of a member's name in a line."""
 
 
 def render(services: Sequence[ServiceStatus]) -> RenderableType:
@@ -25,7 +28,29 @@ def render(services: Sequence[ServiceStatus]) -> RenderableType:
         parts.append(Text(head + f"{service.frames} frames, {service.refused} refused", style="bold"))
         parts.append(_streams(service.sessions) if service.sessions else Text("no streams"))
         parts += [_problem(problem) for problem in service.problems[-SHOWN_PROBLEMS:]]
-    return Group(*parts)
+    members = members_of(services)
+    return Group(*parts, _members(members)) if len(members) > 1 else Group(*parts)
+
+
+def members_of(services: Iterable[ServiceStatus]) -> list[MemberSummary]:
+    """Return the members that services know, each as the one knows it that heard of it last, by name."""
+    members: dict[str, MemberSummary] = {}
+    for one in (member for service in services for member in service.members):
+        if one.member not in members or one.age_s < members[one.member].age_s:
+            members[one.member] = one
+    return [members[name] for name in sorted(members)]
+
+
+def _members(members: Sequence[MemberSummary]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    table.add_column("member", overflow="fold", max_width=NAME)
+    table.add_column("state")
+    for name in ("partitions", "lease age", "newest fence"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for one in members:
+        fence = str(max(one.fences)) if one.fences else ""
+        table.add_row(one.member, one.state, str(len(one.partitions)), duration(one.age_s), fence)
+    return table
 
 
 def _streams(sessions: Sequence[SessionSummary]) -> Table:

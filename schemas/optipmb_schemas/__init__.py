@@ -9,6 +9,8 @@ from optipmb_schemas.arrays import Array
 from optipmb_schemas.codec import MESSAGES, decode, encode, encode_json, encoding_of
 from optipmb_schemas.columns import pack_columns, read_columns
 from optipmb_schemas.control import (
+    DrainRequest,
+    MemberSummary,
     MoveRequest,
     Problem,
     ResetRequest,
@@ -46,11 +48,13 @@ __all__ = [
     "Delivery",
     "Density",
     "Detections",
+    "DrainRequest",
     "Dump",
     "DumpedFrame",
     "FieldOfView",
     "Keys",
     "Limits",
+    "MemberSummary",
     "Message",
     "MessageError",
     "MoveRequest",

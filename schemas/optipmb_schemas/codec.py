@@ -14,7 +14,15 @@ import numpy as np
 
 from optipmb_schemas.blocks import block_of, head_of, pack_large, read_array
 from optipmb_schemas.compact import read_detections
-from optipmb_schemas.control import MoveRequest, Problem, ResetRequest, ServiceStatus, SessionParameters, SessionState
+from optipmb_schemas.control import (
+    DrainRequest,
+    MoveRequest,
+    Problem,
+    ResetRequest,
+    ServiceStatus,
+    SessionParameters,
+    SessionState,
+)
 from optipmb_schemas.errors import MessageError, show
 from optipmb_schemas.limits import DEFAULT, Limits
 from optipmb_schemas.messages import Density, Detections, Points, Tracks
@@ -32,6 +40,7 @@ MESSAGES: Final[tuple[type[Message], ...]] = (
     SessionParameters,
     ResetRequest,
     MoveRequest,
+    DrainRequest,
     Problem,
     ServiceStatus,
 )

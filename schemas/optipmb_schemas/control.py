@@ -59,6 +59,15 @@ class MoveRequest(Message):
     worker: Count = Field(description="Number of the worker process, from 0; 0 for an instance without.")
 
 
+class DrainRequest(Message):
+    """Query `service/<instance>/q/drain`: give all streams to other members. The reply repeats it when that is done.
+
+    With workers, all of them do so. A member that drains takes no streams until it ends or is told otherwise.
+    """
+
+    drain: Flag = Field(default=True, description="False: take a share of the streams again.")
+
+
 class SessionState(Message):
     """Reply of `q/state` and `q/reset`: the state of one session.
 
@@ -161,6 +170,20 @@ class SessionSummary(Message):
     )
 
 
+class MemberSummary(Message):
+    """A member: one run of a process that tracks, with the leases of partitions that it holds."""
+
+    member: Text = Field(description="Name of the instance, `/`, and eight hexadecimal digits that no other run has.")
+    state: Word = Field(description="`alive`, or `draining`: it gives its partitions up and takes none.")
+    age_s: NonNegative = Field(description="Age of its lease: seconds since its last renewal was seen.")
+    partitions: tuple[Count, ...] = Field(
+        default=(), max_length=4096, fail_fast=True, description="Partitions that it holds."
+    )
+    fences: tuple[Count, ...] = Field(
+        default=(), max_length=4096, fail_fast=True, description="Fence of each of these leases."
+    )
+
+
 class ServiceStatus(Message):
     """Reply of `q/status`: the service instance, its sessions and its newest problems."""
 
@@ -174,6 +197,12 @@ class ServiceStatus(Message):
     )
     standby: Count = Field(
         default=0, description="Streams that another instance tracks and this one is ready to take over."
+    )
+    members: tuple[MemberSummary, ...] = Field(
+        default=(),
+        max_length=4096,
+        fail_fast=True,
+        description="The living members that share streams with this instance, itself among them, as it knows them.",
     )
     received: Count = Field(
         default=0,

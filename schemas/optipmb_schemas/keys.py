@@ -4,7 +4,7 @@
 <prefix>/<stream>/q/state | q/density | q/reset | q/parameters    queries
 <prefix>/owner/<stream>/<instance>                            liveliness: who tracks this stream
 <prefix>/service/<instance>/alive                             liveliness: which services are there
-<prefix>/service/<instance>/q/status | q/metrics | q/move     queries
+<prefix>/service/<instance>/q/status | q/metrics | q/move | q/drain     queries
 """
 
 from collections.abc import Callable
@@ -73,6 +73,10 @@ class Keys:
     def move(self, instance: str) -> str:
         """Return the key of the query that moves a stream between the workers of an instance."""
         return f"{self.prefix}/service/{_instance(instance)}/q/move"
+
+    def drain(self, instance: str) -> str:
+        """Return the key of the query that has an instance give its streams to others."""
+        return f"{self.prefix}/service/{_instance(instance)}/q/drain"
 
     def all(self, topic: Topic) -> str:
         """Return the key expression of a topic of all streams."""

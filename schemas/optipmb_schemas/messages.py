@@ -174,7 +174,7 @@ class Delivery(Message):
     step_ms: NonNegative = Field(description="Milliseconds spent in the tracker.")
     run: Count = Field(
         default=0,
-        description="How often the session was taken up again after a stop of the service. Tracks of a later run "
+        description="Grows whenever a process begins to track the stream or goes on with it. Tracks of a later run "
         "replace those of an earlier one for the same `epoch` and `seq`, whatever their revisions.",
     )
 

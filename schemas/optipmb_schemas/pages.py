@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 
 from optipmb_schemas.codec import MESSAGES
-from optipmb_schemas.control import SessionState, SessionSummary
+from optipmb_schemas.control import MemberSummary, SessionState, SessionSummary
 from optipmb_schemas.errors import CODES
 from optipmb_schemas.limits import DEFAULT
 from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Pose, Tracks
@@ -20,7 +20,7 @@ from optipmb_schemas.model import Message
 
 _TABLE: Final = re.compile(r"(<!-- table: ([A-Za-z]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
-_KINDS: Final[tuple[type[Message], ...]] = (*MESSAGES, Pose, FieldOfView, Delivery, SessionSummary)
+_KINDS: Final[tuple[type[Message], ...]] = (*MESSAGES, Pose, FieldOfView, Delivery, MemberSummary, SessionSummary)
 _KIND: Final = {kind.__name__: kind for kind in _KINDS}
 
 

@@ -10,7 +10,7 @@ from fleet import Fleet
 from optipmb_client import Publisher
 from optipmb_schemas import ServiceStatus
 from router import Node, until
-from takeovers import KEYS, SENSOR, check, send
+from takeovers import KEYS, SENSOR, check, published_by, send
 
 import optipmb
 
@@ -65,6 +65,22 @@ def test_a_router_that_is_killed(tmp_path: Path) -> None:
         send(node, 40, 45)
         state = check(node, 45, owner="a")
         assert state.duplicates + state.frames == state.received
+
+
+@pytest.mark.timeout(600)
+def test_killed_before_its_first_checkpoint(tmp_path: Path) -> None:
+    """Fault 2: whoever begins the session once more publishes under a higher run, which replaces the others."""
+    with Fleet(tmp_path, checkpoint_s=3600.0) as fleet, Node(fleet.endpoint) as node:
+        runs: list[set[int]] = []
+        for instance in "abc":
+            service = fleet.service(instance)
+            node.send(*(SENSOR.detections(seq) for seq in range(5)))
+            until(lambda instance=instance: len(published_by(node, instance)) == 5, "its tracks")  # type: ignore[misc]  # bound now
+            runs.append({one.delivery.run for one in published_by(node, instance) if one.delivery})
+            service.process.kill()
+            service.process.wait()
+    assert [len(one) for one in runs] == [1, 1, 1]
+    assert max(runs[0]) < max(runs[1]) < max(runs[2])
 
 
 @pytest.mark.timeout(600)

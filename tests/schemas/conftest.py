@@ -8,6 +8,7 @@ from optipmb_schemas import (
     Delivery,
     Density,
     Detections,
+    DrainRequest,
     FieldOfView,
     Message,
     MoveRequest,
@@ -138,6 +139,7 @@ def _examples() -> list[Message]:
         parameters,
         ResetRequest(close=True),
         MoveRequest(stream="a/b/c", worker=1),
+        DrainRequest(drain=False),
         problem,
         status,
     ]

@@ -108,7 +108,7 @@ def test_all_keys_are_on_the_page() -> None:
     made = [getattr(keys, topic)(stream) for topic in get_args(Topic)]
     made += [keys.query(stream, query) for query in get_args(Query)]
     made += [keys.owner(stream, "instance"), keys.alive("instance")]
-    made += [keys.status("instance"), keys.metrics("instance"), keys.move("instance")]
+    made += [keys.status("instance"), keys.metrics("instance"), keys.move("instance"), keys.drain("instance")]
     said = [re.sub(r"[<>]", "", key) for key in re.findall(r"^\| `(optipmb/v1/[^`]*)`", PAGE, re.MULTILINE)]
     assert sorted(said) == sorted(made)
     assert f"`{keys.all_queries('state')}`" in PAGE

@@ -13,6 +13,7 @@ from optipmb_schemas import (
     Delivery,
     Density,
     Detections,
+    DrainRequest,
     Message,
     MoveRequest,
     Points,
@@ -246,6 +247,7 @@ messages: dict[type[Message], st.SearchStrategy[Message]] = {
     ),
     ResetRequest: st.builds(ResetRequest, close=st.booleans()),
     MoveRequest: st.builds(MoveRequest, stream=stream, worker=st.integers(0, 63)),
+    DrainRequest: st.builds(DrainRequest, drain=st.booleans()),
     Problem: problems,
     ServiceStatus: st.builds(
         ServiceStatus,

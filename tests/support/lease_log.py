@@ -125,6 +125,11 @@ class Alone:
         now = self._store.get(key)
         return self._store.put(Write(key, "alone", now.revision if now else 0))
 
+    def leave(self) -> None:
+        """Hold nothing any more."""
+        for number, fence in enumerate(self._fences):
+            self._store.put(Write(partition_key(number), "", fence or 0))
+
     def fence(self, stream: str) -> int | None:
         """Return the fence of a stream."""
         return self._fences[partition_of(stream)]

@@ -21,7 +21,7 @@ from optipmb_service.observability.health import STUCK_S
 from optipmb_service.observability.metrics import Collected, ReadOnDemand, families
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.ports import TransportError
-from optipmb_service.runtime.queries import move_asked
+from optipmb_service.runtime.queries import drain_asked, move_asked
 from optipmb_service.session.problems import problem_of
 
 if TYPE_CHECKING:
@@ -152,14 +152,16 @@ class AggregateView:
             for session in part.sessions
         ]
         state = self.state()
+        drains = state == "ready" and bool(answered) and all(part.state == "draining" for part in answered)
         well = len(answered) == self._workers.count and all(part.state == "ready" for part in answered)
         return schemas.ServiceStatus(
             instance=self._instance,
             version=__version__,
             started_ns=self._started_ns,
             uptime_s=(time.monotonic_ns() - self._began_ns) / 1e9,
-            state="degraded" if state == "ready" and not well else state,
+            state="draining" if drains else "degraded" if state == "ready" and not well else state,
             sessions=tuple(sorted(sessions, key=lambda session: session.stream)[:SESSIONS]),
+            members=_newest(answered),
             problems=tuple(problem for part in answered for problem in part.problems)[-PROBLEMS:],
             **sums,
         )
@@ -178,12 +180,12 @@ class AggregateView:
 
     def answer(self, request: Request) -> None:
         """Answer a query about the instance, and finish it whatever happens."""
-        status, metrics, move = (
-            make(self._instance) for make in (self._keys.status, self._keys.metrics, self._keys.move)
-        )
+        keys = self._keys
+        status, metrics = keys.status(self._instance), keys.metrics(self._instance)
+        orders = {keys.move(self._instance): self._move, keys.drain(self._instance): self._drain}
         try:
-            if request.key == move:
-                self._move(request)
+            if request.key in orders:
+                orders[request.key](request)
                 return
             if request.matches(status):
                 request.answer(status, self.status())
@@ -207,6 +209,28 @@ class AggregateView:
         if self._network.ask(key, MOVE_S, request.payload or b"", request.encoding) is None:
             raise schemas.MessageError("invalid_value", "worker", "a worker to which the stream comes", "none in time")
         request.answer(request.key, asked)
+
+    def _drain(self, request: Request) -> None:
+        """Have all workers leave their streams.
+
+        Raises:
+            MessageError: what was asked cannot be.
+        """
+        asked = drain_asked(request, self._limits)
+        own = {f"{self._instance}-w{index}" for index in range(self._workers.count)}
+        if asked.drain and all(one.member.rpartition("/")[0] in own or one.state != "alive" for one in self._members()):
+            raise schemas.MessageError("invalid_value", "drain", "another member that takes the streams", "none")
+        keys = [self._keys.drain(name) for name in sorted(own)]
+        payload, encoding = schemas.encode(asked), schemas.encoding_of(schemas.DrainRequest)
+        answers = list(self._asking.map(lambda key: self._network.ask(key, MOVE_S, payload, encoding), keys))
+        if None in answers:
+            raise schemas.MessageError("invalid_value", "drain", "members that take the streams", "not all in time")
+        request.answer(request.key, asked)
+
+    def _members(self) -> tuple[schemas.MemberSummary, ...]:
+        """Return what the workers know of members, of each what was heard last."""
+        answers = [one for one in self._ask(self._keys.status) if one is not None]
+        return _newest(schemas.decode(answer, schemas.ServiceStatus) for answer in answers)
 
     # The parts
 
@@ -247,3 +271,12 @@ class AggregateView:
             received=error.received,
             message=f"Query: {error.path or 'payload'}: expected {error.expected}, received {error.received}.",
         )
+
+
+def _newest(parts: Iterable[schemas.ServiceStatus]) -> tuple[schemas.MemberSummary, ...]:
+    """Return the members that workers know, each as the one knows it that heard of it last."""
+    members: dict[str, schemas.MemberSummary] = {}
+    for one in (member for part in parts for member in part.members):
+        if one.member not in members or one.age_s < members[one.member].age_s:
+            members[one.member] = one
+    return tuple(members[name] for name in sorted(members))

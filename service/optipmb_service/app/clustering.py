@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from optipmb_service.cluster.store import SqliteStore, StoreError, in_use
+from optipmb_service.cluster.sqlite import SqliteStore, in_use
+from optipmb_service.cluster.store import StoreError
 from optipmb_service.runtime.persistence import DAY_S
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 STORE_FILE: Final = "sessions.db"
-LEASES_FILE: Final = "leases.db"
 
 
 def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, str | None]:
@@ -48,4 +48,4 @@ def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, st
             # Tracking without memory is better than none; the status says that it is so.
             log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
             why = str(error)
-    return SqliteStore(private and private / LEASES_FILE), why
+    return SqliteStore(private and private / STORE_FILE), why

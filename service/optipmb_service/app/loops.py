@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 SWITCH_S: Final = 0.0005
 """By default it is ten times as long, and a frame that meets two other threads waits 10 ms."""
 
+HANDOVER_S: Final = 4.0
+"""At the end, how long other members may take to have the streams; it takes a second."""
+
 log = structlog.get_logger("optipmb_service")
 
 _T = TypeVar("_T")

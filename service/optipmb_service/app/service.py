@@ -5,8 +5,8 @@ second the streams that fell silent and the summaries of problems. Messages neve
 thread to a stream's mailbox to a worker thread.
 
 Start: read the profiles, compile the kernels, open Zenoh, subscribe, answer queries, say alive, print the ready line.
-End (SIGINT, SIGTERM): withdraw the alive token, stop receiving, track what was received as long as the grace lasts,
-close.
+End (SIGINT, SIGTERM): withdraw the alive token, let other members take the streams over, stop receiving, track what was
+received as long as the grace lasts, close.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from optipmb_service import __version__
 from optipmb_service.app.clustering import open_store
 from optipmb_service.app.edges import grpc_edge, monitoring
 from optipmb_service.app.kernels import warm_up
-from optipmb_service.app.loops import StopRequest, beat, say_ready, settle, unless
+from optipmb_service.app.loops import HANDOVER_S, StopRequest, beat, say_ready, settle, unless
 from optipmb_service.cluster.member import Member
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import collectors
@@ -34,7 +34,7 @@ from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter
 from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter, NoPersistence
 from optipmb_service.runtime.ports import EdgeError, TransportError
-from optipmb_service.runtime.queries import Queries
+from optipmb_service.runtime.queries import Queries, members_of
 from optipmb_service.runtime.registry import Registry
 from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session.problems import problem_of
@@ -56,6 +56,8 @@ log = structlog.get_logger("optipmb_service")
 HOUSEKEEPING_S: Final = 0.5
 DRAIN_POLL_S: Final = 0.01
 JOIN_S: Final = 0.3
+STORE_S: Final = 3.0
+"""How long a slow store is waited for at the end, for what is to be kept and to say that the leases are free."""
 
 
 class Service:
@@ -120,7 +122,7 @@ class Service:
             self.status,
             self._metrics.text,
             self._metrics.samples,
-            self._member.bring,
+            self._member,
             settings.workers,
         )
 
@@ -143,8 +145,11 @@ class Service:
         self._reporter.flush(now_ns)
 
     def stop(self) -> bool:
-        """Track what was received, within the grace, and close; False when a step would not end."""
+        """Let others go on, track what was received, within the grace, and close; False when a step would not end."""
         self._state = "stopping"
+        self._transport.leave()
+        self._member.drain()
+        self._member.drained(HANDOVER_S)
         ends = time.monotonic() + self._settings.grace_s
         self._transport.stop(JOIN_S)
         if not self._persistence.durable:
@@ -154,8 +159,8 @@ class Service:
         ended = self._scheduler.close(JOIN_S)
         if ended:
             self._registry.keep_now()
-        self._persistence.close(JOIN_S)
-        self._member.close(JOIN_S)
+        self._persistence.close(STORE_S)
+        self._member.close(STORE_S)
         self._reporter.flush(time.monotonic_ns())
         self._transport.close()
         return ended
@@ -172,13 +177,18 @@ class Service:
 
     @property
     def state(self) -> str:
-        """What the service is: starting, ready, degraded (it tracks, and cannot keep checkpoints), paused or stopping.
+        """What the service is: starting, ready, degraded, paused, draining or stopping.
 
-        Paused: it may not publish, for it has no lease.
+        Degraded: it tracks, and cannot keep checkpoints. Paused: it may not publish, for it has no lease. Draining: it
+        leaves its streams to others, or has.
         """
         if self._state != "ready":
             return self._state
-        return "paused" if self._member.failure else "degraded" if self._persistence.failure else "ready"
+        if self._member.failure:
+            return "paused"
+        if self._member.draining:
+            return "draining"
+        return "degraded" if self._persistence.failure else "ready"
 
     def status(self) -> schemas.ServiceStatus:
         """Return the answer to `q/status`."""
@@ -192,6 +202,7 @@ class Service:
             state=self.state,
             sessions=self._summaries(now_ns),
             standby=self._registry.standing_by,
+            members=members_of(self._member.leases()),
             received=totals.received,
             frames=totals.frames,
             duplicates=totals.duplicates,

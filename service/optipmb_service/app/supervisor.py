@@ -21,7 +21,7 @@ import structlog
 from optipmb_service import __version__
 from optipmb_service.app.aggregate import AggregateView
 from optipmb_service.app.edges import grpc_edge, monitoring
-from optipmb_service.app.loops import StopRequest, beat, say_ready, unless
+from optipmb_service.app.loops import HANDOVER_S, StopRequest, beat, say_ready, unless
 from optipmb_service.app.private_folder import private_folder
 from optipmb_service.app.worker_process import WorkerProcess
 from optipmb_service.observability.health import BEAT_S
@@ -44,7 +44,7 @@ LATE_S: Final = 2.0
 """A control loop that turns so late was frozen, or starved, and knows nothing of its workers."""
 
 END_S: Final = 3.0
-"""Beyond the grace, how long workers may take to end before they are killed."""
+"""Beyond grace and handover, how long workers may take to end before they are killed."""
 
 State = Literal["starting", "ready", "down"]
 
@@ -101,7 +101,7 @@ class Supervisor:
                 child.end()
         if not self._tasks:
             return True
-        _, late = await asyncio.wait(self._tasks, timeout=self._settings.grace_s + END_S)
+        _, late = await asyncio.wait(self._tasks, timeout=self._settings.grace_s + HANDOVER_S + END_S)
         for child in self._children:
             if child is not None:
                 child.kill()

@@ -22,7 +22,7 @@ import structlog
 
 import optipmb
 from optipmb_service.app.kernels import warm_up
-from optipmb_service.app.loops import leave
+from optipmb_service.app.loops import HANDOVER_S, leave
 from optipmb_service.app.service import run
 from optipmb_service.observability import logs
 from optipmb_service.runtime.profiles import Profiles
@@ -39,7 +39,7 @@ LOCK: Final = "lock"
 """File that one worker at a time holds while it compiles."""
 
 LAST_S: Final = 5.0
-"""Beyond the grace, how long a worker without a parent may take to end."""
+"""Beyond grace and handover, how long a worker without a parent may take to end."""
 
 
 class SupervisingParent:
@@ -85,7 +85,7 @@ class SupervisingParent:
             pass
         asked.ask_threadsafe("parent")
         # Nobody is left who would kill a worker that hangs.
-        time.sleep(self._settings.grace_s + LAST_S)
+        time.sleep(self._settings.grace_s + HANDOVER_S + LAST_S)
         os._exit(1)
 
     def _say(self, **event: object) -> None:

@@ -17,6 +17,7 @@ import json
 import re
 import threading
 from concurrent.futures import CancelledError
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import structlog
@@ -48,6 +49,7 @@ BATCH: Final = 1024
 """Records read at once."""
 
 SAVED_AT_ONCE: Final = 8
+SAVED_IN_A_CALL: Final = 32
 MEMBER_TTL_S: Final = 3600
 """Age at which the server forgets the record of a member that has ended."""
 
@@ -122,7 +124,11 @@ class JetStream:
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
         """Write the newest checkpoints of streams; return those that were refused for their fence."""
-        return self._call(self._save(checkpoints), len(checkpoints))
+        refused: frozenset[str] = frozenset()
+        left = iter(checkpoints.items())
+        while some := dict(islice(left, SAVED_IN_A_CALL)):  # a server that is stuck is waited for once
+            refused |= self._call(self._save(some), len(some))
+        return refused
 
     def load(self, stream: str) -> bytes | None:
         """Return the newest checkpoint of a stream, None without one."""

@@ -17,7 +17,9 @@ it. No clock is ever compared with another one.
 
 Every member computes from the living ones how many partitions each is to have, within one of an equal share, leaves
 what it has beyond that, and takes what is free up to it. `wish/<number>` names the instance that an operator wants to
-have a partition: while such a member lives, no other takes it, and who holds it leaves it.
+have a partition: while such a member lives, no other takes it, and who holds it leaves it. A member that drains says
+so in its record: its share is nothing, the others have it. Partitions are left a few at a time, so that the streams of
+one wait for nothing but their own restoring.
 """
 
 from __future__ import annotations
@@ -36,6 +38,9 @@ if TYPE_CHECKING:
 
 PARTITIONS: Final = 64
 ALIVE: Final = "alive"
+DRAINING: Final = "draining"
+"""What the record of a member says that gives its partitions up."""
+
 NOBODY: Final = ""
 
 LEAVE_LEASES: Final = 4
@@ -43,6 +48,9 @@ LEAVE_LEASES: Final = 4
 
 WATCHED: Final = 2
 """A pause between two looks at the records that is longer than a lease divided by this does not count as watching."""
+
+LEFT_AT_ONCE: Final = 8
+"""Partitions that a member leaves at the same time."""
 
 MAX_ENDED: Final = 1024
 """Members that have ended and are remembered."""
@@ -111,9 +119,30 @@ class WriteLease:
 @dataclass(slots=True)
 class _Watched:
     revision: int
-    alive: bool
+    state: str
     seen_ns: int
     """When its newest revision was seen first."""
+
+    @property
+    def alive(self) -> bool:
+        return self.state != ENDED
+
+
+@dataclass(frozen=True, slots=True)
+class MemberLease:
+    """A living member, as another one knows it.
+
+    Attributes:
+        member: its id.
+        state: `alive` or `draining`.
+        age_ns: since its newest renewal was seen.
+        fences: the partitions that it holds, each with its fence.
+    """
+
+    member: str
+    state: str
+    age_ns: int
+    fences: dict[int, int]
 
 
 @dataclass
@@ -126,6 +155,9 @@ class LeaseTable:
         position: the highest revision seen.
         held: partitions that it holds, each with its fence; may be read by any thread.
         leaving: of these, those that it is about to leave, since when.
+        draining: whether it is to hold none.
+        wanting: whether it has fewer partitions than it is to have.
+        changed_ns: when something but a renewal was seen last.
     """
 
     member: str
@@ -133,6 +165,9 @@ class LeaseTable:
     position: int = 0
     held: dict[int, int] = field(default_factory=dict)
     leaving: dict[int, int] = field(default_factory=dict)
+    draining: bool = False
+    wanting: bool = False
+    changed_ns: int = 0
     _members: dict[str, _Watched] = field(default_factory=dict)
     _partitions: dict[int, tuple[int, str]] = field(default_factory=dict)
     _wishes: dict[int, str] = field(default_factory=dict)
@@ -150,13 +185,15 @@ class LeaseTable:
             kind, _, name = record.key.partition("/")
             if kind == "member":
                 self._take_in_member(name, record, now_ns)
-            elif kind == "wish":
+                continue
+            self.changed_ns = now_ns
+            if kind == "wish":
                 self._wishes[int(name)] = record.value
             elif record.revision > self._partitions.get(int(name), (0, NOBODY))[0]:
                 self._set(int(name), record.revision, record.value)
         for _, holder in self._partitions.values():
             if holder not in {NOBODY, self.member}:
-                self._members.setdefault(holder, _Watched(0, alive=True, seen_ns=now_ns))
+                self._members.setdefault(holder, _Watched(0, ALIVE, now_ns))
         ended = [name for name, one in self._members.items() if not one.alive]
         for name in ended[: max(0, len(ended) - MAX_ENDED)]:
             del self._members[name]
@@ -164,7 +201,9 @@ class LeaseTable:
     def _take_in_member(self, name: str, record: Record, now_ns: int) -> None:
         known = self._members.get(name)
         if name != self.member and (known is None or record.revision > known.revision):
-            self._members[name] = _Watched(record.revision, record.value == ALIVE, now_ns)
+            if known is None or known.state != record.value:
+                self.changed_ns = now_ns
+            self._members[name] = _Watched(record.revision, record.value, now_ns)
 
     def _set(self, partition: int, revision: int, holder: str) -> None:
         self._partitions[partition] = revision, holder
@@ -177,6 +216,23 @@ class LeaseTable:
     def members(self) -> list[str]:
         """Return the living members with this one, by id."""
         return sorted([self.member, *(name for name, one in self._members.items() if one.alive)])
+
+    def takers(self) -> list[str]:
+        """Return the living members that do not drain, by id."""
+        others = [name for name, one in self._members.items() if one.alive and one.state != DRAINING]
+        return sorted(others if self.draining else [self.member, *others])
+
+    def leases(self, renewed_ns: int, now_ns: int) -> list[MemberLease]:
+        """Return the living members, by id; this one has renewed its record at `renewed_ns`."""
+        held: dict[str, dict[int, int]] = {}
+        for partition, (fence, holder) in sorted(tuple(self._partitions.items())):  # noqa: C414 - in one go, for the member's thread writes it
+            held.setdefault(holder, {})[partition] = fence
+        own = DRAINING if self.draining else ALIVE
+        known = [(name, one.state, one.seen_ns) for name, one in tuple(self._members.items()) if one.alive]
+        return [
+            MemberLease(name, state, max(0, now_ns - seen_ns), held.get(name, {}))
+            for name, state, seen_ns in sorted([(self.member, own, renewed_ns), *known])
+        ]
 
     def holds(self, partition: int) -> bool:
         """Whether sessions of a partition may begin here; may be called by any thread."""
@@ -204,10 +260,15 @@ class LeaseTable:
         mine, others = self._wished()
         # What is wished goes before an equal share.
         room = self._share() - len(mine)
-        for partition in sorted(self.held.keys() - self.leaving.keys() - mine):
-            room -= partition not in others
-            if partition in others or room < 0:
+        wished = self.held.keys() & others
+        surplus = []
+        for partition in sorted(self.held.keys() - self.leaving.keys() - mine - wished):
+            room -= 1
+            surplus += [partition] if room < 0 else []
+        for partition in [*sorted(wished - self.leaving.keys()), *surplus]:
+            if len(self.leaving) < LEFT_AT_ONCE:
                 self.leaving[partition] = now_ns
+        self.wanting = room > 0 or not mine <= self.held.keys()
         first = int.from_bytes(blake2b(self.member.encode(), digest_size=8).digest())
         for offset in range(PARTITIONS):  # each begins elsewhere, so that members seldom want the same one
             partition = (first + offset) % PARTITIONS
@@ -235,19 +296,25 @@ class LeaseTable:
             return
         kind, _, name = write.key.partition("/")
         if kind == "member":
-            self._members[name] = _Watched(revision, alive=False, seen_ns=0)
+            self._members[name] = _Watched(revision, ENDED, 0)
         else:
             self._set(int(name), revision, write.value)
 
     def _share(self) -> int:
         """Return how many of all partitions are an equal share of this member."""
-        members = self.members()
+        if self.draining:
+            return 0
+        members = self.takers()
         each, rest = divmod(PARTITIONS, len(members))
         return each + (members.index(self.member) < rest)
 
     def _wished(self) -> tuple[set[int], set[int]]:
         """Return the partitions that this member is to have by a wish, and those that another living one is to have."""
-        own, living = instance_of(self.member), {instance_of(name) for name in self.members()}
-        mine = {partition for partition, to in self._wishes.items() if to == own and not self.taken(partition, own)}
+        own, living = instance_of(self.member), {instance_of(name) for name in self.takers()}
+        mine = {
+            partition
+            for partition, to in self._wishes.items()
+            if to == own in living and not self.taken(partition, own)
+        }
         others = {partition for partition, to in self._wishes.items() if to in living}
         return mine, others - mine

@@ -14,9 +14,11 @@ import structlog
 
 from optipmb_service.cluster.leases import (
     ALIVE,
+    DRAINING,
     PARTITIONS,
     Change,
     LeaseTable,
+    MemberLease,
     WriteLease,
     instance_of,
     member_key,
@@ -37,8 +39,14 @@ LOOKS_PER_LEASE: Final = 20
 LONGEST_LOOK_S: Final = 0.1
 """Of a store on the same machine: how late a killed member may be noticed."""
 
+SHORT_LOOK_S: Final = 0.02
+"""While partitions change hands: each is held by nobody for as long."""
+
 RENEWALS_PER_LEASE: Final = 10
 WRITE_LEASES_PER_LEASE: Final = 2
+RETRY_S: Final = 0.1
+"""At the end, between two tries to say so."""
+
 FIRST_TURNS: Final = 3
 """Turns in which who begins has ended those that are gone, and has all that is free."""
 
@@ -69,6 +77,8 @@ class Member:
         self._error = "not a member yet"
         self._failing = False
         self._unwritable = False
+        self._value = ALIVE
+        self._said = ALIVE
         self._shown: tuple[list[str], int] = ([], 0)
         self._told: dict[int, int] = {}
         self._recalled: set[int] = set()
@@ -77,6 +87,7 @@ class Member:
         self._resumed: Callable[[], None] = lambda: None
         self._occupied: Callable[[], Container[int]] = frozenset
         self._wake = threading.Event()
+        self._ends_ns = 0
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="member", daemon=True)
 
@@ -135,8 +146,33 @@ class Member:
         with self._came:
             return self._came.wait_for(lambda: self._table.holds(partition), timeout)
 
+    @property
+    def draining(self) -> bool:
+        """Whether it gives its partitions up and takes none."""
+        return self._value == DRAINING
+
+    @property
+    def others(self) -> bool:
+        """Whether another living member would take what this one leaves."""
+        return any(name != self._table.member for name in self._table.takers())
+
+    def drain(self, *, drains: bool = True) -> None:
+        """Give up all partitions, each with the states of its streams, and take none; or take a share again."""
+        self._value = DRAINING if drains else ALIVE
+        self._wake.set()
+
+    def drained(self, timeout: float) -> bool:
+        """Wait until nothing is held, or nobody is there to take it, at most so long (s); False when that was it."""
+        with self._came:
+            return self._came.wait_for(lambda: not (self._table.held and self.others), timeout)
+
+    def leases(self) -> list[MemberLease]:
+        """Return the living members as this one knows them."""
+        return self._table.leases(self._renewed_ns, self._clock()) if self._revision else []
+
     def close(self, timeout: float) -> None:
-        """Leave all partitions, say that this member has ended, and leave the store."""
+        """Leave all partitions, say that this member has ended, and leave the store; a slow one is waited for."""
+        self._ends_ns = self._clock() + round(timeout * SECOND)
         self._ending.set()
         self._wake.set()
         if self._thread.is_alive():
@@ -147,13 +183,20 @@ class Member:
 
     def _run(self) -> None:
         while not self._ending.is_set():
-            self._wake.wait(self._look_s)
+            hurries = self._table.wanting and self._clock() - self._table.changed_ns < self._lease_ns
+            self._wake.wait(min(self._look_s, SHORT_LOOK_S) if hurries else self._look_s)
             self._wake.clear()
             self._step()
-        try:
-            self._end()
-        except StoreError as error:
-            log.warning("leases_failed", error=str(error))
+        while True:
+            try:
+                self._end()
+            except StoreError as error:
+                if self._clock() < self._ends_ns:
+                    self._wake.wait(RETRY_S)
+                    self._wake.clear()
+                    continue
+                log.warning("leases_failed", error=str(error))
+            return
 
     def _step(self) -> None:
         for part in (self._turn, self._settle):
@@ -166,6 +209,7 @@ class Member:
 
     def _turn(self) -> None:
         """Renew, look, write what is due."""
+        self._table.draining = self.draining
         if not self._keep():
             return
         records, now_ns = self._store.follow(self._table.position), self._clock()
@@ -179,21 +223,25 @@ class Member:
     def _keep(self) -> bool:
         """Renew this member's record if it is time to; False: nothing else can be done now."""
         sent_ns = self._clock()
-        if self._revision and sent_ns - self._renewed_ns < self._lease_ns // RENEWALS_PER_LEASE:
+        value = self._value
+        due = sent_ns - self._renewed_ns >= self._lease_ns // RENEWALS_PER_LEASE or value != self._said
+        if self._revision and not due:
             return not self._unwritable
         key = member_key(self._table.member)
-        revision = self._put_alive(key)
+        revision = self._put_alive(key, value)
         if revision is None:
             found = self._store.get(key)
-            if found is None or found.value != ALIVE:
+            if found is None or found.value == ENDED:
                 self._lose()
                 return False
             # A renewal of its own, whose answer did not arrive.
             sent_ns = self._clock()
-            revision = self._store.put(Write(key, ALIVE, found.revision))
+            revision = self._store.put(Write(key, value, found.revision))
             if revision is None:
                 return False
         was = self._write_lease.valid(self._clock())
+        if not self._unwritable:
+            self._said = value
         self._revision, self._renewed_ns, self._error = revision, sent_ns, "its lease has lapsed"
         self._write_lease.renew(sent_ns)
         if self._failing:
@@ -203,15 +251,15 @@ class Member:
             self._resumed()
         return not self._unwritable
 
-    def _put_alive(self, key: str) -> int | None:
+    def _put_alive(self, key: str, value: str) -> int | None:
         """Renew this member's record; return its revision, None when another one is the newest."""
         try:
-            revision = self._store.put(Write(key, ALIVE, self._revision))
+            revision = self._store.put(Write(key, value, self._revision))
         except StoreError:
             # A full or read-only disk: no member can write, so none is ended, and each goes on while its record stands.
             # Whoever can write again has not looked meanwhile, and counts every lease anew.
             found = None if self._store.remote else self._store.get(key)
-            if found is None or found != (key, ALIVE, self._revision):
+            if found is None or found.revision != self._revision:
                 raise
             self._unwritable = True
             return self._revision
@@ -259,5 +307,8 @@ class Member:
     def _end(self) -> None:
         """Say that this member has ended: its partitions are free then. What is to be kept has been saved."""
         self._write_lease.lapse()
-        if self._revision:
-            self._store.put(Write(member_key(self._table.member), ENDED, self._revision))
+        key = member_key(self._table.member)
+        if self._revision and self._store.put(Write(key, ENDED, self._revision)) is None:
+            found = self._store.get(key)
+            if found is not None and found.value != ENDED:  # a renewal of its own, whose answer did not arrive
+                self._store.put(Write(key, ENDED, found.revision))

@@ -48,6 +48,8 @@ SHOWN: Final = 3
 SETTLE_S: Final = 0.25
 """Between a checkpoint and its writing, time for the tracks to leave."""
 
+LEAVE_SETTLE_S: Final = 0.03
+"""The same where a stream is left and another member waits for it: this process is about to do nothing else."""
 
 RETRY_S: Final = 0.1
 """Between two tries to read from a store that cannot be reached."""
@@ -262,13 +264,22 @@ class CheckpointWriter:
         self._write()
 
     def _run(self) -> None:
-        while not self._ended.is_set():
-            self._hurry.wait(max(0.0, self._interval_s - SETTLE_S))
-            self._hurry.clear()
+        while self._serve(max(0.0, self._interval_s - SETTLE_S)):
             self._expire()
             self._gather()
-            if not self._ended.wait(SETTLE_S):
+            if self._serve(SETTLE_S):
                 self._write()
+
+    def _serve(self, seconds: float) -> bool:
+        """For so long write at once what somebody waits for, and nothing else; False at the end."""
+        ends = time.monotonic() + seconds
+        while not self._ended.is_set():
+            if not self._hurry.wait(max(0.0, ends - time.monotonic())):
+                return True
+            self._hurry.clear()
+            if not self._ended.wait(LEAVE_SETTLE_S):
+                self._write(waited_for=True)
+        return False
 
     def _expire(self) -> None:
         """Forget what has been silent for too long, now and then."""
@@ -279,14 +290,21 @@ class CheckpointWriter:
         try:
             if gone := self._store.expire(self._keep_s):
                 log.info("checkpoints_expired", streams=gone)
+                self._expires_ns = now_ns  # the next ones in the next round: checkpoints go first
         except StoreError as error:
             self._failed(error)
 
-    def _write(self) -> None:
-        """Write all that is pending; what the store refuses, and what must wait for a write lease, stays pending."""
+    def _write(self, *, waited_for: bool = False) -> None:
+        """Write all that is pending; what the store refuses, and what must wait for a write lease, stays pending.
+
+        Args:
+            waited_for: write only what somebody waits for.
+        """
         with self._lock:
-            taken, self._pending = self._pending, {}
             thens, self._thens = self._thens, []
+            streams = {stream for stream, _ in thens} if waited_for else self._pending.keys()
+            taken = {stream: one for stream, one in self._pending.items() if stream in streams}
+            self._pending = {stream: one for stream, one in self._pending.items() if stream not in streams}
         mine = {stream: one for stream, one in taken.items() if self._leases.may_write(stream, one[1])}
         # A lease that lapsed is renewed, or the stream is lost: until that is known its newest state is kept.
         later = {

@@ -25,8 +25,10 @@ from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import RefusedError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
+    from optipmb_service.cluster.leases import MemberLease
+    from optipmb_service.cluster.member import Member
     from optipmb_service.runtime.ports import Request
     from optipmb_service.runtime.registry import Registry
     from optipmb_service.runtime.stream_actor import StreamActor
@@ -60,7 +62,7 @@ class Queries:
         status: makes the status of the service.
         metrics: makes its metrics, in Prometheus' text format.
         samples: makes its metrics as data for the parent of this process.
-        bring: has a stream brought to this process, within a time (s); False when it was not.
+        member: the partitions of this process.
         workers: how many processes the service has.
     """
 
@@ -70,14 +72,14 @@ class Queries:
         status: Callable[[], schemas.ServiceStatus],
         metrics: Callable[[], bytes],
         samples: Callable[[], bytes],
-        bring: Callable[[str, float], bool],
+        member: Member,
         workers: int,
     ) -> None:
         self._registry = registry
         self._status = status
         self._metrics = metrics
         self._samples = samples
-        self._bring = bring
+        self._member = member
         self._workers = workers
         self._keys = registry.keys
         self._moves = ThreadPoolExecutor(1, "move")
@@ -85,11 +87,12 @@ class Queries:
         self._digests = ThreadPoolExecutor(1, "digest")
 
     def about_service(self, request: Request) -> None:
-        """Answer with the status of the service, its metrics, or both when the key has a `*`; or move a stream here."""
+        """Answer with the status of the service, its metrics, or both when the key has a `*`; or have streams moved."""
         instance = self._registry.instance
-        if request.key == self._keys.move(instance):
+        if request.key in {self._keys.move(instance), self._keys.drain(instance)}:
             if self._moving.acquire(blocking=False):
-                self._moves.submit(self._move_in_turn, request)
+                moves = self._move if request.key == self._keys.move(instance) else self._drain
+                self._moves.submit(self._move_in_turn, request, moves)
             else:
                 many = schemas.MessageError("invalid_value", "worker", f"at most {MOVES} moves at a time", "more")
                 _guarded(request, lambda: request.refuse(self._problem("", many)))
@@ -105,9 +108,9 @@ class Queries:
         if request.matches(metrics):
             request.answer_text(metrics, self._metrics(), TEXT)
 
-    def _move_in_turn(self, request: Request) -> None:
+    def _move_in_turn(self, request: Request, moves: Callable[[Request], None]) -> None:
         try:
-            _guarded(request, lambda: self._move(request))
+            _guarded(request, lambda: moves(request))
         finally:
             self._moving.release()
 
@@ -119,12 +122,31 @@ class Queries:
             request.refuse(self._problem("", error))
             return
         try:
-            received = "" if self._bring(self._registry.fusion.session_of(asked.stream), MOVE_S) else "none in time"
+            received = (
+                "" if self._member.bring(self._registry.fusion.session_of(asked.stream), MOVE_S) else "none in time"
+            )
         except StoreError as error:
             received = str(error)
         if received:
             failed = schemas.MessageError("invalid_value", "worker", "a worker to which the stream comes", received)
             request.refuse(self._problem(asked.stream, failed))
+        else:
+            request.answer(request.key, asked)
+
+    def _drain(self, request: Request) -> None:
+        """Have all streams taken by others, and say so."""
+        try:
+            asked = drain_asked(request, self._registry.limits)
+        except schemas.MessageError as error:
+            request.refuse(self._problem("", error))
+            return
+        received = "none" if asked.drain and not self._member.others else ""
+        if not received:
+            self._member.drain(drains=asked.drain)
+            received = "" if not asked.drain or self._member.drained(MOVE_S) else "not all streams taken in time"
+        if received:
+            failed = schemas.MessageError("invalid_value", "drain", "another member that takes the streams", received)
+            request.refuse(self._problem("", failed))
         else:
             request.answer(request.key, asked)
 
@@ -343,6 +365,31 @@ def move_asked(request: Request, limits: schemas.Limits, workers: int) -> schema
     if asked.worker >= workers:
         raise schemas.MessageError("invalid_value", "worker", f"a worker from 0 to {workers - 1}", str(asked.worker))
     return asked
+
+
+def drain_asked(request: Request, limits: schemas.Limits) -> schemas.DrainRequest:
+    """Return what a request to leave all streams says.
+
+    Raises:
+        MessageError: it is none.
+    """
+    if not request.payload:
+        return schemas.DrainRequest()
+    return schemas.decode(request.payload, schemas.DrainRequest, encoding=request.encoding, limits=limits)
+
+
+def members_of(leases: Sequence[MemberLease]) -> tuple[schemas.MemberSummary, ...]:
+    """Return the lines of the members in the status."""
+    return tuple(
+        schemas.MemberSummary(
+            member=one.member,
+            state=one.state,
+            age_s=one.age_ns / 1e9,
+            partitions=tuple(one.fences),
+            fences=tuple(one.fences.values()),
+        )
+        for one in leases
+    )
 
 
 class _Countdown:

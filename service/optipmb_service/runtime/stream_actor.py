@@ -11,6 +11,7 @@ decisions, the wall clock only for what delivery reports.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
@@ -25,7 +26,7 @@ from optipmb_service.runtime.track_publisher import Arrival, TrackPublisher
 from optipmb_service.session.checkpoint import Checkpoint, CheckpointError, forgotten
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import MAX_SENSORS, Begun, Output, Quarantined, Tracked
+from optipmb_service.session.values import MAX_SENSORS, Begun, Output, Quarantined, Tracked, total
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -356,7 +357,7 @@ class StreamActor:
             if checkpoint.fused is not self.fused:
                 raise CheckpointError(f"of {'several streams' if checkpoint.fused else 'one stream'}, by `fuse` then")
             return Session.restore(
-                checkpoint, now_ns, context.policy, instance=context.instance, tracker=context.tracker
+                checkpoint, now_ns, context.policy, fence=fence or 1, instance=context.instance, tracker=context.tracker
             )
 
         context.persistence.recall(
@@ -389,7 +390,7 @@ class StreamActor:
                 context.policy,
                 fused=self.fused,
                 instance=context.instance,
-                life=lineage,
+                life=replace(lineage, run=total(lineage.run, fence or 0)),
                 tracker=context.tracker,
             )
             log.info("session_opened", stream=self.stream, profile=session.parameters.name)
@@ -397,8 +398,6 @@ class StreamActor:
             session = restored
             context.metrics.restored()
             log.info("session_restored", stream=self.stream, session=session.session, frames=session.counters.frames)
-            # Its run has a new number: written soon, so that a crash just now does not give the next run the same one.
-            context.persistence.put(session.snapshot(), fence, lambda: None)
         self.session, self._changed = session, False
         self._accounts.open(session)
 

@@ -39,6 +39,7 @@ from optipmb_service.session.values import (
     Policy,
     Quarantined,
     RefusedError,
+    total,
 )
 
 if TYPE_CHECKING:
@@ -94,7 +95,8 @@ class Session:
         self._young_ns: int | None = None
         self._now_ns = 0
         self._quarantine: dict[str, str] = {}
-        self._run = 0
+        self._run = life.run if life else 0
+        self._restored = False
         if not fused:
             self._sensor("")
 
@@ -122,7 +124,11 @@ class Session:
                 self._reporting.deliveries.refused += 1
                 return [self._reporting.complain.quarantined(frame_id, error)]
             outputs += self._released(frame_id.sensor)
-        if self._fused and not (self._run or self.counters.frames or self._began) and self._policy.recovery_wait_ns:
+        if (
+            self._fused
+            and not (self._restored or self.counters.frames or self._began)
+            and self._policy.recovery_wait_ns
+        ):
             self._began = frame_id.stamp_ns, now_ns
             self._recover_until(now_ns + self._policy.recovery_wait_ns)
         judged_by = pending.timeline
@@ -276,19 +282,21 @@ class Session:
         now_ns: int,
         policy: Policy | None = None,
         *,
+        fence: int = 1,
         instance: str = "session",
         tracker: Callable[[optipmb.Parameters], Steps] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> Self:
         """Return the session that a checkpoint was taken of. It is `recovering` for a while.
 
-        Its tracks belong to another `run`, so the caller should write it down again before it publishes any: two runs
-        from one checkpoint would have the same number.
+        Its tracks belong to another `run`, whose number is that of the checkpoint and the fence together: of two
+        sessions that go on from one checkpoint the later one has the higher fence, whatever the other has written down.
 
         Args:
             checkpoint: its state; its profile goes on too.
             now_ns: monotonic time; the waiting for missed frames begins now.
             policy: waiting, restarting, going back.
+            fence: of the lease under which it goes on, 1 or higher.
             instance: name of the service, for problems.
             tracker: makes the tracker.
             clock: measures how long a step takes, ns.
@@ -306,6 +314,7 @@ class Session:
             clock=clock,
         )
         session._resume(checkpoint, now_ns)
+        session._run = total(checkpoint.run, fence)
         return session
 
     @property
@@ -342,7 +351,7 @@ class Session:
 
     @property
     def run(self) -> int:
-        """How often the session was taken up again.
+        """Number that grows whenever a session of the stream begins or is taken up again, by whichever process.
 
         A frame that was tracked before a crash, with others missing, may be tracked again after it with these there,
         and nobody knows any more under which revision it was published. What a later run publishes of a frame holds.
@@ -369,7 +378,7 @@ class Session:
     def life(self) -> Lineage:
         """What a later session of the stream has to know."""
         head = self._processed.head
-        return Lineage(head.starts, head.density.next_id)
+        return Lineage(head.starts, head.density.next_id, self._run)
 
     def state(self, *, shed: int = 0, queue: int = 0, closed: bool = False) -> schemas.SessionState:
         """Return the state as the message that answers a query."""
@@ -507,7 +516,7 @@ class Session:
         if self._fused and checkpoint.base.last is None:
             # Of the beginning of a session: other sensors may have been there that it does not know yet.
             self._young_ns = min((one.message.stamp_ns for one in checkpoint.window), default=None)
-        self._run = checkpoint.run + 1
+        self._restored = True
         self._processed.resume(checkpoint)
         self._pending.clear()
         for name in ("",) if not self._fused else checkpoint.head.sensors:

@@ -90,10 +90,12 @@ class Lineage:
     Attributes:
         starts: how many lives the stream has had.
         next_id: the next track id.
+        run: see `Session.run`; of the next session, higher than that of any which may have published before.
     """
 
     starts: int = 0
     next_id: int = 1
+    run: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -193,11 +193,15 @@ class Transport:
 
     # The end
 
-    def stop(self, timeout: float) -> None:
-        """Receive nothing any more; what was received before is handed over within `timeout` seconds."""
+    def leave(self) -> None:
+        """Say that this instance is alive no longer."""
         if self._alive is not None:
             undeclare(self._alive)
             self._alive = None
+
+    def stop(self, timeout: float) -> None:
+        """Receive nothing any more; what was received before is handed over within `timeout` seconds."""
+        self.leave()
         for subscription in self._subscriptions:
             subscription.close(timeout)
         self._subscriptions.clear()

@@ -15,8 +15,10 @@ from lease_log import LEASE_S, SECOND, Alone, HandMember, MemoryLeases, Shared
 from nats_process import NatsProcess, NatsTrio
 from optipmb_service.cluster import jetstream
 from optipmb_service.cluster.jetstream import JetStream
-from optipmb_service.cluster.leases import PARTITIONS, Change, WriteLease, partition_key, partition_of
-from optipmb_service.cluster.store import Fenced, Record, SqliteStore, StoreError, Write
+from optipmb_service.cluster.leases import LEFT_AT_ONCE, PARTITIONS, Change, WriteLease, partition_key, partition_of
+from optipmb_service.cluster.member import Member
+from optipmb_service.cluster.sqlite import SqliteStore
+from optipmb_service.cluster.store import ENDED, Fenced, Record, StoreError, Write
 from optipmb_service.runtime.persistence import CheckpointWriter
 from router import until
 
@@ -249,7 +251,7 @@ def test_a_partition_is_left_when_the_state_of_its_streams_is_kept(make: Make) -
         assert one.turn(TICK_S)
         assert other.turn(TICK_S)
     recalled = {partition for partition, change in one.changes if change is Change.RECALLED}
-    assert len(recalled) == PARTITIONS // 4
+    assert len(recalled) == LEFT_AT_ONCE
     assert recalled <= one.occupied & one.held
     streams = {partition_of(stream): stream for stream in map(str, range(1000))}
     for stream in map(streams.__getitem__, recalled):
@@ -295,6 +297,62 @@ def test_who_has_been_wished_for_everything_has_it(make: Make) -> None:
     assert (len(one.held), len(other.held)) == (PARTITIONS, 0)
 
 
+def test_who_drains_holds_nothing(make: Make) -> None:
+    """A member that drains gives all to the others and takes nothing, also what is wished for it, until that is undone.
+
+    It says so to those that look; a few partitions at a time are held by nobody.
+    """
+    members = [HandMember(name, make()) for name in "abc"]
+    even(*members)
+    drained, *others = members
+    drained.member.drain()
+    stream = next(name for name in map(str, range(1000)) if partition_of(name) in others[0].held)
+    drained.member.bring(stream, 0.0)
+    left = len(drained.held)
+    while drained.held:
+        assert drained.turn(TICK_S)
+        assert left - LEFT_AT_ONCE <= len(drained.held) < left
+        left = len(drained.held)
+        for one in others:
+            assert one.turn(TICK_S)
+    for _ in range(5):
+        for one in members:
+            assert one.turn(TICK_S)
+    assert drained.member.drained(0.0)
+    assert [len(one.held) for one in members] == [0, PARTITIONS // 2, PARTITIONS // 2]
+    told = {one.member.rpartition("/")[0]: (one.state, set(one.fences)) for one in others[0].member.leases()}
+    assert told == {"a": ("draining", set()), "b": ("alive", others[0].held), "c": ("alive", others[1].held)}
+    drained.member.drain(drains=False)
+    even(*members)
+    assert drained.member.holds(stream)
+
+
+def test_the_last_member_drains_in_vain(make: Make) -> None:
+    """Nobody is there to take what it leaves, so nobody waits for that."""
+    one, other = HandMember("a", make()), HandMember("b", make())
+    even(one, other)
+    for member in (one, other):
+        assert member.member.others
+        member.member.drain()
+    for _ in range(3):
+        assert one.turn(TICK_S)
+        assert other.turn(TICK_S)
+    assert not one.member.others
+    assert one.member.drained(0.0)
+
+
+def test_an_orderly_end_waits_for_a_slow_store() -> None:
+    """A store that does not answer for a moment is asked again, so that the others need not wait for the lease."""
+    store = MemoryLeases(Shared())
+    member = Member("a", store, 60.0)
+    member.start(lambda *_: None, lambda: None, frozenset)
+    until(lambda: not member.failure, "it has joined")
+    store.reachable = False
+    threading.Timer(0.5, setattr, (store, "reachable", True)).start()
+    member.close(60.0)
+    assert [one.value for one in store.shared.records.values() if one.key.startswith("member/")] == [ENDED]
+
+
 def test_a_full_disk_costs_no_lease(tmp_path: Path) -> None:
     """While nothing can be written both members of a machine go on; when it can, none is ended for the time between."""
     stores = [SqliteStore(tmp_path / "sessions.db") for _ in range(2)]
@@ -302,16 +360,18 @@ def test_a_full_disk_costs_no_lease(tmp_path: Path) -> None:
     even(*members)
     held = [dict(one.member._table.held) for one in members]
     for store in stores:
-        assert store._connection is not None
-        store._connection.execute("PRAGMA query_only = 1")
+        assert isinstance(store, SqliteStore)
+        assert store._leases.connection is not None
+        store._leases.connection.execute("PRAGMA query_only = 1")
     for _ in range(100):
         for one in members:
             one.turn(TICK_S)
             assert len(one.held) == PARTITIONS // 2
             assert not one.member.failure
     for store in stores:
-        assert store._connection is not None
-        store._connection.execute("PRAGMA query_only = 0")
+        assert isinstance(store, SqliteStore)
+        assert store._leases.connection is not None
+        store._leases.connection.execute("PRAGMA query_only = 0")
     even(*members)
     assert [one.member._table.held for one in members] == held
     for store in stores:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 from lease_log import Alone
-from optipmb_service.cluster.store import ASIDE, ENDED, ENDED_KEPT, MEMBERS, SqliteStore, StoreError, Write, load_newest
+from optipmb_service.cluster.sqlite import ASIDE, ENDED_KEPT, LEASES, MEMBERS, SLICE, SLICE_BYTES, SqliteStore
+from optipmb_service.cluster.store import ENDED, StoreError, Write, load_newest
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -97,7 +98,7 @@ def test_a_full_disk_is_an_error_and_loses_nothing(tmp_path: Path) -> None:
     store = SqliteStore(tmp_path / "s")
     leases = Alone(store)
     leases.save({"a": b"1", "b": b"1"})
-    store._connection.execute("PRAGMA max_page_count = 40")  # type: ignore[union-attr]  # it is open
+    store._checkpoints.connection.execute("PRAGMA max_page_count = 40")  # type: ignore[union-attr]  # it is open
     with pytest.raises(StoreError, match="full"):
         leases.save({"a": b"2", "b": bytes(10**6)})
     assert (store.load("a"), store.load("b")) == (b"1", b"1")
@@ -115,7 +116,8 @@ def test_a_read_only_folder_is_an_error(tmp_path: Path) -> None:
 KILLED = """
 import os, sys
 from pathlib import Path
-from optipmb_service.cluster.store import Fenced, SqliteStore, Write
+from optipmb_service.cluster.sqlite import SqliteStore
+from optipmb_service.cluster.store import Fenced, Write
 store = SqliteStore(Path(sys.argv[1]))
 lease = store.get("partition/0")
 fence = store.put(Write("partition/0", "one", lease.revision if lease else 0))
@@ -148,13 +150,67 @@ def test_what_was_silent_for_long_expires(tmp_path: Path) -> None:
     now = [1000.0]
     store = SqliteStore(tmp_path / "store.db", lambda: now[0])
     leases = Alone(store)
-    leases.save({"a/b/old": b"1", "a/b/new": b"1"})
+    leases.save({f"a/b/{number}": b"1" for number in range(SLICE + 1)} | {"a/b/new": b"1"})
     now[0] += 500
     leases.save({"a/b/new": b"2"})
     now[0] += 600
-    assert store.expire(1000.0) == 1
+    assert [store.expire(1000.0) for _ in range(3)] == [SLICE, 1, 0]
     assert (store.streams(), store.load("a/b/new")) == (("a/b/new",), b"2")
     store.close()
+
+
+def test_a_renewal_waits_for_no_checkpoint(tmp_path: Path) -> None:
+    """While one process or another writes checkpoints, for as long as its disk wants, records are read and written."""
+    one, other = SqliteStore(tmp_path / "s"), SqliteStore(tmp_path / "s")
+    with one._checkpoints.transaction():
+        for number, store in enumerate((one, other)):
+            assert store.put(Write(f"member/{number}/1", "alive", 0)) == number + 1
+            assert len(store.follow(0)) == number + 1
+    for store in (one, other):
+        store.close()
+
+
+def test_much_is_saved_in_parts(tmp_path: Path) -> None:
+    """So that other processes have their turn in between: neither many checkpoints nor many bytes at once."""
+    store = SqliteStore(tmp_path / "s")
+    leases = Alone(store)
+    done: list[str] = []
+    store._checkpoints.connection.set_trace_callback(done.append)  # type: ignore[union-attr]  # it is open
+    leases.save({str(number): b"1" for number in range(3 * SLICE)})
+    assert done.count("COMMIT") == 3
+    leases.save({str(number): bytes(SLICE_BYTES // 2) for number in range(6)})
+    assert done.count("COMMIT") == 6
+    store.close()
+
+
+def test_a_damaged_file_of_leases_is_made_anew(tmp_path: Path) -> None:
+    """It is not synced, and may be damaged after a power cut; while a member uses it, it is left alone."""
+    store = SqliteStore(tmp_path / "s")
+    Alone(store).save({"a": b"1"})
+    store.close()
+    for path in tmp_path.glob(f"{LEASES}*"):
+        path.unlink()
+    (tmp_path / LEASES).write_text("no database " * 100, encoding="utf-8")
+    store = SqliteStore(tmp_path / "s")
+    assert (store.follow(0), store.load("a")) == ([], b"1")
+    assert store.put(Write("member/one/1", "alive", 0)) == 1
+    for path in tmp_path.glob(f"{LEASES}*"):
+        path.unlink()
+    (tmp_path / LEASES).write_text("no database " * 100, encoding="utf-8")
+    with pytest.raises(StoreError, match="not a database"):
+        SqliteStore(tmp_path / "s")
+    store.close()
+
+
+def test_a_lock_that_somebody_removed_says_nothing(tmp_path: Path) -> None:
+    """A member whose file was cleaned up is not taken for dead while it lives."""
+    one, other = SqliteStore(tmp_path / "s"), SqliteStore(tmp_path / "s")
+    assert one.put(Write("member/one/1", "alive", 0)) == 1
+    (lock,) = (tmp_path / MEMBERS).iterdir()
+    lock.unlink()
+    assert not other.gone("one/1")
+    for store in (one, other):
+        store.close()
 
 
 def test_a_member_that_is_killed_is_gone_at_once(tmp_path: Path) -> None:
@@ -181,7 +237,8 @@ def test_a_member_that_is_killed_is_gone_at_once(tmp_path: Path) -> None:
 MEMBER = """
 import sys
 from pathlib import Path
-from optipmb_service.cluster.store import SqliteStore, Write
+from optipmb_service.cluster.sqlite import SqliteStore
+from optipmb_service.cluster.store import Write
 store = SqliteStore(Path(sys.argv[1]))
 assert store.put(Write("member/one/1", "alive", 0)) == 1
 print("member", flush=True)

@@ -16,7 +16,8 @@ from lease_log import Alone
 from optipmb_schemas import Keys, ServiceStatus, SessionState
 from optipmb_service.app.clustering import STORE_FILE
 from optipmb_service.cluster.leases import ALIVE, member_key
-from optipmb_service.cluster.store import SqliteStore, StoreError, Write
+from optipmb_service.cluster.sqlite import SqliteStore
+from optipmb_service.cluster.store import StoreError, Write
 from optipmb_service.runtime.persistence import CheckpointWriter
 from optipmb_service.session.session import Session
 from router import Node, Sensor, plain, until
@@ -94,7 +95,9 @@ def test_a_torn_checkpoint_is_set_aside(start: Callable[..., Any], tmp_path: Pat
     assert service.stop()
     whole = store.load(SENSOR.stream)
     assert whole is not None
-    Alone(store).save({SENSOR.stream: whole[: len(whole) // 2]})
+    leases = Alone(store)
+    leases.save({SENSOR.stream: whole[: len(whole) // 2]})
+    leases.leave()
     _, endpoint = start(store=str(tmp_path))
     with Node(endpoint) as node:
         node.send(*(SENSOR.detections(seq) for seq in range(10)))

@@ -16,7 +16,7 @@ from lease_log import Alone
 from optipmb_schemas import Detections, Keys, MessageError, MoveRequest, ServiceStatus, SessionState, decode
 from optipmb_service.app.clustering import STORE_FILE
 from optipmb_service.cluster.leases import PARTITIONS
-from optipmb_service.cluster.store import SqliteStore
+from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime import persistence, queries
 from optipmb_service.runtime.byte_budget import ByteBudget

@@ -1,0 +1,401 @@
+"""Leases and checkpoints in two SQLite files, for the processes of one machine; implements `store.LeaseStore`.
+
+A renewal must not wait for a disk: a member that cannot renew for a lease loses its partitions. So the records have a
+file of their own, which is never synced, and a connection that nothing else uses. What a power cut may do to that file
+costs nothing: no member survives it. A damaged one is replaced when nobody uses it.
+
+The other file has the checkpoints. Its journal is a write-ahead log, so that readers never wait for the writer, and
+`synchronous = NORMAL` suffices: what a killed process has committed is in the log and stays, the file is whole after a
+power cut too, which may only cost the last transactions; the publishers' caches give those frames again. Syncing every
+transaction would cost several milliseconds of disk time each second for nothing else. Much is written in transactions
+of a bounded size, so that other processes have their turn.
+
+Beside them is a folder with a file that each member holds a lock on. The kernel gives up the lock of a member whose
+process has ended, however it ended: then it can be said for certain that it publishes nothing more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import sqlite3
+import threading
+import time
+from hashlib import blake2b
+from itertools import islice
+from typing import IO, TYPE_CHECKING, Final
+
+import structlog
+
+from optipmb_service.cluster.store import ENDED, KEPT, Fenced, Record, StoreError, Write
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
+
+log = structlog.get_logger("optipmb_service")
+
+ASIDE: Final = 64
+"""Torn checkpoints kept in all; beyond it the oldest go."""
+
+LEASES: Final = "leases.db"
+"""File of the records."""
+
+MEMBERS: Final = "members"
+"""Folder of the files whose locks say that members live."""
+
+ENDED_KEPT: Final = 64
+"""Records of ended members that are kept; who has followed none of the later ones was ended itself."""
+
+BUSY_S: Final = 5.0
+"""How long a transaction waits for those of other processes; each takes milliseconds."""
+
+BUSY_PAUSE_S: Final = 0.01
+
+SLICE: Final = 64
+"""Streams of one transaction."""
+
+SLICE_BYTES: Final = 4 * 2**20
+"""Bytes of checkpoints of one transaction; one checkpoint may have more."""
+
+_RECORDS: Final = """
+CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, value TEXT NOT NULL, revision INTEGER NOT NULL) WITHOUT ROWID;
+"""
+_CHECKPOINTS: Final = """
+CREATE TABLE IF NOT EXISTS checkpoints (
+    stream TEXT NOT NULL, number INTEGER NOT NULL, data BLOB NOT NULL, PRIMARY KEY (stream, number)
+);
+CREATE TABLE IF NOT EXISTS aside (
+    number INTEGER PRIMARY KEY, stream TEXT NOT NULL, reason TEXT NOT NULL, data BLOB NOT NULL
+);
+CREATE TABLE IF NOT EXISTS written (stream TEXT PRIMARY KEY, at REAL NOT NULL);
+DROP TABLE IF EXISTS records;
+"""
+
+_OLD_MEMBERS: Final = """
+DELETE FROM records WHERE key LIKE 'member/%' AND value = 'ended' AND revision <= (
+    SELECT revision FROM records WHERE key LIKE 'member/%' AND value = 'ended' ORDER BY revision DESC LIMIT 1 OFFSET ?
+)
+"""
+_NEWEST: Final = "SELECT data FROM checkpoints WHERE stream = ? ORDER BY number DESC LIMIT 1"
+_SILENT: Final = "SELECT stream FROM written WHERE at < ? LIMIT ?"
+
+
+class Database:
+    """One file and a connection to it; any thread may use it, one at a time.
+
+    Args:
+        path: the file; made when it is not there. None: in memory.
+        schema: of its tables.
+        synchronous: SQLite's setting.
+
+    Raises:
+        StoreError: it cannot be opened or written, or is no such file.
+    """
+
+    def __init__(self, path: Path | None, schema: str, synchronous: str) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        self.connection: sqlite3.Connection | None = None
+        try:
+            self.connection = sqlite3.connect(
+                path or ":memory:", timeout=BUSY_S, isolation_level=None, check_same_thread=False
+            )
+            self._begin_log(self.connection)
+            self.connection.execute(f"PRAGMA synchronous = {synchronous}")
+            self.connection.execute(f"PRAGMA journal_size_limit = {64 * 2**20}")
+            self.connection.executescript(schema)
+            self.connection.execute("PRAGMA user_version = 3")  # fails here already where nothing can be written
+        except (sqlite3.Error, OSError) as error:
+            self.close()
+            raise StoreError(f"{path}: {error}") from error
+
+    @staticmethod
+    def _begin_log(connection: sqlite3.Connection) -> None:
+        """Have the journal be a write-ahead log; SQLite itself does not wait there for a process that does the same."""
+        until_s = time.monotonic() + BUSY_S
+        while True:
+            try:
+                connection.execute("PRAGMA journal_mode = WAL")
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > until_s:
+                    raise
+                time.sleep(BUSY_PAUSE_S)
+            else:
+                return
+
+    def close(self) -> None:
+        """Close the file; may be called twice."""
+        with self._lock:
+            if self.connection is not None:
+                self.connection.close()
+                self.connection = None
+
+    @contextlib.contextmanager
+    def use(self) -> Iterator[sqlite3.Connection]:
+        """Have the connection for one's own.
+
+        Raises:
+            StoreError: whatever is wrong with it.
+        """
+        with self._lock:
+            if self.connection is None:
+                raise StoreError(f"{self._path}: closed")
+            try:
+                yield self.connection
+            except sqlite3.Error as error:
+                raise StoreError(f"{self._path}: {error}") from error
+
+    @contextlib.contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """Do all of it or nothing; the write lock is taken first, so that no reader has to become a writer halfway."""
+        with self.use() as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield connection
+                connection.execute("COMMIT")
+            except BaseException:
+                # A full disk may have rolled it back already.
+                if connection.in_transaction:
+                    connection.execute("ROLLBACK")
+                raise
+
+
+class SqliteStore:
+    """The leases and checkpoints of the processes of one machine.
+
+    Args:
+        path: the file of the checkpoints; the other one and the folder are beside it, and all are made when they are
+            not there. None: in memory, for one process alone.
+        clock: seconds since 1970.
+
+    Raises:
+        StoreError: it cannot be opened or written, or is no such file.
+    """
+
+    max_bytes: Final = 1_000_000_000  # SQLite's own limit
+    remote: Final = False
+
+    def __init__(self, path: Path | None, clock: Callable[[], float] = time.time) -> None:
+        self._members = None if path is None else path.with_name(MEMBERS)
+        self._member = ""
+        self._lock_file: IO[bytes] | None = None
+        self._clock = clock
+        self._checkpoints = Database(path, _CHECKPOINTS, "NORMAL")
+        try:
+            self._leases = Database(None, _RECORDS, "OFF") if path is None else _leases_beside(path)
+        except StoreError:
+            self._checkpoints.close()
+            raise
+
+    def follow(self, after: int) -> list[Record]:
+        """Return the newest record of each key that changed after a revision, by revision."""
+        with self._leases.use() as connection:
+            rows = connection.execute("SELECT * FROM records WHERE revision > ? ORDER BY revision", (after,)).fetchall()
+        return [Record(*row) for row in rows]
+
+    def get(self, key: str) -> Record | None:
+        """Return the newest record of a key; None without one."""
+        with self._leases.use() as connection:
+            row = connection.execute("SELECT * FROM records WHERE key = ?", (key,)).fetchone()
+        return None if row is None else Record(*row)
+
+    def put(self, write: Write) -> int | None:
+        """Write a record; return its revision, None when the one to be replaced is not the newest.
+
+        With its first record a member takes its lock, and with its last one it, or whoever ends it, removes that.
+        """
+        kind, _, name = write.key.partition("/")
+        begins = kind == "member" and write.over == 0 and write.value != ENDED
+        if begins:
+            self._take_lock(name)
+        with self._leases.transaction() as connection:
+            row = connection.execute("SELECT revision FROM records WHERE key = ?", (write.key,)).fetchone()
+            if (row[0] if row else 0) != write.over:
+                return None
+            (last,) = connection.execute("SELECT coalesce(max(revision), 0) FROM records").fetchone()
+            connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?)", (write.key, write.value, last + 1))
+            if begins:
+                connection.execute(_OLD_MEMBERS, (ENDED_KEPT,))
+        if kind == "member" and write.value == ENDED:
+            self._leave_lock(name)
+        return int(last) + 1
+
+    def gone(self, member: str) -> bool:
+        """Whether nobody holds the lock of a member. A file that is missing says nothing about its process."""
+        if member == self._member or self._members is None:
+            return False
+        try:
+            return not _locked(self._lock_of(member))
+        except OSError:
+            return False
+
+    def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
+        """Write the newest checkpoints of streams, some in a transaction; return those that were refused.
+
+        The fence is read when nobody else can write a checkpoint, and a successor reads one only so (`load`): either it
+        reads what is written here, or its fence is found here.
+        """
+        refused: set[str] = set()
+        left = iter(checkpoints.items())
+        while some := _some(left):
+            with self._checkpoints.transaction() as connection:
+                fences = self._fences({one.lease for _, one in some})
+                for stream, one in some:
+                    if fences.get(one.lease) == one.fence:
+                        self._write(connection, stream, one.data)
+                    else:
+                        refused.add(stream)
+        return frozenset(refused)
+
+    def _fences(self, keys: set[str]) -> dict[str, int]:
+        with self._leases.use() as connection:
+            marks = ",".join("?" * len(keys))
+            query = f"SELECT key, revision FROM records WHERE key IN ({marks})"  # noqa: S608 - question marks
+            return dict(connection.execute(query, tuple(keys)).fetchall())
+
+    def _write(self, connection: sqlite3.Connection, stream: str, data: bytes) -> None:
+        (last,) = connection.execute(
+            "SELECT coalesce(max(number), 0) FROM checkpoints WHERE stream = ?", (stream,)
+        ).fetchone()
+        connection.execute("INSERT INTO checkpoints VALUES (?, ?, ?)", (stream, last + 1, data))
+        connection.execute("INSERT OR REPLACE INTO written VALUES (?, ?)", (stream, self._clock()))
+        connection.execute("DELETE FROM checkpoints WHERE stream = ? AND number <= ?", (stream, last + 1 - KEPT))
+
+    def load(self, stream: str) -> bytes | None:
+        """Return the newest checkpoint of a stream, None without one; what a predecessor still writes is waited for."""
+        with self._checkpoints.transaction() as connection:
+            row = connection.execute(_NEWEST, (stream,)).fetchone()
+        return None if row is None else bytes(row[0])
+
+    def streams(self) -> tuple[str, ...]:
+        """Return the streams that have a checkpoint, by name."""
+        with self._checkpoints.use() as connection:
+            rows = connection.execute("SELECT DISTINCT stream FROM checkpoints ORDER BY stream").fetchall()
+        return tuple(row[0] for row in rows)
+
+    def expire(self, age_s: float) -> int:
+        """Forget some streams of which nothing was saved for so long; one of an earlier version counts from now."""
+        now_s = self._clock()
+        with self._checkpoints.transaction() as connection:
+            connection.execute("INSERT OR IGNORE INTO written SELECT DISTINCT stream, ? FROM checkpoints", (now_s,))
+            old = connection.execute(_SILENT, (now_s - age_s, SLICE)).fetchall()
+            connection.executemany("DELETE FROM checkpoints WHERE stream = ?", old)
+            connection.executemany("DELETE FROM written WHERE stream = ?", old)
+        return len(old)
+
+    def set_aside(self, stream: str, reason: str) -> None:
+        """Move the newest checkpoint of a stream to those set aside; the one before it is the newest then."""
+        with self._checkpoints.transaction() as connection:
+            newest = "stream = ? AND number = (SELECT max(number) FROM checkpoints WHERE stream = ?)"
+            connection.execute(
+                f"INSERT INTO aside (stream, reason, data) SELECT stream, ?, data FROM checkpoints WHERE {newest}",  # noqa: S608 - a constant
+                (reason, stream, stream),
+            )
+            connection.execute(f"DELETE FROM checkpoints WHERE {newest}", (stream, stream))  # noqa: S608 - a constant
+            connection.execute("DELETE FROM aside WHERE number <= (SELECT max(number) FROM aside) - ?", (ASIDE,))
+
+    def aside(self) -> list[tuple[str, str, bytes]]:
+        """Return stream, reason and bytes of what was set aside, the oldest first."""
+        with self._checkpoints.use() as connection:
+            rows = connection.execute("SELECT stream, reason, data FROM aside ORDER BY number").fetchall()
+        return [(stream, reason, bytes(data)) for stream, reason, data in rows]
+
+    def close(self, timeout: float = 0.0) -> None:
+        """Close the files; may be called twice."""
+        del timeout
+        self._checkpoints.close()
+        self._leases.close()
+        if self._lock_file is not None:
+            self._lock_file.close()
+
+    def _lock_of(self, member: str) -> Path:
+        assert self._members is not None  # noqa: S101 - said for the type checker
+        return self._members / blake2b(member.encode(), digest_size=8).hexdigest()
+
+    def _take_lock(self, member: str) -> None:
+        """Take the lock of a member that begins; the one before it in this process has ended."""
+        if self._members is None or member == self._member:
+            return
+        try:
+            file = self._lock_of(member).open("xb")
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise StoreError(f"{self._members}: {error}") from error
+        if self._lock_file is not None:
+            self._lock_file.close()
+        self._member, self._lock_file = member, file
+
+    def _leave_lock(self, member: str) -> None:
+        if self._members is not None:
+            with contextlib.suppress(OSError):
+                self._lock_of(member).unlink(missing_ok=True)
+
+
+def in_use(path: Path) -> bool:
+    """Whether a member lives that keeps its leases beside a file of checkpoints."""
+    for lock in path.with_name(MEMBERS).glob("*"):
+        with contextlib.suppress(OSError):  # it has gone meanwhile
+            if _locked(lock):
+                return True
+    return False
+
+
+def _some(left: Iterator[tuple[str, Fenced]]) -> list[tuple[str, Fenced]]:
+    """Take as many checkpoints as one transaction may have."""
+    some: list[tuple[str, Fenced]] = []
+    size = 0
+    for one in islice(left, SLICE):
+        some.append(one)
+        size += len(one[1].data)
+        if size >= SLICE_BYTES:
+            break
+    return some
+
+
+def _leases_beside(path: Path) -> Database:
+    """Open the file of the records; one that is damaged is made anew when no member uses it.
+
+    Raises:
+        StoreError: it cannot be opened or written.
+    """
+    file, members = path.with_name(LEASES), path.with_name(MEMBERS)
+    try:
+        members.mkdir(exist_ok=True)
+        folder = os.open(members, os.O_RDONLY)
+    except OSError as error:
+        raise StoreError(f"{members}: {error}") from error
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)  # of two that begin, one looks and replaces
+        if _damaged(file) and not in_use(path):
+            log.warning("leases_damaged", file=str(file))
+            for one in (file, *(file.with_name(f"{LEASES}{end}") for end in ("-wal", "-shm"))):
+                one.unlink(missing_ok=True)
+        return Database(file, _RECORDS, "OFF")
+    except OSError as error:
+        raise StoreError(f"{file}: {error}") from error
+    finally:
+        os.close(folder)
+
+
+def _damaged(file: Path) -> bool:
+    """Whether a file is no database, or not whole."""
+    if not file.exists():
+        return False
+    with contextlib.closing(sqlite3.connect(file, timeout=BUSY_S)) as connection:
+        try:
+            return bool(connection.execute("PRAGMA quick_check(1)").fetchone() != ("ok",))
+        except sqlite3.OperationalError:  # busy, or not readable: it is not known
+            return False
+        except sqlite3.DatabaseError:
+            return True
+
+
+def _locked(path: Path) -> bool:
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
