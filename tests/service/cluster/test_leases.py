@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lease_log import LEASE_S, SECOND, Alone, HandMember, MemoryLeases, Shared
 from nats_process import NatsProcess, NatsTrio
-from optipmb_service.cluster import jetstream
+from optipmb_service.cluster import nats_connection
 from optipmb_service.cluster.jetstream import JetStream
 from optipmb_service.cluster.leases import LEFT_AT_ONCE, PARTITIONS, Change, WriteLease, partition_key, partition_of
 from optipmb_service.cluster.member import Member
@@ -39,7 +39,7 @@ HOUR_S = 3600.0
 def _patient() -> Iterator[None]:
     """A server on a machine that is busy with other things may take its time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jetstream, "CALL_S", 20.0)
+        patch.setattr(nats_connection, "CALL_S", 20.0)
         yield
 
 
@@ -460,7 +460,7 @@ def test_of_three_servers_one_may_be_lost(tmp_path: Path, monkeypatch: pytest.Mo
 
     Without two of them nothing is saved; when one is back, all goes on.
     """
-    monkeypatch.setattr(jetstream, "CALL_S", 2.0)  # what is lost with a leader is asked again
+    monkeypatch.setattr(nats_connection, "CALL_S", 2.0)  # what is lost with a leader is asked again
     with NatsTrio(tmp_path) as servers:
         stores = [JetStream(servers.urls, "test") for _ in range(2)]
         members = [HandMember(name, store) for name, store in zip("ab", stores, strict=True)]
