@@ -354,6 +354,24 @@ class Settings(BaseSettings):
         le=65536,
         description="megabytes that are kept so, over all streams; clouds are dropped first",
     )
+    log_s: float = Field(
+        default=600.0,
+        ge=10,
+        le=864_000,
+        description="with `optipmb-service log`: age up to which detections are in the log, for a successor",
+    )
+    log_mb: int = Field(
+        default=1024, ge=16, le=1_048_576, description="megabytes of detections in the log; the oldest go first"
+    )
+    log_tracks_s: float = Field(
+        default=3600.0,
+        ge=0,
+        le=8_640_000,
+        description="with `optipmb-service log`: age up to which tracks are in the log, for `q/tracks`; 0: none are",
+    )
+    log_tracks_mb: int = Field(
+        default=1024, ge=16, le=1_048_576, description="megabytes of tracks in the log; the oldest go first"
+    )
     stale_s: float = Field(default=2.0, gt=0, description="a stream without a frame for this long is logged as stale")
     stuck_s: float = Field(
         default=5.0,

@@ -150,6 +150,12 @@ class Node:
             key = getattr(self.keys, topic)(message.stream)
             self._publisher(key, type(message), cached=topic == "detections").put(encode(message))
 
+    def send_plain(self, *messages: Detections) -> None:
+        """Publish detections as who knows nothing of caches and of tokens: they are gone when nobody takes them."""
+        for message in messages:
+            key = self.keys.detections(message.stream)
+            self.session.put(key, encode(message), encoding=encoding_of(message), express=True)
+
     def send_raw(self, key: str, payload: bytes, encoding: str = "") -> None:
         """Publish any bytes on any key."""
         self.session.put(key, payload, encoding=encoding or None)

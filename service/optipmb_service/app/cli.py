@@ -69,6 +69,15 @@ class RouterOptions(TypedDict, total=False):
     log_level: Annotated[str | None, typer.Option(metavar="LEVEL", help="debug, info, warning or error.")]
 
 
+class LogOptions(RouterOptions, total=False):
+    """What the bridge into the log and the service take beyond that."""
+
+    cluster: Annotated[
+        str | None,
+        typer.Option(metavar="SERVERS", help="NATS servers that the members share; as nats://10.0.0.1:4222,nats://…"),
+    ]
+
+
 class GatewayOptions(RouterOptions, total=False):
     """What a gateway and the service take beyond that."""
 
@@ -78,7 +87,7 @@ class GatewayOptions(RouterOptions, total=False):
     ]
 
 
-class Options(GatewayOptions, total=False):
+class Options(GatewayOptions, LogOptions, total=False):
     """What the service takes beyond that."""
 
     router: Annotated[
@@ -93,10 +102,6 @@ class Options(GatewayOptions, total=False):
         typer.Option(
             metavar="PATTERN", help="Streams whose sensors feed one session per node, repeatable; as 'site/*/lidar*'."
         ),
-    ]
-    cluster: Annotated[
-        str | None,
-        typer.Option(metavar="SERVERS", help="NATS servers that the members share; as nats://10.0.0.1:4222,nats://…"),
     ]
     workers: Annotated[int | None, typer.Option(metavar="N", help="Processes that track, each a share of the streams.")]
 
@@ -202,6 +207,15 @@ def ros2_command(**given: Unpack[RouterOptions]) -> None:
     if not settings.ros2.streams:
         _wrong("setting ros2.streams: expected a table of streams and their topics in --settings, received none")
     run = _needed("optipmb_service.app.ros2", "ros2").run
+    leave(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+
+
+@app.command("log")
+@_taking(LogOptions)
+def log_command(**given: Unpack[LogOptions]) -> None:
+    """Put detections and tracks into the log of a cluster, a client of routers. SIGINT and SIGTERM end it."""
+    settings = _begin(_load(given, connect=[DEFAULT_LISTEN], cluster=[f"nats://{DEFAULT_NATS}"]))
+    run = _needed("optipmb_service.app.log_bridge", "cluster").run
     leave(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
 
 

@@ -5,15 +5,19 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import structlog
+from optipmb_schemas import Keys
 
 from optipmb_service.cluster.sqlite import SqliteStore, in_use
 from optipmb_service.cluster.store import StoreError
+from optipmb_service.runtime.fusion import Fusion
+from optipmb_service.runtime.missed_frames import LoggedFrames, NoLog
 from optipmb_service.runtime.persistence import DAY_S
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from optipmb_service.cluster.store import LeaseStore
+    from optipmb_service.runtime.missed_frames import MissedFrames
     from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
@@ -49,3 +53,14 @@ def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, st
             log.error("store_failed", error=str(error))  # noqa: TRY400 - the text says all
             why = str(error)
     return SqliteStore(private and private / STORE_FILE), why
+
+
+def open_log(settings: Settings) -> MissedFrames:
+    """Return what is known of the frames that a session has missed: those in the log, where there is a cluster."""
+    if not settings.cluster:
+        return NoLog()
+    from optipmb_service.cluster.log_reader import LogReader  # noqa: PLC0415 - an extra
+    from optipmb_service.cluster.message_log import MessageLog  # noqa: PLC0415 - an extra
+
+    reader = LogReader(MessageLog(settings.cluster, settings.prefix), settings.standby_s)
+    return LoggedFrames(reader, Keys(settings.prefix), Fusion(settings.fuse))

@@ -22,7 +22,7 @@ import structlog
 
 import optipmb
 from optipmb_service import __version__
-from optipmb_service.app.clustering import open_store
+from optipmb_service.app.clustering import open_log, open_store
 from optipmb_service.app.edges import grpc_edge, monitoring
 from optipmb_service.app.kernels import warm_up
 from optipmb_service.app.loops import HANDOVER_S, StopRequest, beat, say_ready, settle, unless
@@ -31,7 +31,7 @@ from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import collectors
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.observability.metrics import Metrics
-from optipmb_service.observability.problem_reporter import ProblemReporter
+from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter, NoPersistence
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.runtime.queries import Queries, members_of
@@ -96,7 +96,7 @@ class Service:
         except TransportError:
             store.close(JOIN_S)
             raise
-        self._reporter = ProblemReporter(self._transport.publish_problem, _log_problem)
+        self._reporter = ProblemReporter(self._transport.publish_problem, log_problem)
         self._scheduler = Scheduler()
         self._member = Member(settings.instance, store, settings.lease_s)
         self._persistence: Persistence = (
@@ -104,6 +104,7 @@ class Service:
             if keeps_nothing is None
             else NoPersistence(keeps_nothing)
         )
+        self._missed = open_log(settings)
         self._registry = Registry(
             settings,
             profiles,
@@ -112,6 +113,7 @@ class Service:
             scheduler=self._scheduler,
             member=self._member,
             persistence=self._persistence,
+            missed=self._missed,
             arm=arm,
             metrics=self._metrics,
             tracker=tracker or partial(optipmb.Tracker, max_pairs=settings.max_pairs),
@@ -161,6 +163,7 @@ class Service:
             self._registry.keep_now()
         self._persistence.close(STORE_S)
         self._member.close(STORE_S)
+        self._missed.close(JOIN_S)
         self._reporter.flush(time.monotonic_ns())
         self._transport.close()
         return ended
@@ -389,15 +392,3 @@ async def _serve(
     ended = await asyncio.to_thread(service.stop)
     log.info("stopped", drained=ended)
     return 0
-
-
-def _log_problem(problem: schemas.Problem, count: int) -> None:
-    log.warning(
-        "problem",
-        stream=problem.stream,
-        code=problem.code,
-        path=problem.path,
-        expected=problem.expected,
-        received=problem.received,
-        count=count,
-    )

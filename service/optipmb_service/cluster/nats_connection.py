@@ -6,6 +6,7 @@ The client of NATS is asyncio's; it has a loop on a thread of its own, and whoev
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import re
 import threading
@@ -44,6 +45,7 @@ LEAST: Final = (2, 12)
 EXISTS: Final = 10058
 ENDS: Final = frozenset({"204", "404"})
 """Status that ends a batch: that was all, or there is nothing."""
+NOBODY: Final = "503"
 
 
 class RefusedError(Exception):
@@ -56,6 +58,10 @@ class RefusedError(Exception):
     def __init__(self, error: Mapping[str, Any]) -> None:
         super().__init__(str(error.get("description", error)))
         self.code = error.get("err_code")
+
+
+class NobodyAnswersError(NatsError):
+    """There is no JetStream stream of a name, or none that answers now."""
 
 
 class NatsConnection:
@@ -81,6 +87,16 @@ class NatsConnection:
     def replicas(self) -> int:
         """How many servers are to keep a JetStream stream."""
         return MANY if len(self._servers) >= MANY else 1
+
+    @property
+    def failure(self) -> str:
+        """Why the servers cannot be reached; empty while they can."""
+        return "" if self._client.is_connected else self._why
+
+    def soon(self, callback: Callable[[], object]) -> None:
+        """Have something called on the loop, without waiting for it."""
+        with contextlib.suppress(RuntimeError):  # it has closed
+            self._loop.call_soon_threadsafe(callback)
 
     def start(self, work: Coroutine[Any, Any, _T]) -> Future[_T]:
         """Have the loop do something, without waiting for it."""
@@ -181,16 +197,20 @@ class NatsConnection:
         client = self.client()
         inbox = client.new_inbox()
         subscription = await client.subscribe(inbox)
-        messages = []
+        messages: list[Msg] = []
         try:
             await client.publish(f"$JS.API.DIRECT.GET.{name}", json.dumps(request).encode(), reply=inbox)
             while True:
                 message = await subscription.next_msg(CALL_S)
                 if (status := (message.headers or {}).get("Status")) is not None:
+                    if status == NOBODY:
+                        raise NobodyAnswersError(f"nobody answers for {name}")
                     if status not in ENDS:
                         raise NatsError(f"status {status}")
                     return messages
                 messages.append(message)
+                if "batch" not in request:
+                    return messages
         finally:
             await subscription.unsubscribe()
 

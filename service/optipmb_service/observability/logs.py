@@ -53,6 +53,10 @@ EVENTS: Final = {
     "leases_failed": "The servers of `cluster`, or the folder `store`, cannot be used, for `error`: after half of"
     " `lease_s` nothing is published, and the state is `paused`.",
     "leases_back": "They can be used again.",
+    "log_failed": "The log cannot be written, for `error`: the bridge holds 256 MB of messages and tries again.",
+    "log_back": "The log can be written.",
+    "log_unread": "The log could not be read for the session of `streams`: frames that nobody tracked may be missing.",
+    "log_cut": "More of the log was missing than a session takes at once: later frames come from elsewhere, or not.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames arrive again.",
     "problem": "A message was refused or lost; `count` of this kind since the last line. See the table of problems.",

@@ -107,7 +107,18 @@ GATEWAY_METRICS: Final = {
 }
 """Those of a process that serves gRPC, by itself or beside tracking."""
 
-METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS
+LOG_METRICS: Final = {
+    "log_written_total": MetricFamily("counter", (), "Messages that this bridge has put into the log."),
+    "log_repeated_total": MetricFamily("counter", (), "Messages that another bridge had put there before."),
+    "log_dropped_total": MetricFamily(
+        "counter", (), "Messages that are not in the log: too many waited for NATS, or it does not take them."
+    ),
+    "log_invalid_total": MetricFamily("counter", (), "Messages that were not valid and not put into the log."),
+    "log_waiting_bytes": MetricFamily("gauge", (), "Bytes of messages that wait for NATS."),
+}
+"""Those of a bridge into the log."""
+
+METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS | LOG_METRICS
 """Every metric. The figures of the process itself start with `process_`."""
 
 Value = tuple[str, tuple[str, ...], float]

@@ -13,10 +13,14 @@ from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+import structlog
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     import optipmb_schemas as schemas
+
+log = structlog.get_logger("optipmb_service")
 
 MAX_KINDS: Final = 4096
 """Kinds of problems remembered for their rate."""
@@ -159,3 +163,16 @@ class ProblemReporter:
             self._publish(told.problem.model_copy(update={"count": told.published}))
         if told.logged:
             self._log(told.problem, told.logged)
+
+
+def log_problem(problem: schemas.Problem, count: int) -> None:
+    """Write a line about a problem that stands for so many."""
+    log.warning(
+        "problem",
+        stream=problem.stream,
+        code=problem.code,
+        path=problem.path,
+        expected=problem.expected,
+        received=problem.received,
+        count=count,
+    )

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from optipmb_service.observability.metrics import Metrics
     from optipmb_service.observability.problem_reporter import ProblemReporter
     from optipmb_service.runtime.byte_budget import ByteBudget
+    from optipmb_service.runtime.missed_frames import MissedFrames
     from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.ports import MessageSink, Packet
     from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
@@ -55,6 +56,7 @@ class ActorContext:
         parameters_of: profile of a stream.
         member: says which streams are tracked here.
         checkpoint writer: where checkpoints go and come from.
+        missed: what is known of the frames that a session has missed.
         buffer: makes buffers for packets of streams that are not tracked here now.
         keep: takes a packet of a stream that another instance is to track.
         dump: saves what is needed to see an error of a session again; returns the file.
@@ -83,6 +85,7 @@ class ActorContext:
     parameters_of: Callable[[str], optipmb.Parameters]
     member: Member
     persistence: Persistence
+    missed: MissedFrames
     buffer: Callable[[], TakeoverBuffer]
     keep: Callable[[str, Packet, bool], None]
     dump: Callable[[str, bytes], str]

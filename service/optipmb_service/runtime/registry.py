@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from optipmb_service.cluster.member import Member
     from optipmb_service.observability.metrics import Metrics
     from optipmb_service.observability.problem_reporter import ProblemReporter
+    from optipmb_service.runtime.missed_frames import MissedFrames
     from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.ports import MessageSink, Packet
     from optipmb_service.runtime.profiles import Profiles
@@ -85,6 +86,7 @@ class Registry:
         scheduler: the workers.
         member: says which streams this instance tracks.
         checkpoint writer: where checkpoints go and come from.
+        missed: what is known of the frames that a session has missed.
         arm: has `StreamActor.wake` called at a monotonic time (ns).
         metrics: counts what comes and goes.
         tracker: makes the trackers of sessions.
@@ -100,6 +102,7 @@ class Registry:
         scheduler: Scheduler,
         member: Member,
         persistence: Persistence,
+        missed: MissedFrames,
         arm: Callable[[Actor, int], None],
         metrics: Metrics,
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
@@ -161,6 +164,7 @@ class Registry:
             parameters_of=profiles.of,
             member=member,
             persistence=persistence,
+            missed=missed,
             dump=lambda stream, dump: _save(settings.folder, stream, dump),
             buffer=lambda: TakeoverBuffer(round(settings.standby_s * SECOND), foreign),
             keep=self._keep,

@@ -351,21 +351,31 @@ class StreamActor:
     def _load(self) -> None:
         """Have the session restored on the thread of the store; packets wait meanwhile."""
         context, fence = self._context, self._context.member.fence(self.stream)
+        taken: list[Checkpoint] = []
 
         def restore(checkpoint: Checkpoint) -> Session:
             now_ns = time.monotonic_ns()
+            taken[:] = [checkpoint]
             if checkpoint.fused is not self.fused:
                 raise CheckpointError(f"of {'several streams' if checkpoint.fused else 'one stream'}, by `fuse` then")
             return Session.restore(
                 checkpoint, now_ns, context.policy, fence=fence or 1, instance=context.instance, tracker=context.tracker
             )
 
-        context.persistence.recall(
-            self.stream, restore, lambda restored: self.tell(lambda actor: actor.on_loaded(restored, fence))
-        )
+        def load(restored: Session | None) -> None:
+            context.missed.fetch(
+                self.stream,
+                taken[-1] if restored and taken else None,
+                lambda packets: self.tell(lambda actor: actor.on_loaded(restored, fence, packets)),
+                lambda packets: self.tell(lambda actor: actor._receive_all(packets)),  # noqa: SLF001 - its own
+            )
 
-    def on_loaded(self, restored: Session | None, fence: int | None) -> None:
-        """Begin a session, or go on with the one that was kept; unless the stream was lost meanwhile."""
+        context.persistence.recall(self.stream, restore, load)
+
+    def on_loaded(
+        self, restored: Session | None, fence: int | None, missed: Sequence[tuple[Packet, bool]] = ()
+    ) -> None:
+        """Begin a session, or go on with the one that was kept and what it missed; unless the stream was lost."""
         member, lineage = self._context.member, self._opening
         if lineage is None:
             return
@@ -378,6 +388,7 @@ class StreamActor:
             self._context.release(self.stream, lineage)
             member.look()
         self._opening, self._seeking = None, False
+        self._receive_all(missed)
         self._resume()
 
     def _begin(self, restored: Session | None, lineage: Lineage, fence: int | None) -> None:

@@ -1,0 +1,175 @@
+"""The bridge into the log as a process of its own: what is published as detections and tracks goes to NATS.
+
+It keeps nothing, so any number of it may run: the servers drop what another one has put there. It is a process of its
+own, and no part of a member, because what it receives is not for one member, and a member that is killed must not take
+with it what a successor needs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from typing import TYPE_CHECKING, Final
+
+import optipmb_schemas as schemas
+import structlog
+
+from optipmb_service import __version__
+from optipmb_service.app.edges import monitoring
+from optipmb_service.app.loops import StopRequest, beat, settle, unless
+from optipmb_service.cluster.log_writer import LogWriter
+from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
+from optipmb_service.observability.health import ProcessHealth
+from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
+from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.session.problems import problem_of
+from optipmb_service.zenoh.client import Client
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from optipmb_service.cluster.message_log import Topic
+    from optipmb_service.observability.metrics import Value
+    from optipmb_service.settings import Settings
+    from optipmb_service.zenoh.client import Message
+
+log = structlog.get_logger("optipmb_service")
+
+HOUSEKEEPING_S: Final = 0.5
+CLOSE_S: Final = 1.0
+DRAIN_POLL_S: Final = 0.01
+MEGABYTE: Final = 2**20
+
+
+class LogBridge:
+    """From a network into the log.
+
+    Args:
+        settings: what is kept, and for how long.
+        client: the network; closed by the caller, after this.
+    """
+
+    stuck: Final = False
+
+    def __init__(self, settings: Settings, client: Client) -> None:
+        self._client = client
+        self._instance = settings.instance
+        self._limits = settings.limits.limits()
+        self._grace_s = settings.grace_s
+        self._invalid = 0
+        self._reporter = ProblemReporter(client.publish_problem, log_problem)
+        keep: dict[Topic, Retention] = {"detections": Retention(settings.log_s, settings.log_mb * MEGABYTE)}
+        if settings.log_tracks_s:
+            keep["tracks"] = Retention(settings.log_tracks_s, settings.log_tracks_mb * MEGABYTE)
+        self._log = MessageLog(settings.cluster, settings.prefix)
+        self._writer = LogWriter(self._log, keep, self._unlogged)
+        self._subscriptions = [client.subscribe(client.keys.all(topic), self._take) for topic in keep]
+
+    @property
+    def state(self) -> str:
+        """Ready while it has a router and the servers."""
+        return "unlinked" if not self._client.linked() else "degraded" if self.failure else "ready"
+
+    @property
+    def failure(self) -> str:
+        """Why nothing can be written; empty while it can."""
+        why = self._writer.failure
+        return f"log: {why}" if why else ""
+
+    def status(self) -> None:
+        """Return nothing: a bridge has no streams."""
+
+    def housekeeping(self) -> None:
+        """Do what is due about once a second."""
+        self._reporter.flush(time.monotonic_ns())
+
+    def close(self) -> None:
+        """Write what was received, within the grace, and end."""
+        ends = time.monotonic() + self._grace_s
+        for subscription in self._subscriptions:
+            subscription.close(CLOSE_S)
+        while not self._writer.idle() and time.monotonic() < ends:
+            time.sleep(DRAIN_POLL_S)
+        self._writer.close()
+        self._log.connection.close(CLOSE_S)
+
+    def figures(self) -> Iterator[Value]:
+        """Return what it counts."""
+        writer = self._writer
+        yield "log_written_total", (), writer.written
+        yield "log_repeated_total", (), writer.repeated
+        yield "log_dropped_total", (), writer.dropped
+        yield "log_invalid_total", (), self._invalid
+        yield "log_waiting_bytes", (), writer.held_bytes
+        for code, count in self._reporter.counts().items():
+            yield "problems_total", (code,), count
+
+    def _take(self, message: Message) -> None:
+        """Put a valid message into the log; one that is not, who tracks reports."""
+        try:
+            stream = self._client.keys.stream_of(message.key)
+            kind = schemas.Detections if message.key.endswith("/detections") else schemas.Tracks
+            content = schemas.decode(message.payload, kind, encoding=message.encoding, limits=self._limits)
+        except schemas.MessageError:
+            self._invalid += 1
+            return
+        if content.stream != stream:
+            self._invalid += 1
+            return
+        topic: Topic = "detections"
+        order = (0, 0)
+        if isinstance(content, schemas.Tracks):
+            topic, order = "tracks", (content.delivery.run if content.delivery else 0, content.revision)
+        frame = content.epoch, content.seq, content.stamp_ns
+        self._writer.put(LogMessage(topic, stream, *frame, order, message.payload, message.encoding))
+
+    def _unlogged(self, stream: str, why: str) -> None:
+        problem = problem_of(
+            "unlogged",
+            stream=stream,
+            instance=self._instance,
+            expected="a log that takes the message",
+            received=why,
+            message=f"Log: a message is not in the log: {why}.",
+        )
+        self._reporter.report(problem, time.monotonic_ns())
+
+
+async def run(settings: Settings) -> int:
+    """Serve until SIGINT or SIGTERM.
+
+    Returns:
+        The exit status: 0, or 1 when the network or an address cannot be used.
+    """
+    asked = StopRequest()
+    log.info("starting", instance=settings.instance, version=__version__)
+    health = ProcessHealth(settings.instance)
+    beating = asyncio.create_task(beat(health))
+    try:
+        with monitoring(settings, health):
+            log.info("connecting", endpoints=settings.connect)
+            client = await unless(asked, lambda: Client.opened(settings))
+            if client is None:
+                return 0
+            try:
+                bridge = LogBridge(settings, client)
+                health.metrics.add(bridge.figures)
+                health.report(bridge)
+                settle()
+                print(f"ready log={settings.instance} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
+                log.info("ready", instance=settings.instance, connect=settings.connect)
+                while not asked.is_set():
+                    await asked.wait(HOUSEKEEPING_S)
+                    bridge.housekeeping()
+                health.ends()
+                await asyncio.to_thread(bridge.close)
+            finally:
+                await asyncio.to_thread(client.close)
+    except (TransportError, EdgeError) as error:
+        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+        return 1
+    finally:
+        beating.cancel()
+    log.info("stopped", drained=True)
+    return 0

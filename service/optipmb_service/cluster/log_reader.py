@@ -1,0 +1,122 @@
+"""Reads the log for those who track: what a session has missed, and tracks of a time that has passed.
+
+Everything runs on the loop of the connection, a few streams at a time, each for a bounded time and up to a bounded
+number of bytes. What cannot be read is as if it were not there: the caches of publishers may still have it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import structlog
+from nats.errors import Error as NatsError
+
+from optipmb_service.cluster.nats_connection import RefusedError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from optipmb_service.cluster.log_position import Missed, Position
+    from optipmb_service.cluster.message_log import LogMessage, MessageLog
+
+log = structlog.get_logger("optipmb_service")
+
+AT_ONCE: Final = 16
+"""Streams that are read at once."""
+
+READ_S: Final = 3.0
+"""Longest time for one stream."""
+
+MOST_BYTES: Final = 2**25
+"""Bytes that are read of a stream at most, in all."""
+
+MOST_FRAMES: Final = 1024
+"""Frames that are read of a stream at most, in all: as many as a session holds while some are missing."""
+
+AGAIN_S: Final = (0.3, 0.7)
+"""When the log is read again for what was not there yet, after the first time and after that."""
+
+
+class LogReader:
+    """The reader of one process.
+
+    Args:
+        message_log: what is read; its connection is closed with the reader.
+        back_s: how far a stream is read that has no position: so long before its newest message.
+    """
+
+    def __init__(self, message_log: MessageLog, back_s: float) -> None:
+        self._log = message_log
+        self._back_s = back_s
+        self._turns = asyncio.Semaphore(AT_ONCE)
+
+    def missed(self, wanted: Missed, take: Callable[[list[LogMessage]], None]) -> None:
+        """Read what a session has missed, without waiting for it.
+
+        Args:
+            wanted: of which streams, from where on.
+            take: called, on a thread that must not be kept, with what there is, in the order of the log of each stream;
+                then a few times with what has come since. The first time it is called in any case.
+        """
+        self._log.connection.start(self._missed(wanted, take))
+
+    def close(self, timeout: float) -> None:
+        """End."""
+        self._log.connection.close(timeout)
+
+    # On the loop
+
+    async def _missed(self, wanted: Missed, take: Callable[[list[LogMessage]], None]) -> None:
+        parts: dict[str, _Part] = {}
+        for number, pause_s in enumerate((0.0, *AGAIN_S)):
+            await asyncio.sleep(pause_s)
+            messages = await self._look(wanted, parts)
+            if messages or number == 0:
+                take(messages)
+
+    async def _look(self, wanted: Missed, parts: dict[str, _Part]) -> list[LogMessage]:
+        """Return what is new in the log; nothing where it cannot be read in time."""
+        messages: list[LogMessage] = []
+        try:
+            async with asyncio.timeout(READ_S), self._turns:
+                streams = set(wanted.streams)
+                if wanted.node:
+                    streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.node)))
+                for stream in sorted(streams):
+                    await self._read(parts.setdefault(stream, _Part(stream, wanted.positions.get(stream))), messages)
+        except (NatsError, RefusedError, TimeoutError, OSError) as error:
+            log.warning("log_unread", streams=sorted(wanted.streams), error=self._log.connection.described(error))
+        return messages
+
+    async def _read(self, part: _Part, messages: list[LogMessage]) -> None:
+        """Append what is new of a stream."""
+        position = part.position
+        before = (lambda _: False) if position is None else position.before
+        if part.next is None:
+            back_s = math.inf if position and position.tracked else self._back_s
+            part.next = await self._log.since("detections", part.stream, before, back_s)
+        while part.next is not None and (found := await self._log.read("detections", part.stream, part.next)):
+            part.next = found[-1][0] + 1
+            for _, message in found:
+                if before(message):
+                    continue
+                part.frames += 1
+                part.size += len(message.payload)
+                if part.frames > MOST_FRAMES or part.size > MOST_BYTES:
+                    log.warning("log_cut", stream=part.stream, frames=part.frames, bytes=part.size)
+                    return
+                messages.append(message)
+
+
+@dataclass(slots=True)
+class _Part:
+    """How far a stream has been read."""
+
+    stream: str
+    position: Position | None
+    next: int | None = None
+    frames: int = 0
+    size: int = 0

@@ -1,0 +1,112 @@
+"""What a session has missed while nobody tracked it, from the log: one more source beside the caches of publishers.
+
+What comes from several sources, or was tracked already, the session drops.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Protocol
+
+from optipmb_service.cluster.log_position import Missed, Position
+from optipmb_service.runtime.ports import Packet
+from optipmb_service.session.timeline import number_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    import optipmb_schemas as schemas
+
+    from optipmb_service.cluster.log_reader import LogReader
+    from optipmb_service.cluster.message_log import LogMessage
+    from optipmb_service.runtime.fusion import Fusion
+    from optipmb_service.session.checkpoint import Checkpoint
+
+    Take = Callable[[list[tuple[Packet, bool]]], None]
+
+
+class MissedFrames(Protocol):
+    """Where the frames are that a session has missed."""
+
+    def fetch(self, session: str, checkpoint: Checkpoint | None, first: Take, later: Take) -> None:
+        """Have `first` called soon, once in any case, with what came after a checkpoint, and `later` with what follows.
+
+        Both take packets, each with whether it is a frame, on a thread that they must not keep.
+        """
+
+    def close(self, timeout: float) -> None:
+        """End."""
+
+
+class NoLog:
+    """Without a log there is nothing."""
+
+    def fetch(self, session: str, checkpoint: Checkpoint | None, first: Take, later: Take) -> None:
+        """Go on at once."""
+        del session, checkpoint, later
+        first([])
+
+    def close(self, timeout: float) -> None:
+        """Nothing is open."""
+
+
+class LoggedFrames:
+    """The frames that are in the log.
+
+    Args:
+        reader: reads it; closed with this.
+        keys: the keys of streams.
+        fusion: which streams share a session.
+    """
+
+    def __init__(self, reader: LogReader, keys: schemas.Keys, fusion: Fusion) -> None:
+        self._reader = reader
+        self._keys = keys
+        self._fusion = fusion
+
+    def fetch(self, session: str, checkpoint: Checkpoint | None, first: Take, later: Take) -> None:
+        """Have the log read."""
+        fused = self._fusion.is_session(session)
+        wanted = Missed(
+            streams=() if fused else (session,),
+            node=session.rpartition("/")[0] if fused else "",
+            belongs=lambda stream: self._fusion.session_of(stream) == session,
+            positions={} if checkpoint is None else positions_of(checkpoint),
+        )
+        takes = iter((first,))
+        self._reader.missed(wanted, lambda messages: next(takes, later)(self._packets(messages)))
+
+    def close(self, timeout: float) -> None:
+        """Close the connection."""
+        self._reader.close(timeout)
+
+    def _packets(self, messages: Iterable[LogMessage]) -> list[tuple[Packet, bool]]:
+        wall_ns, now_ns = time.time_ns(), time.monotonic_ns()
+        return [
+            (
+                Packet(self._keys.detections(one.stream), one.payload, len(one.payload), one.encoding, wall_ns, now_ns),
+                True,
+            )
+            for one in messages
+        ]
+
+
+def positions_of(checkpoint: Checkpoint) -> dict[str, Position]:
+    """Return, for each stream of a session, the last frame before the window of a checkpoint.
+
+    Where all frames of a stream are in the window, it is the one before the first of them.
+    """
+    positions = {}
+    for name, epochs in checkpoint.seen.items():
+        cursor = checkpoint.base.sensor(name).cursor
+        if cursor.epoch is not None:
+            before = epochs[: max(0, number_of(epochs, cursor.epoch))]
+            at = Position(frozenset(one.epoch for one in before), cursor.epoch, cursor.seq, tracked=True)
+        else:
+            ids = [one for one in map(checkpoint.frame_id, checkpoint.window) if one.sensor == name]
+            if not ids:
+                continue
+            first = min(ids, key=lambda one: (number_of(epochs, one.epoch), one.seq))
+            at = Position(frozenset(), first.epoch, first.seq - 1, tracked=False)
+        positions[name or checkpoint.stream] = at
+    return positions
