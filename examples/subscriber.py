@@ -4,5 +4,5 @@ from optipmb_client import Subscriber
 
 with Subscriber("garage/*/*", connect="tcp/127.0.0.1:7447", timeout=5) as tracks:
     for message in tracks:
-        for track, label, center in zip(message.id, message.label, message.center.round(1), strict=True):
-            print(message.stream, "track", track, message.labels[label], "at", *center, flush=True)
+        for track, label, (x, y, z) in zip(message.id, message.label, message.center, strict=True):
+            print(message.stream, "track", track, message.labels[label], f"at {x:.1f} {y:.1f} {z:.1f}", flush=True)

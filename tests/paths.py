@@ -24,6 +24,7 @@ README = (ROOT / "README.md").read_text()
 MESSAGES = (ROOT / "docs" / "messages.md").read_text()
 CARS = ((0.0, 0.0, 8.0), (40.0, 4.0, -6.0))  # x, y, speed along x
 LIMIT_S = 1800
+NODE_MB = 60
 KEPT = "(?i)(https?|no)_proxy$|ssl_|lang$"
 PYTHONS_OWN = "pip|setuptools|pkg_resources|_distutils|distutils"
 # Of downloads, so that a second run need not repeat them.
@@ -157,33 +158,37 @@ def python(base: Path, wheel: Path, _node: Path) -> None:
 
 
 def node(base: Path, wheel: Path, node_wheel: Path) -> None:
-    """A service, and a publisher and a subscriber in an environment without the tracker; a publisher without numpy."""
+    """A service; a publisher and a subscriber without tracker and numpy; publishers with numpy and with Zenoh alone."""
     place = Environment(base, "service", f"{wheel}[service]")
     nodes = Environment(base, "node", node_wheel)
-    said(f"  import optipmb_client: {nodes.import_ms('optipmb_client'):.0f} ms of processor time")
+    checked(nodes.megabytes < NODE_MB, f"expected a node of less than {NODE_MB} MB")
+    arrays = Environment(base, "arrays", f"{node_wheel}[arrays]")
+    for one in (nodes, arrays):
+        said(f"  {one.name}: import optipmb_client: {one.import_ms('optipmb_client'):.0f} ms of processor time")
     plain = Environment(base, "zenoh", "eclipse-zenoh")
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
-    programs = {
-        "publisher.py": (nodes, blocks(README, "python", "Publisher(")),
-        "subscriber.py": (nodes, blocks(README, "python", "Subscriber(")),
-        "plain.py": (plain, blocks(MESSAGES, "python", "import zenoh")),
-    }
-    for name, (where, text) in programs.items():
+    programs = (
+        (nodes, "publisher.py", blocks(README, "python", "Publisher(")),
+        (nodes, "subscriber.py", blocks(README, "python", "Subscriber(")),
+        (arrays, "publisher.py", blocks(README, "python", "Publisher(")),
+        (plain, "plain.py", blocks(MESSAGES, "python", "import zenoh")),
+    )
+    for where, name, text in programs:
         (where.work / name).write_text(text.replace("7447", port))
     service = place.start("optipmb-service", "--listen", f"tcp/127.0.0.1:{port}")
     try:
         timed("the service is ready, with compilation", lambda: service.stdout.readline() if service.stdout else "")
-        for program in ("publisher.py", "plain.py"):
+        for where, program, _ in (one for one in programs if one[1] != "subscriber.py"):
             listening = nodes.start("python", "subscriber.py")
             began = time.monotonic()
-            programs[program][0].run("python", program)
+            where.run("python", program)
             printed, _ = listening.communicate(timeout=LIMIT_S)
             stream = "garage/robot-1/lidar" if program == "publisher.py" else "garage/robot-2/lidar"
             rows = [line for line in printed.splitlines() if line.startswith(stream)]
             checked(len(rows) > 10, f"expected tracks of {stream}, received {printed}")
-            said(f"  {program}: {len(rows)} lines with tracks came in {time.monotonic() - began:.1f} s")
+            said(f"  {where.name}, {program}: {len(rows)} lines with tracks came in {time.monotonic() - began:.1f} s")
     finally:
         service.terminate()
         service.wait(60)

@@ -73,5 +73,6 @@ def linked(
     try:
         from optipmb_client.grpc import GrpcConnection  # noqa: PLC0415  an extra that only this needs
     except ModuleNotFoundError as error:
-        raise ClientError(f"gRPC needs {error.name}, which is not installed: pip install 'optipmb[grpc]'") from error
+        how = "pip install 'optipmb[grpc]', or 'optipmb-node[grpc]'"
+        raise ClientError(f"gRPC needs {error.name}, which is not installed: {how}") from error
     return GrpcConnection(tuple(endpoint.removeprefix(GRPC) for endpoint in endpoints), config=config, timeout=timeout)

@@ -60,7 +60,7 @@ def _digest(tracks: Tracks) -> bytes:
     digest = hashlib.blake2b(digest_size=16)
     for name, value in tracks.present():
         if name in tracks.arrays:
-            digest.update(value)
+            digest.update(value.tobytes())
         elif name not in {"delivery", "revision"}:
             digest.update(repr(value).encode())
     return digest.digest()

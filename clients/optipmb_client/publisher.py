@@ -8,6 +8,7 @@ the axes of the frame.
 A stream is named `site/node/sensor`. The service keeps one tracking session per stream.
 """
 
+import array
 import operator
 import secrets
 import threading
@@ -17,9 +18,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-import numpy as np
-from numpy.typing import ArrayLike
 from optipmb_schemas import PREFIX, Detections, FieldOfView, Keys, MessageError, Points, Pose
+from optipmb_schemas.arrays import ArrayLike, numeric
 
 from optipmb_client.links import Link, linked
 
@@ -212,7 +212,7 @@ class Publisher:
                 stamp_ns=_stamp(stamp_ns),
                 frame=self.frame,
                 pose=_pose(pose),
-                xyz=_finite(points),
+                xyz=numeric.finite(_array(points, 3)),
             )
         )
 
@@ -228,24 +228,13 @@ def _labelled(label: Any, labels: Sequence[str] | None) -> tuple[tuple[str, ...]
         if not isinstance(name, str):
             raise MessageError("invalid_value", f"label[{row}]", "a class name, or labels given too", repr(name)[:80])
     index = {name: number for number, name in enumerate(dict.fromkeys(names))}
-    return tuple(index), np.array([index[name] for name in names], dtype=np.int64)
+    return tuple(index), array.array("q", [index[name] for name in names])
 
 
 def _array(values: Any, *columns: int) -> Any:
-    """Return lists as they are (errors then name the element), all else as arrays; without rows: (0, *columns)."""
-    array = values if isinstance(values, list | tuple) else np.asarray(values)
-    empty = array.shape == (0,) if isinstance(array, np.ndarray) else not array
-    return np.zeros((0, *columns)) if empty and columns else array
-
-
-def _finite(points: ArrayLike) -> Any:
-    """Return x, y, z of the points that have a return: those whose coordinates are finite."""
-    given = _array(points, 3)
-    if not isinstance(given, np.ndarray) or given.ndim != 2 or given.dtype.kind != "f":  # noqa: PLR2004  rows of points
-        return given  # the message refuses what is wrong
-    xyz = np.ascontiguousarray(given[:, :3])
-    finite = np.isfinite(xyz)
-    return xyz if finite.all() else xyz[finite[:, 0] & finite[:, 1:].all(axis=1)]
+    """Return lists as they are (errors then name the element), all else as arrays; a table without rows as a list."""
+    rows = values if isinstance(values, list | tuple) else numeric.asarray(values)
+    return [] if columns and getattr(rows, "shape", None) == (0,) else rows
 
 
 def _stamp(value: Any) -> Any:

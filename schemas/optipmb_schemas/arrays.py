@@ -1,9 +1,9 @@
 """Columnar arrays as pydantic fields: one value per column, checked with whole-array operations.
 
-`Annotated[NDArray[np.float64], Array("f8", ("M", 3), low, high)]` is an array of M rows of 3 numbers. Whatever a field
+`Annotated[Reals, Array("f8", ("M", 3), low, high)]` is an array of M rows of 3 numbers. Whatever a field
 is given (an array of another number type, nested lists), what it holds afterwards is always the same kind of array: the
-dtype of the description, native byte order, C-contiguous, aligned and read-only. Compiled code that is specialised on
-array types therefore sees one type. An array that is all this already is held as a view, without a copy.
+number type of the description, row by row and read-only: a numpy array (`numeric`), or, where numpy is not installed,
+`Numbers` (`plain`). An array or buffer that is all this already is held as a view, without a copy.
 
 A letter is a symbolic dimension: equal letters are equal numbers within one message (`Message` compares them).
 """
@@ -11,20 +11,53 @@ A letter is a symbolic dimension: equal letters are equal numbers within one mes
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
-from typing import Any, Final
+from math import hypot, nan
+from operator import le
+from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 from optipmb_schemas.errors import MessageError, cut, invalid, shape_text
 
+try:
+    from optipmb_schemas import numeric
+except ModuleNotFoundError as error:
+    if error.name != "numpy":
+        raise
+    from optipmb_schemas import plain as numeric  # type: ignore[no-redef]  # the same names for programs without numpy
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import ArrayLike, NDArray
+
+    Reals = NDArray[np.float64]
+    Singles = NDArray[np.float32]
+    Integers = NDArray[np.int64]
+    Numeric = NDArray[Any]
+else:  # pydantic looks at the `Array` beside them alone
+    ArrayLike = Reals = Singles = Integers = Numeric = Any
+
+__all__ = [
+    "ARRAY",
+    "MAX_COLUMNS",
+    "Array",
+    "ArrayLike",
+    "Integers",
+    "Numeric",
+    "Reals",
+    "Singles",
+    "first_descent",
+    "numeric",
+    "unit_quaternion",
+]
+
+ARRAY: Final = numeric.ARRAY
+"""The type of what fields of numbers hold."""
+
 MAX_COLUMNS: Final = 64
 """Most columns of an array whose further columns are dropped."""
-
-_DTYPES: Final = {name: np.dtype(name) for name in ("f4", "f8", "i8")}
 
 
 @dataclass(frozen=True)
@@ -85,32 +118,45 @@ class Array:
                 return
         raise MessageError("invalid_value", "", f"shape {self.shape_described}", f"shape {cut(shape_text(shape))}")
 
-    def validate(self, value: object) -> NDArray[Any]:
+    def of_another_kind(self, dtype: object) -> MessageError:
+        """Return the error of an array whose elements are not of the kind that is described."""
+        kind = "integers" if self.dtype == "i8" else "numbers"
+        return MessageError("invalid_value", "", f"an array of {kind}", cut(f"an array of {dtype}"))
+
+    def refused(self, at: int, array: Any) -> MessageError:
+        """Return the error of an array whose number `at`, counted row by row, is out of the range."""
+        return invalid(_element(at, array.shape), self.range_described, array.flat[at])
+
+    def validate(self, value: object) -> Numeric:
         """Return `value` as the array that the description asks for.
 
         Raises:
             MessageError: with a path relative to the field, as `[7][1]`, when a shape, type or value is not allowed.
         """
-        array = self._canonical(value if isinstance(value, np.ndarray) else self.from_lists(value))
-        if array.size:
-            self._check_values(array)
+        array = numeric.given(value)
+        if array is None:
+            array = self.from_lists(value)
+        self.check_shape(array.shape)
+        array = numeric.canonical(array, self)
+        if array.size and (at := numeric.first_outside(array, self)) is not None:
+            raise self.refused(at, array)
         return array
 
-    def from_lists(self, value: object) -> NDArray[Any]:
+    def from_lists(self, value: object) -> Numeric:
         """Return nested lists of numbers (None for an unknown number where that is allowed) as an array."""
         leaves, shape = self._flatten(value)
         kinds = set(map(type, leaves))
         if self.unknown and type(None) in kinds:
-            leaves = [np.nan if leaf is None else leaf for leaf in leaves]
+            leaves = [nan if leaf is None else leaf for leaf in leaves]
             kinds.discard(type(None))
         whole = self.dtype == "i8"
-        wanted = (int, np.integer) if whole else (int, float, np.integer, np.floating)
+        wanted = numeric.WHOLE if whole else numeric.REAL
         bad = {kind for kind in kinds if kind is bool or not issubclass(kind, wanted)}
         if bad:
             at = next(i for i, leaf in enumerate(leaves) if type(leaf) in bad)
             raise invalid(_element(at, shape), "an integer" if whole else "a number", leaves[at])
         try:
-            return np.array(leaves, dtype="i8" if whole else "f8").reshape(shape)
+            return numeric.of_leaves(leaves, "i8" if whole else "f8", shape)
         except OverflowError:  # an integer beyond what the array can hold: say which
             at = next(i for i, leaf in enumerate(leaves) if not self.low <= leaf <= self.high)
             raise invalid(_element(at, shape), self.range_described, leaves[at]) from None
@@ -137,42 +183,7 @@ class Array:
             level = list(chain.from_iterable(level))
         return level, shape
 
-    def _canonical(self, array: NDArray[Any]) -> NDArray[Any]:
-        self.check_shape(array.shape)
-        if self.wider:
-            array = array[:, : self.shape[-1]]
-        flags = array.flags
-        if array.dtype != _DTYPES[self.dtype] or not (flags.c_contiguous and flags.aligned):
-            array = self._converted(array)
-        if array.flags.writeable or type(array) is not np.ndarray:
-            array = array.view(np.ndarray)
-            array.flags.writeable = False
-        return array
-
-    def _converted(self, array: NDArray[Any]) -> NDArray[Any]:
-        whole = self.dtype == "i8"
-        if array.dtype.kind not in ("iu" if whole else "fiu"):
-            expected = f"an array of {'integers' if whole else 'numbers'}"
-            raise MessageError("invalid_value", "", expected, cut(f"an array of {array.dtype}"))
-        if whole and array.size and array.max() > self.high:  # before the conversion, which would wrap around
-            at = int(array.argmax())
-            raise invalid(_element(at, array.shape), self.range_described, array.reshape(-1)[at])
-        with np.errstate(over="ignore"):  # what overflows becomes infinite, and the range check names it
-            return np.array(array, self.dtype, order="C")
-
-    def _check_values(self, array: NDArray[Any]) -> None:
-        lowest, highest = np.minimum.reduce(array, axis=None), np.maximum.reduce(array, axis=None)
-        # Both extremes of an array with a NaN are NaN, and comparisons with NaN are false.
-        if (lowest > self.low if self.above else lowest >= self.low) and highest <= self.high:
-            return
-        good = ((array > self.low) if self.above else (array >= self.low)) & (array <= self.high)
-        if self.unknown:
-            good |= np.isnan(array).all(axis=-1, keepdims=True)
-        if not good.all():
-            at = int(np.argmin(good))
-            raise invalid(_element(at, array.shape), self.range_described, array.reshape(-1)[at])
-
-    def to_lists(self, array: NDArray[Any]) -> list[Any]:
+    def to_lists(self, array: Numeric) -> list[Any]:
         """Return the array as nested lists for JSON, an unknown number as None."""
         lists: list[Any] = array.tolist()
         return _with_nulls(lists) if self.unknown else lists
@@ -206,14 +217,24 @@ def _with_nulls(value: Any) -> Any:
     return None if value != value else value  # noqa: PLR0124 - NaN
 
 
-def unit_quaternion(array: NDArray[np.float64]) -> NDArray[np.float64]:
+def unit_quaternion(array: Reals) -> Reals:
     """Return `array` (4,), w x y z, when its norm is within 0.001 of one, so that float32 sources pass."""
-    norm = float(np.sqrt(array @ array))
+    norm = hypot(*array.tolist())
     if abs(norm - 1.0) > 1e-3:  # noqa: PLR2004 - the tolerance of the description
         raise MessageError("invalid_value", "", "a unit quaternion w, x, y, z", f"one of norm {norm:.6g}")
     return array
 
 
+def first_descent(array: Numeric) -> int:
+    """Return which number of an array (N,) is the first that is not above the one before it; 0: none is."""
+    values = array.tolist()
+    return next((at for at, fails in enumerate(map(le, values[1:], values), 1) if fails), 0)
+
+
 def _element(at: int, shape: tuple[int, ...]) -> str:
     """Return the path of the element number `at` of an array: `[7][1]`; empty for an array without dimensions."""
-    return "".join(f"[{int(i)}]" for i in np.unravel_index(at, shape)) if shape else ""
+    path = ""
+    for length in reversed(shape):
+        at, index = divmod(at, length)
+        path = f"[{index}]{path}"
+    return path

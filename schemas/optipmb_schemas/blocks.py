@@ -5,22 +5,19 @@ otherwise. The encoder moves the data of a large block to a multiple of 8 bytes 
 optional field `pad`), so that the receiver's view is aligned.
 """
 
-import sys
 from collections.abc import Sequence
 from functools import lru_cache
 from math import prod
 from typing import Any, Final
 
 import msgpack
-import numpy as np
-from numpy.typing import NDArray
 
-from optipmb_schemas.arrays import Array
+from optipmb_schemas.arrays import Array, Numeric, numeric
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import Limits
 
-DTYPES: Final = {name: np.dtype("<" + name) for name in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")}
-"""Number types that a block may have. Numpy's spelling (`<f8`, `|u1`) is understood as well."""
+DTYPES: Final = {name: int(name[1]) for name in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")}
+"""Number types that a block may have, and their bytes. Numpy's spelling (`<f8`, `|u1`) is understood as well."""
 
 LARGE: Final = 4096
 """Bytes from which on a block's data are viewed instead of copied, in both directions."""
@@ -28,14 +25,12 @@ LARGE: Final = 4096
 ALIGNMENT: Final = 8
 """Large blocks start at a multiple of this many bytes from the start of the message."""
 
-_LITTLE: Final = sys.byteorder == "little"
-
-_NAMES: Final = DTYPES | {dtype.str: dtype for dtype in DTYPES.values()}
+_NAMES: Final = {f"{sign}{name}": name for name in DTYPES for sign in ("", "|" if DTYPES[name] == 1 else "<")}
 
 _msgpack: Any = msgpack  # its type information is partial
 
 
-def read_array(value: object, description: Array, limits: Limits) -> NDArray[Any]:
+def read_array(value: object, description: Array, limits: Limits) -> Numeric:
     """Return a received block or nested list as an array of an allowed shape and of any number type.
 
     Raises:
@@ -59,7 +54,7 @@ def _check_lengths(shape: Sequence[int], description: Array, limits: Limits) -> 
             raise MessageError("too_large", "", f"at most {most} {what}", f"{length} {what}")
 
 
-def _read_block(block: dict[str, Any], description: Array, limits: Limits) -> NDArray[Any]:
+def _read_block(block: dict[str, Any], description: Array, limits: Limits) -> Numeric:
     for name in ("dtype", "shape", "data"):
         if block.get(name) is None:
             raise MessageError("missing_field", name, "a value", "nothing")
@@ -75,16 +70,16 @@ def _read_block(block: dict[str, Any], description: Array, limits: Limits) -> ND
     description.check_shape(tuple(shape))
     if not isinstance(data, bytes | memoryview):
         raise invalid("data", "bytes (in JSON, arrays are nested lists)", data)
-    size = prod(shape) * dtype.itemsize  # integers of Python do not overflow
+    size = prod(shape) * DTYPES[dtype]  # integers of Python do not overflow
     if size != len(data):
         raise invalid("data", f"{size} bytes, from dtype and shape", data)
     _check_lengths(shape, description, limits)
-    return np.frombuffer(data, dtype).reshape(shape) if size else np.empty(shape, dtype)
+    return numeric.of_bytes(data, dtype, shape)
 
 
-def block_of(array: NDArray[Any]) -> dict[str, Any]:
-    """Return the block of a native array."""
-    return {"dtype": array.dtype.str[1:], "shape": array.shape, "data": _data(array)}
+def block_of(array: Numeric, dtype: str) -> dict[str, Any]:
+    """Return the block of an array of a number type."""
+    return {"dtype": dtype, "shape": array.shape, "data": numeric.bytes_of(array, LARGE)}
 
 
 def head_of(name: str, dtype: str, shape: tuple[int, ...]) -> bytes:
@@ -92,36 +87,29 @@ def head_of(name: str, dtype: str, shape: tuple[int, ...]) -> bytes:
 
     The data are its bytes in memory, so where numbers are stored otherwise than on the wire there is no small array.
     """
-    size = prod(shape) * DTYPES[dtype].itemsize
-    if size >= LARGE or not _LITTLE:
+    size = prod(shape) * DTYPES[dtype]
+    if size >= LARGE or not numeric.LITTLE:
         return b""
     field: bytes = _msgpack.packb({name: {"dtype": dtype, "shape": shape, "data": bytes(size)}})
     return field[1 : len(field) - size]
 
 
-def pack_large(name: str, array: NDArray[Any], offset: int) -> tuple[bytes, bytes | memoryview]:
+def pack_large(name: str, array: Numeric, dtype: str, offset: int) -> tuple[bytes, bytes | memoryview]:
     """Return a field with a large array that is to lie at `offset`, in two parts: all before the data, and the data.
 
     The data are aligned, and a view, not a copy, if they can be.
     """
-    before, after = _large_head(name, array.dtype, array.shape)
+    before, after = _large_head(name, dtype, array.shape)
     padding = -(offset + len(before) + 2 + len(after)) % ALIGNMENT
-    return before + b"\xc4" + bytes((padding, *bytes(padding))) + after, _data(array)
+    return before + b"\xc4" + bytes((padding, *bytes(padding))) + after, numeric.bytes_of(array, LARGE)
 
 
 # Messages have the same few shapes over and over.
 
 
 @lru_cache(1024)
-def _large_head(name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[bytes, bytes]:
+def _large_head(name: str, dtype: str, shape: tuple[int, ...]) -> tuple[bytes, bytes]:
     """Return what stands before the padding of a large array, and what between it and the data."""
-    pack, size = _msgpack.packb, prod(shape) * dtype.itemsize
-    before = pack(name) + b"\x84" + b"".join(map(pack, ("dtype", dtype.str[1:], "shape", shape, "pad")))
+    pack, size = _msgpack.packb, prod(shape) * DTYPES[dtype]
+    before = pack(name) + b"\x84" + b"".join(map(pack, ("dtype", dtype, "shape", shape, "pad")))
     return before, pack("data") + b"\xc6" + size.to_bytes(4, "big")
-
-
-def _data(array: NDArray[Any]) -> bytes | memoryview:
-    """Return the bytes of an array, little-endian, row by row: of a large one a view."""
-    if not (_LITTLE and array.dtype.isnative and array.flags.c_contiguous):
-        array = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-    return array.data.cast("B") if array.nbytes >= LARGE else array.tobytes()

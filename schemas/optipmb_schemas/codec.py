@@ -10,10 +10,9 @@ from functools import lru_cache
 from typing import Any, Final, TypeVar, cast
 
 import msgpack
-import numpy as np
 
+from optipmb_schemas.arrays import ARRAY
 from optipmb_schemas.blocks import block_of, head_of, pack_large, read_array
-from optipmb_schemas.compact import read_detections
 from optipmb_schemas.control import (
     DrainRequest,
     MoveRequest,
@@ -28,6 +27,14 @@ from optipmb_schemas.limits import DEFAULT, Limits
 from optipmb_schemas.messages import Density, Detections, Points, Tracks
 from optipmb_schemas.model import Message
 from optipmb_schemas.structure import Span, check_json, check_msgpack
+
+try:
+    from optipmb_schemas.compact import read_detections
+except ModuleNotFoundError:  # without numpy the models read every form
+
+    def read_detections(payload: bytes, limits: Limits) -> Detections | None:  # noqa: ARG001, D103  the other one's
+        return None
+
 
 T = TypeVar("T", bound=Message)
 
@@ -75,14 +82,16 @@ def encode(message: Message) -> bytes:
     parts: list[bytes | memoryview] = [_msgpack.Packer().pack_map_header(len(fields))]
     plain: dict[str, Any] = {}
     for name, value in fields:
-        if type(value) is not np.ndarray:
+        if type(value) is not ARRAY:
             plain[name] = value if type(value) in _SCALARS else _plain(value, blocks=True)
             continue
         if plain:
             parts.append(_without_head(pack(plain), len(plain)))
             plain = {}
-        head = _head(kind, name, value.shape)
-        parts += (head, value.tobytes()) if head else pack_large(name, value, sum(map(len, parts)))
+        if head := _head(kind, name, value.shape):
+            parts += (head, value.tobytes())
+        else:
+            parts += pack_large(name, value, kind.arrays[name].dtype, sum(map(len, parts)))
     if plain:
         parts.append(_without_head(pack(plain), len(plain)))
     return b"".join(parts)
@@ -243,8 +252,9 @@ def _plain(value: Any, *, blocks: bool) -> Any:
         for name, field in value.present():
             if type(field) in _SCALARS and blocks:
                 fields[name] = field
-            elif isinstance(field, np.ndarray):
-                fields[name] = block_of(field) if blocks else value.arrays[name].to_lists(field)
+            elif isinstance(field, ARRAY):
+                array = value.arrays[name]
+                fields[name] = block_of(field, array.dtype) if blocks else array.to_lists(field)
             else:
                 fields[name] = _plain(field, blocks=blocks)
         return fields

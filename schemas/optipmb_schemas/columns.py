@@ -2,19 +2,21 @@
 
 from collections.abc import Mapping
 from math import prod
-from typing import Any, Final
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, Final
 
 from optipmb_schemas.errors import MessageError, invalid
 
-DTYPES: Final = {"f8": np.dtype("<f8"), "i8": np.dtype("<i8"), "b1": np.dtype("?")}
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+DTYPES: Final = {"f8": "<f8", "i8": "<i8", "b1": "?"}
 MAX_DIMENSIONS: Final = 4
 
 
-def pack_columns(columns: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, Any]]:
+def pack_columns(columns: Mapping[str, "NDArray[Any]"]) -> dict[str, dict[str, Any]]:
     """Return named arrays of float64, int64 or bool as blocks; equal arrays give equal blocks."""
+    import numpy as np  # noqa: PLC0415  messages alone need no numpy
+
     packed: dict[str, dict[str, Any]] = {}
     for name, column in columns.items():
         little = np.ascontiguousarray(column, column.dtype.newbyteorder("<"))
@@ -23,7 +25,7 @@ def pack_columns(columns: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, Any
     return packed
 
 
-def read_columns(value: object) -> dict[str, NDArray[Any]]:
+def read_columns(value: object) -> "dict[str, NDArray[Any]]":
     """Return the named arrays of blocks, read-only.
 
     Raises:
@@ -34,13 +36,15 @@ def read_columns(value: object) -> dict[str, NDArray[Any]]:
     return {str(name): _read(str(name), block) for name, block in value.items()}
 
 
-def _read(name: str, block: object) -> NDArray[Any]:
+def _read(name: str, block: object) -> "NDArray[Any]":
+    import numpy as np  # noqa: PLC0415  as above
+
     if not isinstance(block, dict):
         raise invalid(name, "an array block", block)
     kind, shape, data = block.get("dtype"), block.get("shape"), block.get("data")
-    dtype = DTYPES.get(kind) if isinstance(kind, str) else None
-    if dtype is None:
+    if not isinstance(kind, str) or kind not in DTYPES:
         raise invalid(f"{name}.dtype", f"one of {', '.join(DTYPES)}", kind)
+    dtype = np.dtype(DTYPES[kind])
     if not isinstance(shape, list) or not 0 < len(shape) <= MAX_DIMENSIONS:
         raise invalid(f"{name}.shape", f"a list of 1 to {MAX_DIMENSIONS} lengths", shape)
     if not all(type(length) is int and 0 <= length < 2**31 for length in shape):

@@ -5,10 +5,9 @@ which software it was. It is one msgpack map, and does not depend on the service
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgpack
-from numpy.typing import NDArray
 
 from optipmb_schemas.codec import decode, encode
 from optipmb_schemas.columns import pack_columns, read_columns
@@ -16,6 +15,9 @@ from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import Limits
 from optipmb_schemas.messages import Detections, Points
 from optipmb_schemas.structure import check_msgpack
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 FORMAT: Final = "optipmb-dump"
 VERSION: Final = 2
@@ -67,7 +69,7 @@ class Dump:
     parameters: dict[str, Any]
     stamp_ns: int
     next_id: int
-    density: dict[str, NDArray[Any]]
+    density: "dict[str, NDArray[Any]]"
     frames: tuple[DumpedFrame, ...]
 
 

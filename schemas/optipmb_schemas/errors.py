@@ -5,9 +5,7 @@ message as a whole. Texts that quote a received value are short and printable wh
 into logs, terminals and `Problem` messages as they are.
 """
 
-from typing import Final, Literal
-
-import numpy as np
+from typing import Any, Final, Literal
 
 Code = Literal["malformed", "wrong_type", "unsupported_version", "too_large", "missing_field", "invalid_value"]
 
@@ -60,7 +58,8 @@ def invalid(path: str, expected: str, received: object) -> MessageError:
 
 def show(value: object) -> str:
     """Return a short printable ASCII text for any received value, in time and memory that do not grow with it."""
-    if isinstance(value, np.generic):
+    shape: Any = getattr(value, "shape", None)  # arrays and scalars of numpy, and of libraries like it
+    if shape == () and hasattr(value, "item"):
         value = value.item()
     if value is None:
         text = "nothing"
@@ -70,8 +69,8 @@ def show(value: object) -> str:
         text = f"an integer of {value.bit_length()} bits"
     elif isinstance(value, int | float):
         text = repr(value)
-    elif isinstance(value, np.ndarray):
-        text = f"{value.dtype} array of shape {shape_text(value.shape)}"
+    elif type(shape) is tuple and hasattr(value, "dtype"):
+        text = f"{value.dtype} array of shape {shape_text(shape)}"
     else:
         text = _show_container(value)
     return cut(text)

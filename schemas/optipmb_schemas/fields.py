@@ -7,11 +7,9 @@ import math
 import re
 from typing import Annotated, Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, WithJsonSchema
 
-from optipmb_schemas.arrays import Array
+from optipmb_schemas.arrays import Array, Reals, first_descent
 from optipmb_schemas.errors import cut, invalid
 
 CHUNK: Final = r"[A-Za-z0-9_.-]+"
@@ -87,11 +85,9 @@ def check_labels(labels: tuple[str, ...]) -> tuple[str, ...]:
     return labels
 
 
-def check_horizons(horizons: NDArray[np.float64]) -> NDArray[np.float64]:
+def check_horizons(horizons: Reals) -> Reals:
     """Return `horizons` when they ascend."""
-    steps = np.diff(horizons)
-    if steps.size and steps.min() <= 0.0:
-        at = int(np.argmax(steps <= 0.0)) + 1
+    if at := first_descent(horizons):
         raise invalid(f"[{at}]", f"a number above {horizons[at - 1]:g}, in ascending order", horizons[at])
     return horizons
 
@@ -123,7 +119,7 @@ Epoch = Annotated[
     WithJsonSchema({"type": "string", "pattern": "^[0-9a-fA-F]{32}$"}),
 ]
 Plain = Annotated[dict[str, Any], AfterValidator(_plain)]
-Horizons = Annotated[NDArray[np.float64], Array("f8", ("H",), 0, 30, above=True), AfterValidator(check_horizons)]
+Horizons = Annotated[Reals, Array("f8", ("H",), 0, 30, above=True), AfterValidator(check_horizons)]
 Labels = Annotated[
     tuple[Annotated[str, Field(strict=True, min_length=1, max_length=64)], ...],
     Field(max_length=256, fail_fast=True),

@@ -6,13 +6,12 @@ described here and nowhere else: the JSON Schemas and the tables of the document
 """
 
 import math
+from itertools import chain
 from typing import Annotated, Any, Final, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
-from optipmb_schemas.arrays import Array, unit_quaternion
+from optipmb_schemas.arrays import Array, Integers, Numeric, Reals, Singles, first_descent, numeric, unit_quaternion
 from optipmb_schemas.errors import MessageError, invalid, show
 from optipmb_schemas.fields import Count, Epoch, Flag, Horizons, Labels, Name, NonNegative, SessionId, Stamp, Stream
 from optipmb_schemas.model import Message
@@ -35,29 +34,25 @@ SYMMETRY = 1e-6
 class Pose(Message):
     """Pose of the sensor: takes points of the sensor frame to the world frame (rotate first, then translate)."""
 
-    translation: Annotated[NDArray[np.float64], Array("f8", (3,), -FAR, FAR)] = Field(
+    translation: Annotated[Reals, Array("f8", (3,), -FAR, FAR)] = Field(
         description="Position of the sensor in the world frame: x, y, z in metres."
     )
-    quaternion: Annotated[NDArray[np.float64], Array("f8", (4,), -1.001, 1.001), AfterValidator(unit_quaternion)] = (
-        Field(
-            description="Rotation from the sensor frame to the world frame: w, x, y, z; its norm within 0.001 of one."
-        )
+    quaternion: Annotated[Reals, Array("f8", (4,), -1.001, 1.001), AfterValidator(unit_quaternion)] = Field(
+        description="Rotation from the sensor frame to the world frame: w, x, y, z; its norm within 0.001 of one."
     )
 
 
 class FieldOfView(Message):
     """Where the sensor detects objects, in its own axes (x forward, y left, z up); each field is an interval."""
 
-    azimuth: Annotated[NDArray[np.float64], Array("f8", (2,), -TURN, TURN)] = Field(
+    azimuth: Annotated[Reals, Array("f8", (2,), -TURN, TURN)] = Field(
         description="The sector counter-clockwise from the first angle to the second, radians from x; [-pi, pi] is the "
         "full circle, [2.5, -2.5] looks backwards."
     )
-    elevation: Annotated[NDArray[np.float64], Array("f8", (2,), -QUARTER, QUARTER)] = Field(
+    elevation: Annotated[Reals, Array("f8", (2,), -QUARTER, QUARTER)] = Field(
         description="Radians above the xy plane; [-pi/2, pi/2]: no limit."
     )
-    range: Annotated[NDArray[np.float64], Array("f8", (2,), 0, 1e9)] = Field(
-        description="Distance from the sensor in metres."
-    )
+    range: Annotated[Reals, Array("f8", (2,), 0, 1e9)] = Field(description="Distance from the sensor in metres.")
 
     def check(self) -> None:
         """No interval is empty, and none is wider than a turn."""
@@ -105,23 +100,23 @@ class Detections(SensorMessage):
     """The detected objects of one frame, M of them (M may be 0). One row of every array is one object."""
 
     labels: Labels = Field(description="Names of the classes that `label` counts, for example `car`. All different.")
-    label: Annotated[NDArray[np.int64], Array("i8", ("M",), 0, 255)] = Field(
+    label: Annotated[Integers, Array("i8", ("M",), 0, 255)] = Field(
         description="Class of each object as an index into `labels`, from 0."
     )
-    center: Annotated[NDArray[np.float64], Array("f8", ("M", 3), -FAR, FAR)] = Field(
+    center: Annotated[Reals, Array("f8", ("M", 3), -FAR, FAR)] = Field(
         description="Geometric centres of the boxes: x, y, z in metres, in `frame`."
     )
-    size: Annotated[NDArray[np.float64], Array("f8", ("M", 3), 0, 1e4, above=True)] = Field(
+    size: Annotated[Reals, Array("f8", ("M", 3), 0, 1e4, above=True)] = Field(
         description="Length (along the heading), width, height in metres."
     )
-    yaw: Annotated[NDArray[np.float64], Array("f8", ("M",), -1e4, 1e4)] = Field(
+    yaw: Annotated[Reals, Array("f8", ("M",), -1e4, 1e4)] = Field(
         description="Heading in radians, counter-clockwise about z from the x axis of `frame`."
     )
-    score: Annotated[NDArray[np.float64], Array("f8", ("M",), 0, 1)] = Field(
+    score: Annotated[Reals, Array("f8", ("M",), 0, 1)] = Field(
         description="Confidence of the detector. Logits must be passed through a sigmoid first. An object of score 0 "
         "is left out and counted in `Tracks.ignored`."
     )
-    velocity: Annotated[NDArray[np.float64], Array("f8", ("M", 2), -1e3, 1e3, unknown=True)] | None = Field(
+    velocity: Annotated[Reals, Array("f8", ("M", 2), -1e3, 1e3, unknown=True)] | None = Field(
         default=None,
         description="Velocity over ground in m/s along the x and y axes of `frame` (not relative to a moving sensor). "
         "A row of two NaN (JSON: null) is an object of unknown velocity. Absent: unknown for all.",
@@ -137,13 +132,11 @@ class Detections(SensorMessage):
         "Objects outside are neither detected nor missed. Absent: the sensor sees everything.",
     )
 
-    position_covariance: Annotated[NDArray[np.float64], Array("f8", ("M", 3, 3), -1e8, 1e8, unknown=True)] | None = (
-        Field(
-            default=None,
-            description="Covariance of the errors of each centre's x, y and z in m^2, along the axes of `frame`: "
-            "symmetric, the variance along every axis from 1e-8 to 1e8. A matrix of NaN (JSON: null) is an object for "
-            "which the profile's noise holds. Absent: it holds for all.",
-        )
+    position_covariance: Annotated[Reals, Array("f8", ("M", 3, 3), -1e8, 1e8, unknown=True)] | None = Field(
+        default=None,
+        description="Covariance of the errors of each centre's x, y and z in m^2, along the axes of `frame`: "
+        "symmetric, the variance along every axis from 1e-8 to 1e8. A matrix of NaN (JSON: null) is an object for "
+        "which the profile's noise holds. Absent: it holds for all.",
     )
 
     def check(self) -> None:
@@ -157,7 +150,7 @@ class Detections(SensorMessage):
 class Points(SensorMessage):
     """One point cloud of the sensor. Its `seq` counts clouds, apart from the detections."""
 
-    xyz: Annotated[NDArray[np.float32], Array("f4", ("P", 3), -FAR, FAR, wider=True)] = Field(
+    xyz: Annotated[Singles, Array("f4", ("P", 3), -FAR, FAR, wider=True)] = Field(
         description="Points x, y, z in metres, in `frame`. Further columns (up to 64) are dropped. "
         "All must be finite: leave out the points without a return."
     )
@@ -202,50 +195,46 @@ class Tracks(Header):
         default=0, description="Number of detections left out: their class is not in the profile, or their score is 0."
     )
     labels: Labels = Field(description="Names of the classes that `label` counts.")
-    id: Annotated[NDArray[np.int64], Array("i8", ("N",), 0, INT64)] = Field(
+    id: Annotated[Integers, Array("i8", ("N",), 0, INT64)] = Field(
         description="Identity of the track: unique in the stream, never used again. Ascending."
     )
-    label: Annotated[NDArray[np.int64], Array("i8", ("N",), 0, 255)] = Field(
-        description="Class, an index into `labels`."
-    )
-    center: Annotated[NDArray[np.float64], Array("f8", ("N", 3), -FAR * 10, FAR * 10)] = Field(
+    label: Annotated[Integers, Array("i8", ("N",), 0, 255)] = Field(description="Class, an index into `labels`.")
+    center: Annotated[Reals, Array("f8", ("N", 3), -FAR * 10, FAR * 10)] = Field(
         description="Geometric centres of the boxes: x, y, z in metres, world frame."
     )
-    size: Annotated[NDArray[np.float64], Array("f8", ("N", 3), 0, 1e5, above=True)] = Field(
+    size: Annotated[Reals, Array("f8", ("N", 3), 0, 1e5, above=True)] = Field(
         description="Length, width, height in metres."
     )
-    yaw: Annotated[NDArray[np.float64], Array("f8", ("N",), -1e5, 1e5)] = Field(
+    yaw: Annotated[Reals, Array("f8", ("N",), -1e5, 1e5)] = Field(
         description="Heading in radians, counter-clockwise about z from the x axis of the world frame."
     )
-    heading_confidence: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1)] | None = Field(
+    heading_confidence: Annotated[Reals, Array("f8", ("N",), 0, 1)] | None = Field(
         default=None,
         description="Probability that the object faces along `yaw` and not the other way; 1 where the profile does not "
         "follow it. Absent: from a service that did not tell.",
     )
-    velocity: Annotated[NDArray[np.float64], Array("f8", ("N", 2), -1e5, 1e5)] = Field(
+    velocity: Annotated[Reals, Array("f8", ("N", 2), -1e5, 1e5)] = Field(
         description="Velocity in m/s along x and y of the world frame."
     )
-    yaw_rate: Annotated[NDArray[np.float64], Array("f8", ("N",), -1e5, 1e5)] = Field(description="Turn rate in rad/s.")
-    acceleration: Annotated[NDArray[np.float64], Array("f8", ("N",), -1e5, 1e5)] = Field(
+    yaw_rate: Annotated[Reals, Array("f8", ("N",), -1e5, 1e5)] = Field(description="Turn rate in rad/s.")
+    acceleration: Annotated[Reals, Array("f8", ("N",), -1e5, 1e5)] = Field(
         description="Acceleration along the heading in m/s^2."
     )
-    existence: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1)] = Field(
-        description="Probability that the object exists."
-    )
-    score: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1)] = Field(description="Confidence of the track.")
-    covariance: Annotated[NDArray[np.float64], Array("f8", ("N", 6, 6), -1e30, 1e30)] = Field(
+    existence: Annotated[Reals, Array("f8", ("N",), 0, 1)] = Field(description="Probability that the object exists.")
+    score: Annotated[Reals, Array("f8", ("N",), 0, 1)] = Field(description="Confidence of the track.")
+    covariance: Annotated[Reals, Array("f8", ("N", 6, 6), -1e30, 1e30)] = Field(
         description="Covariance of [x, y, speed, heading, turn rate, acceleration], in the units above."
     )
-    age: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1e12)] = Field(
+    age: Annotated[Reals, Array("f8", ("N",), 0, 1e12)] = Field(
         description="Seconds since the first detection of the track."
     )
-    time_since_detection: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1e12)] = Field(
+    time_since_detection: Annotated[Reals, Array("f8", ("N",), 0, 1e12)] = Field(
         description="Seconds since the last detection of the track; 0 when this frame has one."
     )
-    detection: Annotated[NDArray[np.int64], Array("i8", ("N",), -1, INT64)] = Field(
+    detection: Annotated[Integers, Array("i8", ("N",), -1, INT64)] = Field(
         description="Row of the associated detection in the `Detections` message of this frame; -1: none."
     )
-    confirmed: Annotated[NDArray[np.int64], Array("i8", ("N",), 0, 1)] | None = Field(
+    confirmed: Annotated[Integers, Array("i8", ("N",), 0, 1)] | None = Field(
         default=None,
         description="1: the track is confirmed, its existence reached a threshold of the profile and has not fallen "
         "below a lower one since; 0: it may be of nothing. Absent: from a service that did not tell.",
@@ -255,13 +244,13 @@ class Tracks(Header):
         description="Times after `stamp_ns` in seconds, ascending, at which the predicted paths are given. Absent, as "
         "are the next three: the session has no horizons.",
     )
-    path_position: Annotated[NDArray[np.float64], Array("f8", ("N", "H", 2), -FAR * 1e4, FAR * 1e4)] | None = Field(
+    path_position: Annotated[Reals, Array("f8", ("N", "H", 2), -FAR * 1e4, FAR * 1e4)] | None = Field(
         default=None, description="Predicted x and y of the centres at each horizon: metres, world frame."
     )
-    path_yaw: Annotated[NDArray[np.float32], Array("f4", ("N", "H"), -1e5, 1e5)] | None = Field(
+    path_yaw: Annotated[Singles, Array("f4", ("N", "H"), -1e5, 1e5)] | None = Field(
         default=None, description="Predicted headings, as `yaw`."
     )
-    path_covariance: Annotated[NDArray[np.float32], Array("f4", ("N", "H", 2, 2), -1e30, 1e30)] | None = Field(
+    path_covariance: Annotated[Singles, Array("f4", ("N", "H", 2, 2), -1e30, 1e30)] | None = Field(
         default=None, description="Covariance of the predicted x and y, m^2."
     )
     delivery: Delivery | None = Field(default=None, description="How this publication came about.")
@@ -270,9 +259,7 @@ class Tracks(Header):
         """Labels must be in the list, ids ascending, the fields of paths there together."""
         super().check()
         _check_labels(self.label, self.labels)
-        steps = np.diff(self.id)
-        if steps.size and steps.min() <= 0:
-            at = int(np.argmax(steps <= 0)) + 1
+        if at := first_descent(self.id):
             raise invalid(f"id[{at}]", f"an id above {self.id[at - 1]}, in ascending order", self.id[at])
         absent = [name for name in PATHS if getattr(self, name) is None]
         if absent and len(absent) < len(PATHS):
@@ -283,9 +270,7 @@ PATHS: Final = ("horizons", "path_position", "path_yaw", "path_covariance")
 """Fields of `Tracks` with predicted paths."""
 
 
-def path_fields(
-    horizons: NDArray[np.float64], mean: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> dict[str, NDArray[Any]]:
+def path_fields(horizons: Reals, mean: Reals, covariance: Reals) -> dict[str, Numeric]:
     """Return the fields of `Tracks` with predicted paths.
 
     Args:
@@ -316,19 +301,13 @@ class Density(Message):
     session: SessionId = Field(description="32 hexadecimal digits, as in the tracks; all 0: without a session.")
     stamp_ns: Stamp | None = Field(default=None, description="Stamp of the newest frame. Absent: no frame yet.")
     labels: Labels = Field(description="Names of the classes that `label` counts.")
-    label: Annotated[NDArray[np.int64], Array("i8", ("N",), 0, 255)] = Field(
-        description="Class, an index into `labels`."
-    )
-    weight: Annotated[NDArray[np.float64], Array("f8", ("N",), 0, 1e30)] = Field(
-        description="Expected number of objects."
-    )
-    mean: Annotated[NDArray[np.float64], Array("f8", ("N", 6), -1e30, 1e30)] = Field(
+    label: Annotated[Integers, Array("i8", ("N",), 0, 255)] = Field(description="Class, an index into `labels`.")
+    weight: Annotated[Reals, Array("f8", ("N",), 0, 1e30)] = Field(description="Expected number of objects.")
+    mean: Annotated[Reals, Array("f8", ("N", 6), -1e30, 1e30)] = Field(
         description="Mean of [x, y, speed, heading, turn rate, acceleration]: world frame, metres, seconds, radians."
     )
-    covariance: Annotated[NDArray[np.float64], Array("f8", ("N", 6, 6), -1e30, 1e30)] = Field(
-        description="Covariance of the same."
-    )
-    z: Annotated[NDArray[np.float64], Array("f8", ("N",), -1e30, 1e30)] = Field(
+    covariance: Annotated[Reals, Array("f8", ("N", 6, 6), -1e30, 1e30)] = Field(description="Covariance of the same.")
+    z: Annotated[Reals, Array("f8", ("N",), -1e30, 1e30)] = Field(
         description="Height of the centre in metres, world frame."
     )
 
@@ -338,23 +317,40 @@ class Density(Message):
         _check_labels(self.label, self.labels)
 
 
-def _check_labels(label: NDArray[np.int64], labels: tuple[str, ...]) -> None:
-    if label.size and label.max() >= len(labels):
-        at = int(label.argmax())
-        raise MessageError("invalid_value", f"label[{at}]", f"an index into the {len(labels)} labels", show(label[at]))
+def _check_labels(label: Integers, labels: tuple[str, ...]) -> None:
+    indices = label.tolist()
+    if (most := max(indices, default=-1)) >= len(labels):
+        at = indices.index(most)
+        raise MessageError("invalid_value", f"label[{at}]", f"an index into the {len(labels)} labels", show(most))
 
 
-def _check_covariances(covariance: NDArray[np.float64]) -> None:
-    given: NDArray[np.bool_] = ~np.all(np.isnan(covariance), axis=(1, 2))
-    known = np.where(given[:, None, None], covariance, np.eye(3))
-    good: NDArray[np.bool_] = np.all(np.isfinite(known), axis=(1, 2))
-    known[~good] = 0.0
-    difference = np.abs(known - known.transpose(0, 2, 1)).max(axis=(1, 2))
-    known = 0.5 * (known + known.transpose(0, 2, 1))
-    variance = np.linalg.eigvalsh(known)
-    good &= (difference <= SYMMETRY * known.max(axis=(1, 2))) & (variance[:, 0] >= LEAST_VARIANCE)
-    good &= variance[:, 2] <= FAR
-    if not good.all():
-        at = int(np.argmin(good))
-        expected = "a symmetric covariance with variances from 1e-8 to 1e8 along every axis, or NaN alone"
-        raise invalid(f"position_covariance[{at}]", expected, covariance[at].tolist())
+def _check_covariances(covariance: Reals) -> None:
+    for at, good in enumerate(numeric.of_each_matrix(_is_covariance, covariance)):
+        if not good and not all(map(math.isnan, chain.from_iterable(rows := covariance[at].tolist()))):
+            expected = "a symmetric covariance with variances from 1e-8 to 1e8 along every axis, or NaN alone"
+            raise invalid(f"position_covariance[{at}]", expected, rows)
+
+
+def _is_covariance(matrix: Any) -> Any:
+    """Return whether a matrix (3, 3) is symmetric with its eigenvalues within the limits, element by element.
+
+    The elements may be arrays, which hold those of several matrices: so is what is returned. NaN gives False.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
+    good = True
+    for one, other in ((xy, yx), (xz, zx), (yz, zy)):
+        gap = abs(one - other) / SYMMETRY
+        good = good & ((gap <= xx) | (gap <= yy) | (gap <= zz))
+    mixed = (0.5 * (xy + yx), 0.5 * (xz + zx), 0.5 * (yz + zy))
+    good = good & _semidefinite(xx - LEAST_VARIANCE, yy - LEAST_VARIANCE, zz - LEAST_VARIANCE, *mixed)
+    return good & _semidefinite(FAR - xx, FAR - yy, FAR - zz, *(-one for one in mixed))
+
+
+def _semidefinite(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Any:
+    """Return whether no principal minor, and so no eigenvalue, of a symmetric matrix is negative."""
+    determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    minors = (yy, zz, xx * yy - xy * xy, xx * zz - xz * xz, yy * zz - yz * yz, determinant)
+    good = xx >= 0.0
+    for minor in minors:
+        good = good & (minor >= 0.0)
+    return good

@@ -3,10 +3,9 @@
 from types import UnionType
 from typing import Annotated, Any, ClassVar, Final, Self, Union, get_args, get_origin
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from optipmb_schemas.arrays import Array
+from optipmb_schemas.arrays import ARRAY, Array, numeric
 from optipmb_schemas.errors import MessageError, invalid, path_of, shape_text, show
 
 
@@ -62,9 +61,8 @@ class Message(BaseModel):
         holds, arrays their dtype and order; all fields are given that have no default.
         """
         for name, value in fields.items():
-            if type(value) is np.ndarray and value.flags.writeable:
-                fields[name] = array = value.view()
-                array.flags.writeable = False
+            if type(value) is ARRAY:
+                fields[name] = numeric.read_only(value)
         return cls.of_valid(cls.optional | fields, set(fields))
 
     def with_trusted(self, /, **fields: Any) -> Self:
@@ -122,12 +120,12 @@ class Message(BaseModel):
 
     def __repr_args__(self) -> list[tuple[str | None, Any]]:
         """Show arrays by type and shape."""
-        return [(n, show(v) if isinstance(v, np.ndarray) else v) for n, v in self.present()]
+        return [(n, show(v) if isinstance(v, ARRAY) else v) for n, v in self.present()]
 
 
 def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, np.ndarray):
-        return isinstance(other, np.ndarray) and one.shape == other.shape and one.tobytes() == other.tobytes()
+    if isinstance(one, ARRAY):
+        return isinstance(other, ARRAY) and one.shape == other.shape and one.tobytes() == other.tobytes()
     return bool(one == other)
 
 

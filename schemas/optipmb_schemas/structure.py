@@ -7,8 +7,6 @@ and there are not too many. What remains to be built afterwards is bounded by th
 
 from typing import Final
 
-import numpy as np
-
 from optipmb_schemas.blocks import LARGE
 from optipmb_schemas.errors import MessageError
 from optipmb_schemas.limits import Limits
@@ -103,7 +101,7 @@ def _truncated(size: int) -> MessageError:
     return MessageError("malformed", "", "a whole msgpack value", f"one cut short after {size} bytes")
 
 
-_QUOTE: Final = ord('"')
+_PIECE: Final = 2**16
 _BRACKETS: Final = bytes.maketrans(b"{}", b"[]")
 _NOT_BRACKETS: Final = bytes(set(range(256)) - set(b"[]{}"))
 
@@ -115,9 +113,13 @@ def check_json(payload: bytes, limits: Limits) -> None:
         MessageError: `too_large` when there are too many values, `malformed` when brackets are too deep or unpaired.
     """
     # Without escaped characters, every second quote ends a text. Backslashes outside of texts are no JSON anyway.
-    characters = np.frombuffer(payload.replace(b"\\\\", b"").replace(b'\\"', b""), np.uint8)
-    inside = np.logical_xor.accumulate(characters == _QUOTE)
-    outside = characters[~inside].tobytes()
+    characters = payload.replace(b"\\\\", b"").replace(b'\\"', b"")
+    parts, inside = [], 0
+    for begin in range(0, len(characters), _PIECE):  # in pieces, which bounds the memory for their parts
+        between = characters[begin : begin + _PIECE].split(b'"')
+        parts.append(b"".join(between[inside::2]))
+        inside = (inside + len(between) - 1) % 2
+    outside = b"".join(parts)
     values = sum(map(outside.count, (b",", b":", b"[", b"{")))
     if values > limits.max_values:
         raise MessageError("too_large", "", f"at most {limits.max_values} values", f"about {values}")

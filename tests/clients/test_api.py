@@ -1,6 +1,8 @@
 """Publisher and Subscriber through a real router; plain Zenoh sessions play the other side."""
 
+import functools
 import re
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -15,6 +17,7 @@ from optipmb_client import Connection, ConnectionFailed, Publisher, Subscriber
 from optipmb_client.transport import Inbox
 from optipmb_schemas import Detections, Message, MessageError, Points, Problem, Tracks, decode, encode, encoding_of
 from routers import free_endpoint, open_client
+from without_numpy import command, publish_everything
 
 if TYPE_CHECKING:
     from optipmb_client.links import Link
@@ -99,6 +102,20 @@ def service(endpoint: str) -> Iterator[Service]:
     """The other side, with a session of its own."""
     with open_client(endpoint) as session:
         yield Service(session)
+
+
+def test_without_numpy_the_same_is_published(link: Connection, endpoint: str) -> None:
+    """A process without numpy publishes poses, fields of view, covariances and clouds as one with numpy does."""
+    boxes, clouds = listen(link, "detections"), listen(link, "points")
+    publish_everything(functools.partial(Publisher, connect=endpoint))
+    code = "import functools\nfrom optipmb_client import Publisher\nfrom without_numpy import publish_everything\n"
+    code += "publish_everything(functools.partial(Publisher, connect=sys.argv[2]))"
+    subprocess.run([*command(code), endpoint], check=True, timeout=DEADLINE_S)
+    for inbox, kind, count in ((boxes, Detections, 2), (clouds, Points, 1)):
+        arrivals = [inbox.get(DEADLINE_S) for _ in range(2 * count)]
+        messages = [arrival.read(kind).model_copy(update={"epoch": bytes(16)}) for arrival in arrivals if arrival]
+        assert messages[:count] == messages[count:]
+        assert len(messages) == 2 * count
 
 
 def test_detections_arrive_as_published(link: Connection) -> None:

@@ -12,22 +12,34 @@ from optipmb_client import Publisher
 from optipmb_client.child import ServiceProcess
 from optipmb_client.transport import DEFAULT_ENDPOINT
 from real_data import REPOSITORY
+from without_numpy import command
 
 EXAMPLES = REPOSITORY / "examples"
 README = REPOSITORY / "README.md"
 
 
-def example(name: str, service: ServiceProcess, folder: Path) -> list[str]:
-    """Give the command that runs an example against a service that does not listen at the default endpoint."""
+def example(name: str, service: ServiceProcess, folder: Path, *, numpy: bool) -> list[str]:
+    """Give the command that runs an example against a service that does not listen at the default endpoint.
+
+    Without numpy it publishes another stream, for the service keeps the tracks of a stream for those who come late.
+    """
     text = (EXAMPLES / name).read_text()
     assert text.count(DEFAULT_ENDPOINT) == 1, "the example names the endpoint, once"
     path = folder / name
-    path.write_text(text.replace(DEFAULT_ENDPOINT, service.endpoint))
-    return [sys.executable, str(path)]
+    text = text.replace(DEFAULT_ENDPOINT, service.endpoint)
+    if numpy:
+        path.write_text(text)
+        return [sys.executable, str(path)]
+    path.write_text(text.replace("robot-1", "robot-2"))
+    return [*command("import runpy; runpy.run_path(sys.argv[2])"), str(path)]
 
 
-def test_publisher_and_subscriber(service: ServiceProcess, tmp_path: Path) -> None:
-    """The subscriber prints the car that the publisher publishes, under one identity, moving along x at 10 m/s."""
+@pytest.mark.parametrize("numpy", [True, False])
+def test_publisher_and_subscriber(service: ServiceProcess, tmp_path: Path, *, numpy: bool) -> None:
+    """The subscriber prints the car that the publisher publishes, under one identity, moving along x at 10 m/s.
+
+    Both need no numpy.
+    """
     lines: list[str] = []
     listening = threading.Event()
 
@@ -38,7 +50,9 @@ def test_publisher_and_subscriber(service: ServiceProcess, tmp_path: Path) -> No
 
     with (
         Publisher("garage/test/probe", service.endpoint, frame="world") as probe,
-        subprocess.Popen(example("subscriber.py", service, tmp_path), stdout=subprocess.PIPE, text=True) as subscriber,
+        subprocess.Popen(
+            example("subscriber.py", service, tmp_path, numpy=numpy), stdout=subprocess.PIPE, text=True
+        ) as subscriber,
     ):
         assert subscriber.stdout is not None
         reader = threading.Thread(target=read, args=(subscriber.stdout,))
@@ -48,10 +62,10 @@ def test_publisher_and_subscriber(service: ServiceProcess, tmp_path: Path) -> No
             probe.publish(stamp_ns=number * 100_000_000, **box)
             if listening.wait(0.1):
                 break
-        subprocess.run(example("publisher.py", service, tmp_path), check=True, timeout=200)
+        subprocess.run(example("publisher.py", service, tmp_path, numpy=numpy), check=True, timeout=200)
         reader.join(60.0)
         assert subscriber.wait(120) == 0
-    rows = [line.split() for line in lines if line.startswith("garage/robot-1/lidar ")]
+    rows = [line.split() for line in lines if line.startswith(f"garage/robot-{1 if numpy else 2}/lidar ")]
     assert len(rows) >= 45
     assert {(row[2], row[3]) for row in rows} == {(rows[0][2], "car")}
     x = [float(row[5]) for row in rows]

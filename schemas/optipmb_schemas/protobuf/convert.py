@@ -18,7 +18,6 @@ from google.protobuf.message import DecodeError
 from google.protobuf.message import Message as ProtoMessage
 from numpy.typing import NDArray
 
-from optipmb_schemas.blocks import DTYPES
 from optipmb_schemas.codec import build
 from optipmb_schemas.compact import checked, checked_part
 from optipmb_schemas.errors import MessageError, invalid
@@ -33,7 +32,8 @@ P = TypeVar("P", bound=ProtoMessage)
 _DTYPE_NAMES: Final[dict[int, str]] = {
     code: name.rpartition("_")[2].lower() for name, code in pb.DataType.items() if code
 }
-DTYPE_CODES: Final[dict[np.dtype[Any], Any]] = {DTYPES[name]: code for code, name in _DTYPE_NAMES.items()}
+_DTYPES: Final = {code: np.dtype(f"<{name}") for code, name in _DTYPE_NAMES.items()}
+DTYPE_CODES: Final[dict[str, Any]] = {name: code for code, name in _DTYPE_NAMES.items()}
 _USUAL: Final = {"i8": pb.DATA_TYPE_I8, "f8": pb.DATA_TYPE_F8}
 _FRAMES: Final[dict[int, str]] = {pb.FRAME_WORLD: "world", pb.FRAME_SENSOR: "sensor"}
 _FRAME_CODES: Final = {name: code for code, name in _FRAMES.items()}
@@ -58,7 +58,7 @@ def to_proto(message: Message) -> Any:
     fields: dict[str, Any] = {}
     for name, value in message.present():
         if isinstance(value, np.ndarray):
-            fields[name] = value.tolist() if name in _repeated(kind) else _array(value)
+            fields[name] = value.tolist() if name in _repeated(kind) else _array(value, kind.arrays[name].dtype)
         elif isinstance(value, Message):
             fields[name] = to_proto(value)
         elif name == "frame":
@@ -81,7 +81,7 @@ def from_proto(proto: ProtoMessage, kind: type[T], limits: Limits = DEFAULT) -> 
 
 def column(array: pb.Array) -> NDArray[Any]:
     """Return a column that was checked before as an array, a view of its bytes."""
-    dtype = DTYPES[_DTYPE_NAMES[array.dtype]]
+    dtype = _DTYPES[array.dtype]
     return np.frombuffer(array.data, dtype).reshape(array.shape) if array.data else np.empty(array.shape, dtype)
 
 
@@ -123,9 +123,9 @@ def _doubles(values: Sequence[float], length: int) -> bytes:
     return pack(f"<{length}d", *values)
 
 
-def _array(array: NDArray[Any]) -> pb.Array:
-    little = array.dtype.newbyteorder("<")
-    return pb.Array(dtype=DTYPE_CODES[little], shape=array.shape, data=np.ascontiguousarray(array, little).tobytes())
+def _array(array: NDArray[Any], dtype: str) -> pb.Array:
+    data = np.ascontiguousarray(array, f"<{dtype}").tobytes()
+    return pb.Array(dtype=DTYPE_CODES[dtype], shape=array.shape, data=data)
 
 
 def _fields(proto: ProtoMessage) -> dict[str, Any]:

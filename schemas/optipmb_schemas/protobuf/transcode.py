@@ -122,9 +122,9 @@ def _columns(rows: int, horizons: int) -> list[tuple[str, str, list[int], int, b
     sizes, columns = {"N": rows, "H": horizons}, []
     for name, one in Tracks.arrays.items():
         shape = [length if isinstance(length, int) else sizes[length] for length in one.shape]
-        size = prod(shape) * DTYPES[one.dtype].itemsize
+        size = prod(shape) * DTYPES[one.dtype]
         proto: Any = pb.Tracks()
-        getattr(proto, name).CopyFrom(pb.Array(dtype=DTYPE_CODES[DTYPES[one.dtype]], shape=shape, data=bytes(size)))
+        getattr(proto, name).CopyFrom(pb.Array(dtype=DTYPE_CODES[one.dtype], shape=shape, data=bytes(size)))
         field: bytes = proto.SerializeToString()
         columns.append((name, one.dtype, shape, size, field[: len(field) - size]))
     return columns
