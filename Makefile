@@ -18,7 +18,7 @@ help:
 	@echo "make test    lint, types, schemas, tests, wheel"
 	@echo "make check   lint, types, and the tests nearest to what changed since SINCE=main, in less than a minute"
 	@echo "make accuracy  hold the figures of accuracy on KITTI and nuScenes, where their data are"
-	@echo "make alone   run the tests that measure memory and latency, one after the other"
+	@echo "make alone   run the tests that measure memory, latency and outages, one after the other"
 	@echo "make bounds  call the tracker with every kernel compiled with bounds checks, which takes a minute"
 	@echo "make ray     track on Ray clusters, with workers and a node killed, which takes a minute"
 	@echo "make lowest  test the wheel with the oldest packages that it may be installed with"
@@ -89,7 +89,7 @@ tests: kernels
 accuracy: kernels
 	$(BIN)/pytest -n $(JOBS) tests/clients -m accuracy
 
-# What measures memory and latency, one test after the other.
+# What measures memory, latency and outages, one test after the other.
 alone: kernels
 	$(BIN)/pytest tests/e2e -m alone
 

@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 OTHERS = {
-    "alone": ("e2e/test_load.py", "e2e/test_soak.py"),
+    "alone": ("e2e/test_cluster.py", "e2e/test_load.py", "e2e/test_soak.py"),
     "accuracy": ("clients/test_accuracy_kitti.py", "clients/test_accuracy_nuscenes.py"),
 }
 """Files whose tests `make test` leaves to `make alone` and `make accuracy`, by their marker."""

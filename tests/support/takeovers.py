@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from functools import cache
 from typing import TYPE_CHECKING
@@ -81,3 +82,12 @@ def outage_s(node: Node, since_ns: int, sensor: Sensor = SENSOR) -> float:
         if where == key and at > since_ns + 100_000_000
     ]
     return (min(later) - since_ns) / 1e9
+
+
+def longest_silence_s(node: Node, sensor: Sensor = SENSOR) -> float:
+    """Seconds between two tracks messages of a stream, at most."""
+    key = KEYS.tracks(sensor.stream)
+    times = [
+        at for at, (where, _, _) in zip(node.tracks_seen.times_ns, node.tracks_seen.items, strict=True) if where == key
+    ]
+    return max(later - earlier for earlier, later in itertools.pairwise(times)) / 1e9
