@@ -33,12 +33,15 @@ def render(services: Sequence[ServiceStatus]) -> RenderableType:
 
 
 def members_of(services: Iterable[ServiceStatus]) -> list[MemberSummary]:
-    """Return the members that services know, each as the one knows it that heard of it last, by name."""
-    members: dict[str, MemberSummary] = {}
-    for one in (member for service in services for member in service.members):
-        if one.member not in members or one.age_s < members[one.member].age_s:
-            members[one.member] = one
-    return [members[name] for name in sorted(members)]
+    """Return the members that services know, by name: each as it knows itself, else as who heard of it last does."""
+    members: dict[str, tuple[bool, float, MemberSummary]] = {}
+    for service in services:
+        for one in service.members:
+            own = one.member.startswith((f"{service.instance}/", f"{service.instance}-w"))
+            known = (not own, one.age_s, one)
+            if one.member not in members or known[:2] < members[one.member][:2]:
+                members[one.member] = known
+    return [members[name][2] for name in sorted(members)]
 
 
 def _members(members: Sequence[MemberSummary]) -> Table:

@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING, Self
 
 import pytest
+from commands import run_here
 from fleet import Fleet, RouterProcess, freeze, thaw
 from nats_process import NatsProcess
 from optipmb_schemas import ServiceStatus
@@ -41,6 +42,7 @@ class Cluster:
     def __init__(self, folder: Path, nats: NatsProcess | None, fleet: Fleet, beyond: str, node: Node) -> None:
         self.nats = nats
         self.node = node
+        self.endpoint = fleet.endpoint
         self.beyond = beyond
         """Where the router is that the node is not connected to."""
         self._folder = folder
@@ -247,6 +249,54 @@ def test_a_site_that_is_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert {stream: state.session for stream, state in states.items()} == sessions
     with capsys.disabled():
         print(f"\nsilent for {silent_s:.2f} s at most after a site was cut off (lease 2 s)")  # noqa: T201 - the figure
+
+
+@pytest.mark.timeout(600)
+def test_a_member_drains(cluster: Cluster, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fault 18: an operator drains a member while all streams go on, has it back, and another ends: no frame is lost.
+
+    `optipmb status` shows it, in 80 columns. A member that is alone is not drained.
+    """
+    node, endpoint = cluster.node, cluster.endpoint
+    monkeypatch.setenv("COLUMNS", "80")
+    first = cluster.member("a")
+
+    def run(*arguments: str) -> tuple[int, str]:
+        done = run_here(capsys, *arguments, "--connect", endpoint)
+        return done.returncode, done.stdout + done.stderr
+
+    status, text = run("drain", "a")
+    assert (status, "another member" in text) == (1, True)
+    second = cluster.member("b", cluster.beyond)
+    with Sending(node, 0) as sending:
+        for member in (first, second):
+            holds(member, 32)
+        cluster.settled("a", "b")
+        began_ns = time.monotonic_ns()
+        assert run("drain", "a") == (0, "a holds no streams\n")
+        holds(second, 64)
+        cluster.settled("b")
+        _, text = run("status")
+        lines = [line.split() for line in text.splitlines() if line.startswith(("a/", "b/"))]
+        assert [(line[1], line[2]) for line in lines] == [("draining", "0"), ("alive", "64")]
+        assert max(map(len, text.splitlines())) <= 80
+        assert node.ask(KEYS.status("a"), ServiceStatus).state == "draining"
+        members = node.ask(KEYS.status("b"), ServiceStatus).members
+        assert [(one.state, len(one.fences)) for one in members] == [("draining", 0), ("alive", 64)]
+        drained_s = max(longest_silence_s(node, one, began_ns) for one in SENSORS)
+        assert run("drain", "a", "--undo")[0] == 0
+        for member in (first, second):
+            holds(member, 32)
+        cluster.settled("a", "b")
+        began_ns = time.monotonic_ns()
+        assert second.end()[0] == 0
+        cluster.settled("a")
+        before = sending.frames
+        until(lambda: sending.frames > before + 5, "more frames")
+        ended_s = max(longest_silence_s(node, one, began_ns) for one in SENSORS)
+    cluster.check(sending.frames, "a")
+    with capsys.disabled():
+        print(f"\nsilent after a drain {drained_s:.2f} s, SIGTERM {ended_s:.2f} s, at 10 Hz")  # noqa: T201 - the figures
 
 
 @pytest.mark.timeout(600)

@@ -84,10 +84,9 @@ def outage_s(node: Node, since_ns: int, sensor: Sensor = SENSOR) -> float:
     return (min(later) - since_ns) / 1e9
 
 
-def longest_silence_s(node: Node, sensor: Sensor = SENSOR) -> float:
-    """Seconds between two tracks messages of a stream, at most."""
+def longest_silence_s(node: Node, sensor: Sensor = SENSOR, since_ns: int = 0) -> float:
+    """Seconds between two tracks messages of a stream, at most, since a time."""
     key = KEYS.tracks(sensor.stream)
-    times = [
-        at for at, (where, _, _) in zip(node.tracks_seen.times_ns, node.tracks_seen.items, strict=True) if where == key
-    ]
+    seen = tuple(zip(node.tracks_seen.times_ns, node.tracks_seen.items, strict=False))  # more may come meanwhile
+    times = [at for at, (where, _, _) in seen if where == key and at > since_ns]
     return max(later - earlier for earlier, later in itertools.pairwise(times)) / 1e9

@@ -16,6 +16,7 @@ from prometheus_client import CollectorRegistry, ProcessCollector, generate_late
 from prometheus_client.metrics_core import Metric
 
 from optipmb_service import __version__
+from optipmb_service.cluster.leases import ALIVE, instance_of
 from optipmb_service.observability import collectors
 from optipmb_service.observability.health import STUCK_S
 from optipmb_service.observability.metrics import Collected, ReadOnDemand, families
@@ -218,7 +219,7 @@ class AggregateView:
         """
         asked = drain_asked(request, self._limits)
         own = {f"{self._instance}-w{index}" for index in range(self._workers.count)}
-        if asked.drain and all(one.member.rpartition("/")[0] in own or one.state != "alive" for one in self._members()):
+        if asked.drain and all(instance_of(one.member) in own or one.state != ALIVE for one in self._members()):
             raise schemas.MessageError("invalid_value", "drain", "another member that takes the streams", "none")
         keys = [self._keys.drain(name) for name in sorted(own)]
         payload, encoding = schemas.encode(asked), schemas.encoding_of(schemas.DrainRequest)
@@ -274,9 +275,11 @@ class AggregateView:
 
 
 def _newest(parts: Iterable[schemas.ServiceStatus]) -> tuple[schemas.MemberSummary, ...]:
-    """Return the members that workers know, each as the one knows it that heard of it last."""
-    members: dict[str, schemas.MemberSummary] = {}
-    for one in (member for part in parts for member in part.members):
-        if one.member not in members or one.age_s < members[one.member].age_s:
-            members[one.member] = one
-    return tuple(members[name] for name in sorted(members))
+    """Return the members that workers know: each as it knows itself, else as who heard of it last does."""
+    members: dict[str, tuple[bool, float, schemas.MemberSummary]] = {}
+    for part in parts:
+        for one in part.members:
+            known = (instance_of(one.member) != part.instance, one.age_s, one)
+            if one.member not in members or known[:2] < members[one.member][:2]:
+                members[one.member] = known
+    return tuple(members[name][2] for name in sorted(members))

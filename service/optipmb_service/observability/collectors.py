@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from optipmb_service.observability.metrics import Value
     from optipmb_service.session.values import MessageCounters
 
-STATES: Final = ("starting", "ready", "degraded", "paused", "stopping")
+STATES: Final = ("starting", "ready", "degraded", "paused", "draining", "stopping")
 SESSION_STATES: Final = ("new", "running", "stale")
 QUANTILES: Final = ("0.5", "0.99")
 

@@ -48,6 +48,8 @@ EVENTS: Final = {
     "store_failed": "Checkpoints cannot be written (disk full, read-only): tracking goes on, the state is `degraded`.",
     "store_back": "Checkpoints are written again.",
     "partitions_held": "How many of 64 partitions, parts of all streams, this member holds, and who the `members` are.",
+    "leases_damaged": "The `file` of the leases, which is not synced, was damaged, as by a power cut, and was made"
+    " anew: nobody used it.",
     "lease_lost": "This member was frozen, starved or cut off for `lease_s`, and others continue its streams. It joins"
     " again at once.",
     "leases_failed": "The servers of `cluster`, or the folder `store`, cannot be used, for `error`: after half of"

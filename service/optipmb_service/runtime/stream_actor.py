@@ -178,11 +178,12 @@ class StreamActor:
             expected = f"at most {self._context.step_limit_ns / 1e9:g} s of processor time for a message"
             self._report("overload", "", expected, "a stream that took more just before", stream=stream)
             return
-        began_ns = time.thread_time_ns()
+        began_ns, held = time.thread_time_ns(), session.held
         try:
             self._track(session, packet, frame=frame)
         finally:
-            self._charge(stream, time.thread_time_ns() - began_ns)
+            # After a restore a message may let go many that were held for it.
+            self._charge(stream, (time.thread_time_ns() - began_ns) // max(1, held + frame - session.held))
 
     def _charge(self, stream: str, took_ns: int) -> None:
         """Degrade a stream when a message of it took too long: the others of the process waited for it."""
@@ -220,6 +221,11 @@ class StreamActor:
     def _arrived(self, packet: Packet, stream: str, *, frame: bool) -> None:
         """Note a valid message of a stream."""
         self.meter.arrived(packet.now_ns, frame=frame)
+        if self.fused and stream not in self.sensors and len(self.sensors) >= MAX_SENSORS:
+            oldest = min(self.sensors, key=lambda name: self.sensors[name].active_ns)
+            if oldest in self.stale:
+                self.stale.discard(oldest)
+                self.sensors = {name: one for name, one in self.sensors.items() if name != oldest}
         if self.fused and (stream in self.sensors or len(self.sensors) < MAX_SENSORS):
             self.sensors.setdefault(stream, StreamMeter(packet.now_ns)).arrived(packet.now_ns, frame=frame)
         if stream in self.stale and frame:

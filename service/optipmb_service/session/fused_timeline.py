@@ -30,6 +30,7 @@ from optipmb_service.session.timeline import (
     number_of,
     remembered,
 )
+from optipmb_service.session.values import MAX_SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -196,7 +197,7 @@ class FusedTimeline:
         one = JumpedFrames(1, stamp_ns, stamp_ns)
         if before is not None and 0 < stamp_ns - before.newest_ns <= self.gap_limit_ns:
             one = JumpedFrames(before.count + 1, before.since_ns, stamp_ns)
-        jumped = {**self.jumped, sensor: one}
+        jumped = {**_latest(self.jumped, MAX_SENSORS - 1), sensor: one}
         agreed = all(_agrees(jumped.get(name), stamp_ns, self.gap_limit_ns) for name in self.live() if name != sensor)
         alone = stamp_ns - one.since_ns > self.gap_limit_ns
         if one.count < JUMP_FRAMES or not (agreed or alone):
@@ -220,7 +221,18 @@ class FusedTimeline:
         return {**self.clock, frame_id.sensor: max(before, frame_id.stamp_ns)}
 
     def _remembering(self, frame_id: FrameId) -> Mapping[str, tuple[SeenNumbers, ...]]:
-        return {**self.seen, frame_id.sensor: remembered(self.seen.get(frame_id.sensor, ()), frame_id)}
+        seen = {**self.seen, frame_id.sensor: remembered(self.seen.get(frame_id.sensor, ()), frame_id)}
+        if len(seen) > MAX_SENSORS:
+            live = self.live()
+            silent = [name for name in seen if name not in live and name != frame_id.sensor]
+            for name in sorted(silent, key=lambda one: (self.clock.get(one, -1), one))[: len(seen) - MAX_SENSORS]:
+                del seen[name]
+        return seen
+
+
+def _latest(jumped: Mapping[str, JumpedFrames], most: int) -> dict[str, JumpedFrames]:
+    """Return those of the sensors that have come last."""
+    return dict(tuple(jumped.items())[-most:])
 
 
 def _order(frame_id: FrameId) -> tuple[int, str, int]:

@@ -79,7 +79,8 @@ class PendingFrames:
 
     def __init__(self, policy: Policy, timeline: Timeline | FusedTimeline) -> None:
         self.policy = policy
-        self.timeline = timeline
+        self._timeline = timeline
+        self._behind = False
         self.clouds = CloudBuffer(policy.clouds, policy.cloud_bytes)
         self._held: list[Held] = []
         self.held_bytes = 0
@@ -89,6 +90,20 @@ class PendingFrames:
 
     def __len__(self) -> int:
         return len(self._held)
+
+    @property
+    def timeline(self) -> Timeline | FusedTimeline:
+        """The timeline of the past with the frames held."""
+        if self._behind:
+            # Frames of other sensors were processed, of which the timeline with those held knows nothing.
+            self._behind = False
+            for one in self._held:
+                self._timeline = self._timeline.judge(one.frame_id)[1]
+        return self._timeline
+
+    @timeline.setter
+    def timeline(self, timeline: Timeline | FusedTimeline) -> None:
+        self._timeline, self._behind = timeline, False
 
     def add(
         self,
@@ -127,10 +142,7 @@ class PendingFrames:
         if not self._held:
             self.timeline = past
         elif isinstance(past, FusedTimeline):
-            # Frames of other sensors were processed, of which the timeline with those held knows nothing.
-            self.timeline = past
-            for one in self._held:
-                self.timeline = self.timeline.judge(one.frame_id)[1]
+            self._timeline, self._behind = past, True  # judged when it is asked for: many are let go before that
         elif gone:
             self.timeline = self.timeline.settle(base.cursors, base.last, gone)
 
@@ -187,8 +199,10 @@ class PendingFrames:
     def _cloud(self, held: Held) -> schemas.Points | None:
         if held.message.has_points is False:
             return None
-        frame_id, known = held.frame_id, self.timeline.knows
-        return self.clouds.get(frame_id.epoch, frame_id.stamp_ns, lambda one: known(replace(frame_id, epoch=one)))
+        frame_id = held.frame_id
+        return self.clouds.get(
+            frame_id.epoch, frame_id.stamp_ns, lambda one: self.timeline.knows(replace(frame_id, epoch=one))
+        )
 
     def _crowded(self, held: Held) -> bool:
         """Whether longer waiting for a cloud would cost the frames behind it theirs.

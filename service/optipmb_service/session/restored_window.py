@@ -29,7 +29,10 @@ def window_of(checkpoint: Checkpoint, gap_limit_ns: int) -> tuple[Timeline | Fus
     by_frame_id = {checkpoint.frame_id(one): one for one in checkpoint.window}
     timeline: Timeline | FusedTimeline
     if checkpoint.fused:
-        generation, frame_ids = checkpoint.head.generation, tuple(by_frame_id)
+        # A frame that was refused for its effort may have begun a generation that no frame was tracked in yet.
+        head = checkpoint.head
+        generation = max([head.generation, *(one.generation for one in head.cursors.values())])
+        frame_ids = tuple(by_frame_id)
         timeline = FusedTimeline.resume(gap_limit_ns, checkpoint.seen, base.cursors, base.last, frame_ids, generation)
     else:
         epochs, cursor = checkpoint.seen.get("", ()), base.sensor("").cursor

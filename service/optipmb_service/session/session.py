@@ -359,6 +359,11 @@ class Session:
         return self._run
 
     @property
+    def held(self) -> int:
+        """Frames that wait."""
+        return sum(map(len, self._pending.values()))
+
+    @property
     def held_bytes(self) -> int:
         """Bytes of the messages that are kept: frames that wait, clouds, and the window; nearly, for any thread."""
         window = sum(entry.weight for entry in self._processed.entries)
@@ -387,7 +392,7 @@ class Session:
             self._processed.head,
             condition="closed" if closed else self._condition,
             shed=shed,
-            queue=queue + sum(map(len, self._pending.values())),
+            queue=queue + self.held,
         )
 
     @property
@@ -536,10 +541,23 @@ class Session:
     def _sensor(self, name: str) -> PendingFrames | None:
         """Return what is held of a sensor, nothing for a new one; None when there are too many."""
         pending = self._pending.get(name)
+        if pending is None and len(self._pending) >= MAX_SENSORS:
+            self._forget_one()
         if pending is None and len(self._pending) < MAX_SENSORS:
             pending = self._pending[name] = PendingFrames(self._policy, self._processed.timeline)
             pending.recovery_ns = self._recovery_ns
         return pending
+
+    def _forget_one(self) -> None:
+        """Make room for a sensor: the one that fed the session longest ago goes, if that is not lately."""
+        timeline = self._processed.timeline
+        if isinstance(timeline, FusedTimeline):
+            live, newest_ns = timeline.live(), timeline.clock
+            silent = [name for name, one in self._pending.items() if not len(one) and name not in live]
+            if silent:
+                name = min(silent, key=lambda one: (newest_ns.get(one, -1), one))
+                del self._pending[name]
+                self._quarantine.pop(name, None)
 
     def _remember(
         self, pending: PendingFrames, judged_by: Timeline | FusedTimeline, arrived: Timeline | FusedTimeline

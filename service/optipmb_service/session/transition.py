@@ -22,7 +22,7 @@ from optipmb_service.session import convert
 from optipmb_service.session.pose_check import judge, position_of
 from optipmb_service.session.state import Entry, FilterState, FrameCounts, PoseHistory, SensorState
 from optipmb_service.session.timeline import FrameId, Verdict
-from optipmb_service.session.values import MAX_LABELS, SECOND, total
+from optipmb_service.session.values import MAX_LABELS, MAX_SENSORS, SECOND, total
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas
@@ -187,7 +187,7 @@ class Transition:
             last=frame_id,
             tracks=len(tracks.id),
             counts=_counted(before, entry, tracked=1, gap=gap, used=used, repaired=repaired),
-            sensors={**before.sensors, frame_id.sensor: known},
+            sensors=_sensors(before, frame_id.sensor, known),
         )
         return after, Outcome(entry, tracks, begins, unknown)
 
@@ -210,7 +210,16 @@ def _passed(
     counts = _counted(before, entry, astray=astray, effort=effort, unconfirmed=unconfirmed)
     frame_id, sensor = entry.frame_id, before.sensor(entry.frame_id.sensor)
     passed = replace(sensor, cursor=sensor.cursor.after(frame_id, entry.place), pose_history=pose_history)
-    return replace(before, last=frame_id, counts=counts, sensors={**before.sensors, frame_id.sensor: passed})
+    return replace(before, last=frame_id, counts=counts, sensors=_sensors(before, frame_id.sensor, passed))
+
+
+def _sensors(before: FilterState, name: str, state: SensorState) -> dict[str, SensorState]:
+    """Return the sensors after a frame of one; when there are too many, the one that was silent for longest goes."""
+    sensors = {**before.sensors, name: state}
+    if len(sensors) > MAX_SENSORS:
+        others = [(one.cursor.generation, one.cursor.newest_ns, other) for other, one in before.sensors.items()]
+        del sensors[min(one for one in others if one[2] != name)[2]]
+    return sensors
 
 
 def _counted(  # noqa: PLR0913 - all keywords, each a count

@@ -120,6 +120,25 @@ def test_a_stream_that_takes_too_long_rests(start: Callable[..., Any]) -> None:
         assert [one.seq for one in node.tracks(CARELESS.stream, 2)] == [0, 2]
 
 
+def test_catching_up_after_a_restart_is_no_overload(start: Callable[..., Any], tmp_path: Path) -> None:
+    """A message lets many frames go that were held for it: it takes as long as they, and none is refused for that."""
+    busy: list[float] = []
+    options = {"store": str(tmp_path), "step_limit_s": 0.2, "recovery_wait_s": 60.0}
+    make = {"tracker": lambda parameters: Slow(parameters, busy)}
+    service, endpoint = start(**make, **options)
+    with Node(endpoint) as node:
+        node.send(CARELESS.detections(0))
+        node.tracks(CARELESS.stream, 1)
+    assert service.stop()
+    service, endpoint = start(**make, **options)
+    busy += [0.02] * 30
+    with Node(endpoint) as node:
+        node.send(*(CARELESS.detections(seq) for seq in range(2, 32)))
+        until(lambda: [one.queue for one in service.status().sessions] == [30], "the frames are held")
+        node.send(CARELESS.detections(1), CARELESS.detections(32))
+        assert [one.seq for one in node.tracks(CARELESS.stream, 32)] == list(range(1, 33))
+
+
 def test_a_tracking_thread_that_is_stuck_is_not_healthy(start: Callable[..., Any]) -> None:
     """A step that does not end is seen from outside: neither alive nor ready, until it ends."""
     gate = threading.Event()

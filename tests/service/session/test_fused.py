@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_schemas import Pose
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import MAX_SENSORS, Policy
 from router import SECOND, Sensor
@@ -21,6 +22,7 @@ import optipmb
 
 if TYPE_CHECKING:
     from optipmb_schemas import Detections
+    from optipmb_service.session.timeline import FrameId
 
 NUSCENES = optipmb.load_profile("nuscenes")
 
@@ -208,6 +210,70 @@ def test_a_session_takes_so_many_sensors() -> None:
     outputs = feed(one, [0], replace(FRONT, stream="site/node/more"))
     assert [(p.code, p.stream) for p in problems(outputs)] == [("refused", "site/node/more")]
     assert len(one.density.bernoulli) == 1
+
+
+def test_a_sensor_that_is_silent_makes_room_for_another() -> None:
+    """Names may come and go for ever: of more than a session takes, those that were silent longest are forgotten.
+
+    So it goes on when it was written down and restored in between.
+    """
+    one = fused()
+    names = [f"site/node/s{number}" for number in range(6 * 30)]
+    for number, name in enumerate(names):
+        passed_s = 3.0 * (number // 30) + 0.01 * (number % 30)
+        assert len(tracks(feed(one, [0], delayed(replace(FRONT, stream=name), passed_s)))) == 1
+        if number % 30 == 29:
+            assert len(tracks(feed(one, [number], delayed(FRONT, passed_s - 0.1 * number + 0.001)))) == 1
+            one = Session.restore(
+                decode_checkpoint(encode_checkpoint(one.snapshot())), 0, Policy(recovery_wait_ns=0), tracker=chained
+            )
+            one.recovered(0)
+    for kept in (one._pending, one._processed.head.sensors, one._processed.timeline.seen):
+        assert len(kept) == MAX_SENSORS
+        assert names[-1] in kept
+        assert FRONT.stream in kept
+
+
+class Tired(optipmb.Tracker):
+    """Refuses frames of seven objects for their effort."""
+
+    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+        """Refuse, or go on."""
+        if len(frame.score) == 7:
+            raise optipmb.EffortError("pairs", "at most 7", "8")
+        return super().step(density, frame)
+
+
+def test_a_jump_stays_believed_when_its_first_frame_is_refused() -> None:
+    """The frame with which all agree needs too much computing: also after a restart the new clock is the session's."""
+    one, later = fused(tracker=Tired), delayed(FRONT, 3600.0)
+    feed(one, [0], FRONT)
+    assert [p.code for p in problems(feed(one, range(100, 103), later, objects=7))][-1] == "overload"
+    restored = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0, tracker=Tired)
+    restored.recovered(0)
+    for session in (one, restored):
+        outputs = feed(session, [103], later)
+        assert (begun(outputs), len(tracks(outputs))) == (["jump"], 1)
+    assert state_bytes(restored.snapshot()) == state_bytes(one.snapshot())
+
+
+def test_frames_held_are_judged_once_when_many_are_let_go() -> None:
+    """Letting n held frames go after a restore takes a number of judgements that grows with n, not with its square."""
+    one = fused()
+    given_to(one, in_order(4))
+    restored = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0, tracker=chained)
+    for sensor in (FRONT, SIDE):
+        feed(restored, range(6, 106), sensor)  # behind a gap: 4 and 5 are missing
+    judged, judge = [0], FusedTimeline.judge
+
+    def counted(timeline: FusedTimeline, frame_id: FrameId) -> Any:
+        judged[0] += 1
+        return judge(timeline, frame_id)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FusedTimeline, "judge", counted)
+        assert len(tracks(restored.recovered(0))) == 200
+    assert judged[0] < 1000
 
 
 def test_after_a_restart_the_caches_of_all_sensors_are_waited_for() -> None:
