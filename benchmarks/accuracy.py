@@ -1,6 +1,6 @@
 """The profiles with every detector, and two simple trackers: `python benchmarks/accuracy.py --root data`.
 
-Prints the tables of docs/tuning.md as Markdown: the profiles with each detector and class, and beside them, for some of
+Prints docs/tuning/detectors.csv: the profiles with each detector and class, and beside them, for some of
 these, a greedy tracker of nearest centres and AB3DMOT's Kalman filters (`tests/support/greedy.py`, `kalman.py`) with
 their published parameters. The same detections and evaluator; KITTI counts at a 3D overlap of 0.25, ten sequences.
 """
@@ -8,6 +8,7 @@ their published parameters. The same detections and evaluator; KITTI counts at a
 from __future__ import annotations
 
 import argparse
+import csv
 import sys
 from functools import partial
 from pathlib import Path
@@ -58,26 +59,28 @@ def ways(dataset: str, detections: str, name: str) -> Iterator[Way]:
         if name in HABITS:
             yield "Kalman filters (AB3DMOT)", partial(kalman_tracks, name=name)
     for profile in (f"{dataset}-paper", dataset):
-        yield f"`{profile}`", partial(track_clip, parameters=only(optipmb.load_profile(profile), name))
+        yield profile, partial(track_clip, parameters=only(optipmb.load_profile(profile), name))
 
 
-def backward(sequences: Sequence[DataSequence], clips: Sequence[Clip], profile: str, name: str, rules: Rules) -> str:
+def backward(
+    sequences: Sequence[DataSequence], clips: Sequence[Clip], profile: str, name: str, rules: Rules
+) -> tuple[str, str]:
     """Return the shares of boxes that face backwards, of tracks and of their detections, in percent."""
     parameters = only(optipmb.load_profile(profile), name)
     parts = ((one, clip.world, *track_fully(clip, parameters)) for one, clip in zip(sequences, clips, strict=True))
     found = evaluate_errors(parts, name, rules)
     shares = found.figures(found.detected)["backward"]
-    return f"{100 * shares['track']:.2f} | {100 * shares['detection']:.2f}"
+    return f"{100 * shares['track']:.2f}", f"{100 * shares['detection']:.2f}"
 
 
 def main() -> None:
-    """Print the tables."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, required=True, help="folder with kitti/ and nuscenes/")
     parser.add_argument("--degrade", action="store_true", help="of detections made worse, as `optipmb tune` does")
     given = parser.parse_args()
-    columns = (*SHOWN, "backward %", "of the detections")
-    print("| | tracker | " + " | ".join(columns) + " |\n| --- | --- |" + " ---: |" * len(columns))
+    out = csv.writer(sys.stdout, lineterminator="\n")
+    out.writerow(("detector", "class", "tracker", *SHOWN, "backward %", "of the detections"))
     for dataset, detections, names in SETS:
         options = {"z_bottom": True} if detections == "pointpillars" else {}
         opened = open_dataset(dataset, given.root / dataset, detections, clouds=False, **options)
@@ -91,9 +94,10 @@ def main() -> None:
             scorer = scorer_of(dataset, name, sequences)
             for way, run in ways(dataset, detections, name):
                 found = scorer.figures([scorer.measure(clip, run(clip)) for clip in clips]).to_json()
-                profile = way.strip("`")
-                sides = backward(sequences, clips, profile, name, scorer.near) if profile != way else "- | -"
-                print(f"| {detections} {name} | {way}", *(_shown(found[key]) for key in SHOWN), sides, "", sep=" | ")
+                known = way in optipmb.profiles()
+                sides = backward(sequences, clips, way, name, scorer.near) if known else ("-", "-")
+                out.writerow((detections, name, way, *(_shown(found[key]) for key in SHOWN), *sides))
+                sys.stdout.flush()
 
 
 def _shown(value: float | None) -> str:
