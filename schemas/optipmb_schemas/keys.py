@@ -4,6 +4,7 @@
 <prefix>/<stream>/q/state | q/density | q/reset | q/parameters    queries
 <prefix>/owner/<stream>/<instance>                            liveliness: who tracks this stream
 <prefix>/service/<instance>/alive                             liveliness: which services are there
+<prefix>/service/<instance>/discovered/<stream>               liveliness: streams whose publishers say nothing
 <prefix>/service/<instance>/q/status | q/metrics | q/move | q/drain     queries
 """
 
@@ -78,6 +79,22 @@ class Keys:
         """Return the key of the query that has an instance give its streams to others."""
         return f"{self.prefix}/service/{_instance(instance)}/q/drain"
 
+    def recent(self, instance: str = "") -> str:
+        """Return the key of the query for what an instance received lately and does not track; default: of all."""
+        return f"{self.prefix}/service/{_instance(instance) if instance else '*'}/q/recent"
+
+    def discovered(self, stream: str, instance: str) -> str:
+        """Return the liveliness key by which an instance says that a stream exists, for its publisher does not."""
+        return f"{self.prefix}/service/{_instance(instance)}/discovered/{_stream(stream)}"
+
+    def all_discovered(self) -> str:
+        """Return the key expression of all streams that instances have discovered."""
+        return f"{self.prefix}/service/*/discovered/*/*/*"
+
+    def all_publishers(self) -> str:
+        """Return the key expression of the tokens of publishers of detections with a cache, which Zenoh declares."""
+        return f"{self.all('detections')}/@adv/pub/**"
+
     def all(self, topic: Topic) -> str:
         """Return the key expression of a topic of all streams."""
         return f"{self.prefix}/*/*/*/{_one_of(topic, get_args(Topic))}"
@@ -111,7 +128,13 @@ class Keys:
     def stream_of(self, key: str) -> str:
         """Return the stream that a key of a topic, a query or an owner belongs to."""
         match self._chunks(key):
-            case ["owner", site, node, sensor, _] | [site, node, sensor, _] | [site, node, sensor, "q", _]:
+            case (
+                ["owner", site, node, sensor, _]
+                | ["service", _, "discovered", site, node, sensor]
+                | [site, node, sensor, _]
+                | [site, node, sensor, "q", _]
+                | [site, node, sensor, "detections", "@adv", "pub", *_]
+            ):
                 return _named("key", check_stream, f"{site}/{node}/{sensor}")
         raise invalid("key", f"a key of a stream under {self.prefix}", key)
 

@@ -10,7 +10,7 @@ It takes Zenoh's samples and imports no Zenoh.
 """
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import Final, Generic, Protocol, TypeVar
 
 __all__ = ["ANSWER_S", "LateJoin"]
@@ -74,6 +74,7 @@ class LateJoin(Generic[_S]):
         self._receive = receive
         self._ask = ask
         self._sources: dict[_Source, list[_S] | None] = {}  # what waits for the answer of a cache; None: nothing does
+        self._keys: dict[_Source, str] = {}
         self._waiting_bytes = 0
         self._lock = threading.Lock()
         self._closed = False
@@ -91,8 +92,9 @@ class LateJoin(Generic[_S]):
             if self._closed:
                 return
             if first := source not in self._sources:
-                self._forget()
+                self._make_room()
                 self._sources[source] = [] if info.source_sn else None
+                self._keys[source] = str(sample.key_expr)
             waiting = self._sources[source]
             if waiting is None:
                 self._receive(sample)
@@ -104,6 +106,12 @@ class LateJoin(Generic[_S]):
         if first:
             self._ask_before(sample.key_expr, source, info.source_sn)
 
+    def forget(self, keys: Container[str]) -> None:
+        """Forget the publishers of some keys: when they are heard again, what their caches hold is asked for anew."""
+        with self._lock:
+            for source in [one for one, key in self._keys.items() if key in keys and self._sources[one] is None]:
+                del self._sources[source], self._keys[source]
+
     def close(self) -> None:
         """Hand over what still waits, and nothing afterwards."""
         with self._lock:
@@ -111,14 +119,15 @@ class LateJoin(Generic[_S]):
                 for sample in waiting or ():
                     self._receive(sample)
             self._sources.clear()
+            self._keys.clear()
             self._closed = True
 
-    def _forget(self) -> None:
+    def _make_room(self) -> None:
         """Make room for a new publisher."""
         if len(self._sources) >= MAX_SOURCES:
             oldest = next((source for source, waiting in self._sources.items() if waiting is None), None)
             if oldest is not None:
-                del self._sources[oldest]
+                del self._sources[oldest], self._keys[oldest]
 
     def _ask_before(self, key: object, source: _Source, number: int) -> None:
         early: list[tuple[int, _S]] = []

@@ -32,6 +32,7 @@ from optipmb_service.observability import collectors
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
+from optipmb_service.runtime.intake import Intake
 from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter, NoPersistence
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.runtime.queries import Queries, members_of
@@ -118,6 +119,14 @@ class Service:
             metrics=self._metrics,
             tracker=tracker or partial(optipmb.Tracker, max_pairs=settings.max_pairs),
         )
+        self._intake = Intake(
+            self._registry,
+            self._member,
+            self._transport,
+            standby=not settings.cluster,
+            linger_s=settings.lease_s,
+            idle_s=settings.idle_s,
+        )
         self._metrics.add(self._figures)
         self._queries = Queries(
             self._registry,
@@ -125,6 +134,7 @@ class Service:
             self._metrics.text,
             self._metrics.samples,
             self._member,
+            self._intake.hand_over,
             settings.workers,
         )
 
@@ -133,8 +143,8 @@ class Service:
         self._transport.watch()
         self._transport.watch_owners(self._registry.told_owner)
         self._persistence.start(self._registry.keep)
-        self._member.start(self._registry.changed, self._registry.resume, self._registry.occupied)
-        self._transport.subscribe(self._registry.frame, self._registry.cloud)
+        self._member.start(self._intake.changed, self._registry.resume, self._registry.occupied)
+        self._intake.start()
         self._transport.serve(self._queries.about_streams, self._queries.about_service)
         self._state = "ready"
         if announce:
@@ -152,7 +162,9 @@ class Service:
         self._transport.leave()
         self._member.drain()
         self._member.drained(HANDOVER_S)
+        self._intake.handed_over(JOIN_S)
         ends = time.monotonic() + self._settings.grace_s
+        self._intake.close()
         self._transport.stop(JOIN_S)
         if not self._persistence.durable:
             self._registry.finish()  # else what waits for its cloud comes again from the publishers' caches
@@ -204,7 +216,7 @@ class Service:
             uptime_s=(now_ns - self._began_ns) / 1e9,
             state=self.state,
             sessions=self._summaries(now_ns),
-            standby=self._registry.standing_by,
+            standby=self._intake.standing_by,
             members=members_of(self._member.leases()),
             received=totals.received,
             frames=totals.frames,
@@ -262,7 +274,7 @@ class Service:
             self._persistence.written,
             self._persistence.complete_ns,
             owned=len(sessions),
-            standing_by=self._registry.standing_by,
+            standing_by=self._intake.standing_by,
             now_ns=time.monotonic_ns(),
         )
         yield from collectors.of_sessions(sessions)

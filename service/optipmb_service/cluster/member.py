@@ -116,6 +116,11 @@ class Member:
         """Why nothing may be published at present; empty while it may."""
         return "" if self._write_lease.valid(self._clock()) else f"leases: {self._error}"
 
+    @property
+    def partitions(self) -> set[int]:
+        """The partitions that this member holds, also those that it is about to leave."""
+        return set(self._table.held.copy())
+
     def holds(self, stream: str) -> bool:
         """Whether a session of a stream may begin here."""
         return self._table.holds(partition_of(stream))

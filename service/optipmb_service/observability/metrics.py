@@ -45,6 +45,10 @@ SERVICE_METRICS: Final = {
     "state": MetricFamily("gauge", ("state",), "1 for the state the process is in."),
     "received_total": MetricFamily("counter", ("topic",), "Messages received, before any check."),
     "received_bytes_total": MetricFamily("counter", ("topic",), "Bytes of their payloads."),
+    "foreign_total": MetricFamily(
+        "counter", ("topic",), "Messages received of streams that another member tracks; not among `received`."
+    ),
+    "foreign_bytes_total": MetricFamily("counter", ("topic",), "Bytes of their payloads."),
     "frames_total": MetricFamily("counter", (), "Frames tracked."),
     "dropped_total": MetricFamily(
         "counter",
@@ -158,6 +162,8 @@ class Metrics:
         )
         self._messages = {"detections": 0, "points": 0}
         self._bytes = {"detections": 0, "points": 0}
+        self._foreign = {"detections": 0, "points": 0}
+        self._foreign_bytes = {"detections": 0, "points": 0}
         self._started = self._ended = self._restored = 0
         self._registry.register(Collected(lambda: [one.family(name) for name, one in self._durations.items()]))
         self.add(self._counted)
@@ -167,6 +173,11 @@ class Metrics:
         """Count a message that arrived."""
         self._messages[topic] += 1
         self._bytes[topic] += size
+
+    def foreign(self, topic: Literal["detections", "points"], size: int) -> None:
+        """Count a message of a stream that another member tracks."""
+        self._foreign[topic] += 1
+        self._foreign_bytes[topic] += size
 
     def published(self, *, latency_s: float, queue_s: float, decode_s: float, step_s: float) -> None:
         """Count a frame whose tracks went out."""
@@ -210,6 +221,8 @@ class Metrics:
         for topic, count in self._messages.items():
             yield "received_total", (topic,), count
             yield "received_bytes_total", (topic,), self._bytes[topic]
+            yield "foreign_total", (topic,), self._foreign[topic]
+            yield "foreign_bytes_total", (topic,), self._foreign_bytes[topic]
         yield "tracks_started_total", (), self._started
         yield "tracks_ended_total", (), self._ended
         yield "sessions_restored_total", (), self._restored

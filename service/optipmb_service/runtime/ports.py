@@ -85,8 +85,8 @@ class Request(Protocol):
     def answer(self, key: str, message: schemas.Message) -> None:
         """Reply."""
 
-    def answer_text(self, key: str, text: bytes, encoding: str) -> None:
-        """Reply with text that is no message."""
+    def answer_text(self, key: str, text: bytes, encoding: str, *, about: str = "") -> None:
+        """Reply with bytes as they are, and with the key that they are about."""
 
     def refuse(self, problem: schemas.Problem) -> None:
         """Reply with an error."""

@@ -25,11 +25,11 @@ from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import RefusedError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from optipmb_service.cluster.leases import MemberLease
     from optipmb_service.cluster.member import Member
-    from optipmb_service.runtime.ports import Request
+    from optipmb_service.runtime.ports import Packet, Request
     from optipmb_service.runtime.registry import Registry
     from optipmb_service.runtime.stream_actor import StreamActor
     from optipmb_service.session.checkpoint import Checkpoint
@@ -63,6 +63,7 @@ class Queries:
         metrics: makes its metrics, in Prometheus' text format.
         samples: makes its metrics as data for the parent of this process.
         member: the partitions of this process.
+        hand_over: gives what was received lately of sessions that are tracked elsewhere now.
         workers: how many processes the service has.
     """
 
@@ -73,6 +74,7 @@ class Queries:
         metrics: Callable[[], bytes],
         samples: Callable[[], bytes],
         member: Member,
+        hand_over: Callable[[Iterable[str], Callable[[Packet], None]], None],
         workers: int,
     ) -> None:
         self._registry = registry
@@ -80,15 +82,20 @@ class Queries:
         self._metrics = metrics
         self._samples = samples
         self._member = member
+        self._handed_over = hand_over
         self._workers = workers
         self._keys = registry.keys
         self._moves = ThreadPoolExecutor(1, "move")
         self._moving = threading.BoundedSemaphore(MOVES)
         self._digests = ThreadPoolExecutor(1, "digest")
+        self._handovers = ThreadPoolExecutor(1, "recent")
 
     def about_service(self, request: Request) -> None:
         """Answer with the status of the service, its metrics, or both when the key has a `*`; or have streams moved."""
         instance = self._registry.instance
+        if request.key == self._keys.recent():
+            self._handovers.submit(_guarded, request, lambda: self._hand_over(request))
+            return
         if request.key in {self._keys.move(instance), self._keys.drain(instance)}:
             if self._moving.acquire(blocking=False):
                 moves = self._move if request.key == self._keys.move(instance) else self._drain
@@ -107,6 +114,15 @@ class Queries:
             request.answer(status, self._status())
         if request.matches(metrics):
             request.answer_text(metrics, self._metrics(), TEXT)
+
+    def _hand_over(self, request: Request) -> None:
+        """Answer with what was received lately of sessions, whose names are lines, to who tracks them now."""
+        key = self._keys.recent(self._registry.instance)
+
+        def give(packet: Packet) -> None:
+            request.answer_text(key, packet.payload or b"", packet.encoding, about=packet.key)
+
+        self._handed_over((request.payload or b"").decode("ascii", "replace").splitlines(), give)
 
     def _move_in_turn(self, request: Request, moves: Callable[[Request], None]) -> None:
         try:

@@ -30,7 +30,7 @@ from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import SECOND, Lineage, MessageCounters, Policy
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Container, Iterable
     from pathlib import Path
 
     from optipmb_service.cluster.member import Member
@@ -190,13 +190,15 @@ class Registry:
 
     def _receive(self, packet: Packet, *, frame: bool) -> None:
         try:
-            stream, session = self._parsed(packet.key)
+            stream, session = self.parsed(packet.key)
         except schemas.MessageError as error:
-            if self._member.holds(packet.key):  # of all instances one reports it
-                self._count_refused()
-                self._report("invalid_value", "", error.expected, error.received)
+            # Whoever receives it receives the detections of all: it is one of all members.
+            self._count_refused()
+            self._report("invalid_value", "", error.expected, error.received)
             return
-        if not self._kept_for_takeover(session, packet, frame=frame):
+        if self._kept_for_takeover(session, packet, frame=frame):
+            self._metrics.foreign("detections" if frame else "points", packet.size)
+        else:
             self._metrics.received("detections" if frame else "points", packet.size)
             if not self._over_quota(stream, packet, frame=frame):
                 self._hand(session, packet, frame=frame)
@@ -253,10 +255,52 @@ class Registry:
             totals += actor.totals()
         return totals
 
-    @property
-    def standing_by(self) -> int:
-        """Streams that are not tracked here and are known here, for a takeover."""
-        return len(self._foreign)
+    # Streams that come here, or have left
+
+    def passed_by(self, size: int) -> None:
+        """Count detections that were received, and are of no use here."""
+        self._metrics.foreign("detections", size)
+
+    def is_foreign(self, session: str) -> bool:
+        """Whether something may have been kept of a session that is not tracked here."""
+        return session in self._foreign and not self._member.holds(session)
+
+    def foreign(self, partitions: Container[int]) -> set[str]:
+        """Return the sessions of partitions of which something is kept for a takeover."""
+        with self._foreign_lock:
+            return {session for session in self._foreign if partition_of(session) in partitions}
+
+    def waits(self, session: str) -> bool:
+        """Whether messages of a session wait for a worker."""
+        with self._lock:
+            actor = self._actors.get(session)
+        return actor is not None and (actor.occupied or not actor.mailbox.idle)
+
+    def recent(self, sessions: Iterable[str]) -> list[Packet]:
+        """Return what is kept of sessions, the oldest first."""
+        with self._foreign_lock:
+            kept = [one for session in sessions if session in self._foreign for one in self._foreign[session].kept()]
+        return sorted((packet for packet, _ in kept if packet.payload is not None), key=lambda one: one.now_ns)
+
+    def hold(self, session: str) -> None:
+        """Keep what comes of a session until it is taken up."""
+        with self._foreign_lock:
+            self._foreign.setdefault(session, self._context.buffer()).seen_ns = time.monotonic_ns()
+
+    def take_up(self, session: str, packets: list[tuple[Packet, bool]]) -> None:
+        """Go on with a session that has come here: with what others received of it, then with what was kept here."""
+        with self._foreign_lock:
+            buffer = self._foreign.get(session)
+            if buffer is None:
+                return
+            if not self._member.holds(session):  # it has gone again
+                for packet, frame in packets:
+                    buffer.add(packet, frame=frame)
+                return
+            known = {(packet.key, packet.payload) for packet, _ in packets}
+            packets = packets + [one for one in buffer.take() if (one[0].key, one[0].payload) not in known]
+            self._offer(session, partial(_take_up, packets=packets), limited=False)
+            del self._foreign[session]  # from now on readers hand over newer ones
 
     def elsewhere(self, stream: str) -> bool:
         """Whether another instance tracks a stream, and answers for it."""
@@ -312,13 +356,8 @@ class Registry:
             self.command(actor.stream, lambda one: one.close_session("memory"), urgent=False)
 
     def changed(self, partition: int, change: Change) -> None:
-        """Tell the workers of streams what has become of their partition."""
+        """Tell the workers of streams what has become of their partition; those that came here are to be taken up."""
         if change is Change.HELD:
-            with self._foreign_lock:
-                for stream in [one for one in self._foreign if partition_of(one) == partition]:
-                    packets = self._foreign[stream].take()
-                    self._offer(stream, partial(_take_up, packets=packets), limited=False)
-                    del self._foreign[stream]  # from now on readers hand over newer ones
             return
         told = StreamActor.on_recalled if change is Change.RECALLED else StreamActor.on_lost
         with self._lock:
@@ -453,7 +492,7 @@ class Registry:
         with self._lock:
             self._past += MessageCounters(received=1, refused=1)
 
-    def _parsed(self, key: str) -> tuple[str, str]:
+    def parsed(self, key: str) -> tuple[str, str]:
         """Return the stream of a key and its session, remembered.
 
         Raises:

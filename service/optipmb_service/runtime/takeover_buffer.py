@@ -55,6 +55,10 @@ class TakeoverBuffer:
         self._packets.clear()
         return taken
 
+    def kept(self) -> list[tuple[Packet, bool]]:
+        """Return all packets, the oldest first, each with whether it is a frame."""
+        return list(self._packets)
+
     def _drop(self, index: int) -> bool:
         packet, _ = self._packets[index]
         del self._packets[index]

@@ -169,14 +169,14 @@ class Question:
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
 
-    def answer_text(self, key: str, text: bytes, encoding: str) -> None:
-        """Reply with text that is no message.
+    def answer_text(self, key: str, text: bytes, encoding: str, *, about: str = "") -> None:
+        """Reply with bytes as they are, and with the key that they are about.
 
         Raises:
             TransportError: the asker or the session is gone.
         """
         try:
-            self._query.reply(key, text, encoding=encoding)
+            self._query.reply(key, text, encoding=encoding, attachment=about or None)
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
 

@@ -80,14 +80,22 @@ class Subscription:
             log.exception("internal_error", reader=self._key)  # one message must not end the reading
 
     def _ask(self, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[], None]) -> None:
-        def take(answer: zenoh.Reply) -> None:
-            if (sample := answer.ok) is not None:
-                reply(sample)
+        ask_cache(self._session, selector, reply, end)
 
-        self._session.get(
-            selector,
-            zenoh.handlers.Callback(take, end),
-            accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=ANSWER_S,
-        )
+
+def ask_cache(
+    session: zenoh.Session, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[], None]
+) -> None:
+    """Ask publishers' caches for what they hold: `reply` is called with each message, and `end` when no more comes."""
+
+    def take(answer: zenoh.Reply) -> None:
+        if (sample := answer.ok) is not None:
+            reply(sample)
+
+    session.get(
+        selector,
+        zenoh.handlers.Callback(take, end),
+        accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=ANSWER_S,
+    )

@@ -23,11 +23,12 @@ from optipmb_service.zenoh.handles import (
     publish_problem,
     undeclare,
 )
-from optipmb_service.zenoh.subscription import Subscription
+from optipmb_service.zenoh.inputs import Topic
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
+    from optipmb_service.runtime.intake import Kind
     from optipmb_service.runtime.ports import Request
     from optipmb_service.settings import Settings
     from optipmb_service.zenoh.handles import Undeclared
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
 CHANNEL: Final = 4096
 """Messages between Zenoh and a draining thread; more than any publisher's history."""
 
-HISTORY_S: Final = 60.0
-"""Age of what is fetched from the publishers' small caches when the service starts or a publisher appears."""
+RECENT_S: Final = 2.0
+"""How long other instances may take to answer what they have received of streams that have come here."""
 
 TRACKS_CACHE: Final = 50
 """Tracks kept per stream for subscribers that lost some or come late: 5 s at 10 Hz. Most of what a stream holds."""
@@ -62,23 +63,125 @@ class Transport:
         self._is_router = settings.is_router
         self._session = opened(settings)
         self._readers = Readers()
-        self._subscriptions: list[Subscription] = []
+        self._topics: dict[str, Topic] = {}
+        self._discover: Callable[[zenoh.Sample], None] = lambda _: None
+        self._all = False
+        self._discoveries: dict[str, Undeclared] = {}
         self._claims: set[Publisher] = set()
         self._lock = threading.Lock()
         self._alive: Undeclared | None = None
 
     # Receiving
 
-    def subscribe(self, on_frame: Callable[[Packet], None], on_cloud: Callable[[Packet], None]) -> None:
-        """Hand over the detections and point clouds of all streams, each on a thread of its own."""
-        self._subscribe("detections", CHANNEL, lambda sample: self._receive(sample, on_frame))
-        self._subscribe("points", CHANNEL // 16, lambda sample: self._receive(sample, on_cloud))
+    def receive(
+        self,
+        on_frame: Callable[[Packet], None],
+        on_cloud: Callable[[Packet], None],
+        noticed: Callable[[str, bool], bool],
+        passed_by: Callable[[int], None],
+    ) -> None:
+        """Hand over the detections and point clouds that are subscribed to, each on a thread of its own.
 
-    def _subscribe(self, topic: schemas.Topic, channel: int, receive: Callable[[zenoh.Sample], None]) -> None:
-        """Subscribe to a topic of all streams, with what the publishers' caches hold: also of clouds, if they do."""
-        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_age=HISTORY_S)
-        key = self._keys.all(topic)
-        self._subscriptions.append(Subscription(self._session, key, receive, channel=channel, history=history))
+        Args:
+            on_frame: takes detections.
+            on_cloud: takes clouds.
+            noticed: told of detections that come by a subscription to all, by key and whether they can be recovered;
+                where that is `discovery`, those alone are handed over for which it returns True.
+            passed_by: told the sizes of the others.
+        """
+
+        def discover(sample: zenoh.Sample) -> None:
+            if noticed(str(sample.key_expr), sample.source_info is not None):
+                self._receive(sample, on_frame)
+            else:
+                passed_by(len(sample.payload))
+
+        def detected(sample: zenoh.Sample) -> None:
+            if self._all:
+                noticed(str(sample.key_expr), sample.source_info is not None)
+            self._receive(sample, on_frame)
+
+        self._discover = discover
+        self._topics = {
+            "detections": Topic("detections", self._session, detected, CHANNEL),
+            "points": Topic("points", self._session, lambda one: self._receive(one, on_cloud), CHANNEL // 16),
+        }
+
+    def subscribe(self, kind: Kind, stream: str) -> None:
+        """Receive the detections or clouds of a stream, or of all of them where it is empty; `discovery` is of all.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        if kind == "discovery":
+            self._topics["detections"].subscribe(kind, self._keys.all("detections"), self._discover)
+        else:
+            self._all = self._all or not stream
+            self._topics[kind].subscribe(stream, self._key(kind, stream))
+
+    def unsubscribe(self, inputs: Iterable[tuple[Kind, str]]) -> None:
+        """Withdraw subscriptions."""
+        for kind, stream in inputs:
+            if kind == "discovery":
+                self._topics["detections"].leave(kind)
+            else:
+                self._all = self._all and bool(stream)
+                self._topics[kind].leave(stream, self._key(kind, stream))
+
+    def _key(self, topic: schemas.Topic, stream: str) -> str:
+        return self._keys.matching(stream, topic) if stream else self._keys.all(topic)
+
+    def pass_through(self, then: Callable[[], None]) -> None:
+        """Call `then` when all that has come until now is handed over."""
+        detections, points = self._topics.values()
+        detections.pass_through(lambda: points.pass_through(then))
+
+    def watch_streams(
+        self, published: Callable[[str, str, bool], None], discovered: Callable[[str, str, bool], None]
+    ) -> None:
+        """Tell of publishers of detections with a cache, by key and token, and of what is discovered by whom."""
+        self._watch("publishers", self._keys.all_publishers(), lambda key, present: published(key, key, present))
+        self._watch(
+            "discovered",
+            self._keys.all_discovered(),
+            lambda key, present: discovered(key, self._keys.instance_of(key), present),
+        )
+
+    def discover(self, streams: set[str]) -> None:
+        """Announce these streams, and no others."""
+        for stream in self._discoveries.keys() - streams:
+            undeclare(self._discoveries.pop(stream))
+        for stream in streams - self._discoveries.keys():
+            try:
+                token = self._session.liveliness().declare_token(self._keys.discovered(stream, self._instance))
+            except zenoh.ZError as error:
+                raise TransportError(line(error)) from error
+            self._discoveries[stream] = token
+
+    def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
+        """Return what other instances have received lately of sessions, each packet with whether it is a frame.
+
+        The question has the lowest priority: it overtakes no message on the way to who is asked.
+        """
+        found = []
+        try:
+            for reply in self._session.get(
+                self._keys.recent(),
+                payload="\n".join(sessions),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                allowed_destination=zenoh.Locality.REMOTE,
+                priority=zenoh.Priority.BACKGROUND,
+                timeout=RECENT_S,
+            ):
+                if (sample := reply.ok) is not None and (about := sample.attachment) is not None:
+                    key, payload = about.to_string(), sample.payload.to_bytes()
+                    now = time.time_ns(), time.monotonic_ns()
+                    packet = Packet(key, payload, len(payload), str(sample.encoding), *now)
+                    found.append((packet, key.endswith("/detections")))
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
+        return found
 
     def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""
@@ -181,15 +284,20 @@ class Transport:
 
     def watch_owners(self, told: Callable[[str, str, bool], None]) -> None:
         """Tell which instance tracks which stream, or does so no longer (False), from now on."""
-        tokens = self._session.liveliness().declare_subscriber(
-            self._keys.all_owners(), zenoh.handlers.FifoChannel(CHANNEL), history=True
+        self._watch(
+            "owners",
+            self._keys.all_owners(),
+            lambda key, present: told(self._keys.stream_of(key), self._keys.instance_of(key), present),
         )
 
-        def receive(sample: zenoh.Sample) -> None:
-            key = str(sample.key_expr)
-            told(self._keys.stream_of(key), self._keys.instance_of(key), sample.kind == zenoh.SampleKind.PUT)
-
-        self._readers.add("owners", tokens, tokens.handler, receive)
+    def _watch(self, name: str, pattern: str, told: Callable[[str, bool], None]) -> None:
+        """Tell of the tokens of a pattern, those that are there and those that come and go."""
+        tokens = self._session.liveliness().declare_subscriber(
+            pattern, zenoh.handlers.FifoChannel(CHANNEL), history=True
+        )
+        self._readers.add(
+            name, tokens, tokens.handler, lambda one: told(str(one.key_expr), one.kind == zenoh.SampleKind.PUT)
+        )
 
     # The end
 
@@ -202,9 +310,8 @@ class Transport:
     def stop(self, timeout: float) -> None:
         """Receive nothing any more; what was received before is handed over within `timeout` seconds."""
         self.leave()
-        for subscription in self._subscriptions:
-            subscription.close(timeout)
-        self._subscriptions.clear()
+        for topic in self._topics.values():
+            topic.close(timeout)
         self._readers.stop(timeout)
 
     def close(self) -> None:

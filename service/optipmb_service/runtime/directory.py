@@ -1,0 +1,140 @@
+"""Which streams there are, whoever tracks them: decisions only, no network and no threads of its own.
+
+Who publishes detections with a cache says so by a liveliness token, from before its first message to its end. A
+publisher without one is noticed by its messages: one member, the *discoverer*, subscribes to the detections of all
+streams, and announces each such stream by a token of its own, so all members know of it.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from typing import Final
+
+from optipmb_service.session.values import SECOND
+
+MAX_STREAMS: Final = 65_536
+"""Streams that are known at once; publishers beyond it are not heard."""
+
+FORGET_NS: Final = 10 * SECOND
+"""How long a stream stays known after its last token: a publisher, or the discoverer, may come back."""
+
+TOKEN_NS: Final = SECOND
+"""How long the token of a publisher whose messages can be recovered may come after its first message."""
+
+
+@dataclass(slots=True)
+class _Known:
+    tokens: set[str] = field(default_factory=set)
+    """Of publishers with a cache."""
+    discoverers: set[str] = field(default_factory=set)
+    """Instances that announce the stream."""
+    announced: bool = False
+    """Whether this instance does."""
+    seen_ns: int = 0
+    """When this instance noticed a message last; of those that it announces."""
+    left_ns: int | None = None
+    """Since when there is no token; None while there is one."""
+
+
+class StreamDirectory:
+    """What is known of the streams, for any thread.
+
+    Args:
+        instance: the name of this one.
+        idle_ns: silence after which an announced stream is announced no longer.
+    """
+
+    def __init__(self, instance: str, idle_ns: int) -> None:
+        self._instance = instance
+        self._idle_ns = idle_ns
+        self._lock = threading.Lock()
+        self._streams: dict[str, _Known] = {}
+        self._awaited: dict[str, int] = {}
+
+    def published(self, stream: str, token: str, now_ns: int, *, present: bool) -> bool:
+        """Take in the token of a publisher; True: that changes what is known."""
+        with self._lock:
+            known = self._found(stream) if present else self._streams.get(stream)
+            if known is None or (token in known.tokens) is present:
+                return False
+            (known.tokens.add if present else known.tokens.discard)(token)
+            self._awaited.pop(stream, None)
+            return self._settled(known, now_ns)
+
+    def discovered(self, stream: str, instance: str, now_ns: int, *, present: bool) -> bool:
+        """Take in that a discoverer announces a stream, or does so no longer; True: that changes what is known."""
+        with self._lock:
+            known = self._found(stream) if present else self._streams.get(stream)
+            if known is None or (instance in known.discoverers) is present:
+                return False
+            (known.discoverers.add if present else known.discoverers.discard)(instance)
+            return self._settled(known, now_ns)
+
+    def noticed(self, stream: str, now_ns: int, *, recoverable: bool) -> bool:
+        """Take in a message that the discoverer received; True: its publisher has no token.
+
+        Args:
+            stream: of the message.
+            now_ns: monotonic time.
+            recoverable: whether the publisher numbers its messages for recovery; then its token may be on the way.
+        """
+        known = self._streams.get(stream)
+        if known is not None and known.tokens:
+            return False  # the usual case, without the lock
+        with self._lock:
+            known = self._streams.get(stream)
+            if known is None or not known.announced:
+                if recoverable and now_ns - self._awaited.setdefault(stream, now_ns) < TOKEN_NS:
+                    if len(self._awaited) > MAX_STREAMS:
+                        self._awaited.clear()
+                    return False
+                known = self._found(stream)
+                if known is None:
+                    return False
+                known.announced, known.left_ns = True, None
+            known.seen_ns = now_ns
+            return not known.tokens
+
+    def adopt(self, now_ns: int) -> None:
+        """Announce what other discoverers announce, or did until just now: this instance is the discoverer now."""
+        with self._lock:
+            for known in self._streams.values():
+                if not known.tokens and not known.announced:
+                    known.announced, known.seen_ns, known.left_ns = True, now_ns, None
+
+    def expire(self, now_ns: int, *, discovering: bool) -> None:
+        """Forget streams whose publishers are gone, and announce those no longer that need it no longer."""
+        with self._lock:
+            for stream, known in tuple(self._streams.items()):
+                if known.announced and (known.tokens or not discovering or now_ns - known.seen_ns > self._idle_ns):
+                    known.announced = False
+                    self._settled(known, now_ns)
+                if known.left_ns is not None and now_ns - known.left_ns > FORGET_NS:
+                    del self._streams[stream]
+            self._awaited = {one: since for one, since in self._awaited.items() if now_ns - since < self._idle_ns}
+
+    def streams(self) -> dict[str, bool]:
+        """Return the streams that are known, each with whether its publisher has a cache to ask."""
+        with self._lock:
+            return {stream: bool(known.tokens) for stream, known in self._streams.items()}
+
+    def announced(self) -> set[str]:
+        """Return the streams that this instance is to announce."""
+        with self._lock:
+            return {stream for stream, known in self._streams.items() if known.announced}
+
+    def _found(self, stream: str) -> _Known | None:
+        known = self._streams.get(stream)
+        if known is None and len(self._streams) < MAX_STREAMS:
+            known = self._streams[stream] = _Known()
+        return known
+
+    @staticmethod
+    def _settled(known: _Known, now_ns: int) -> bool:
+        """Note whether anybody still speaks for a stream."""
+        if known.tokens or known.discoverers or known.announced:
+            known.left_ns = None
+        elif known.left_ns is None:
+            known.left_ns = now_ns
+        return True

@@ -1,0 +1,301 @@
+"""What a member receives: the streams of its partitions, and of others what somebody has to receive.
+
+From the partitions that are held and the streams that are known follows a set of subscriptions, whatever came before:
+
+- all detections and all clouds, where this member holds all partitions;
+- else detections and clouds of each stream of its partitions, and of those that it left just now, for who has them
+  then asks for what came in between (`recent`);
+- detections of streams whose publishers have no cache, where nothing else would know what was sent when their member
+  is killed (`standby`);
+- detections of all streams, where it is the discoverer: the member that holds partition 0. Those whose publishers have
+  tokens are dropped unread.
+
+New subscriptions are declared before old ones are withdrawn. A stream that comes here from another member is held until
+the others have answered what they have received of it lately; then its session goes on with that.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal, Protocol
+
+import optipmb_schemas as schemas
+import structlog
+
+from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
+from optipmb_service.runtime.directory import StreamDirectory
+from optipmb_service.runtime.ports import TransportError
+from optipmb_service.session.values import SECOND
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from optipmb_service.cluster.member import Member
+    from optipmb_service.runtime.ports import Packet
+    from optipmb_service.runtime.registry import Registry
+
+log = structlog.get_logger("optipmb_service")
+
+DISCOVERY: Final = 0
+"""The partition whose holder is the discoverer."""
+
+ALL: Final = ""
+"""Instead of a stream: all of them."""
+
+EXPIRY_S: Final = 1.0
+DRAIN_S: Final = 0.5
+"""How long who is asked for what came lately waits for what is still on its way through this process."""
+
+DRAIN_POLL_S: Final = 0.005
+END_S: Final = 5.0
+
+Kind = Literal["detections", "points", "discovery"]
+
+
+@dataclass(frozen=True, order=True)
+class Input:
+    """A subscription: what of a stream, or of all of them."""
+
+    kind: Kind
+    stream: str = ALL
+
+
+class Inputs(Protocol):
+    """What is needed of the network."""
+
+    def receive(
+        self,
+        on_frame: Callable[[Packet], None],
+        on_cloud: Callable[[Packet], None],
+        noticed: Callable[[str, bool], bool],
+        passed_by: Callable[[int], None],
+    ) -> None:
+        """Say where messages go, who decides which of those discovered do, and who counts the others."""
+
+    def subscribe(self, kind: Kind, stream: str) -> None:
+        """Receive a stream, or all of them."""
+
+    def unsubscribe(self, inputs: Iterable[tuple[Kind, str]]) -> None:
+        """Receive streams no longer."""
+
+    def watch_streams(
+        self, published: Callable[[str, str, bool], None], discovered: Callable[[str, str, bool], None]
+    ) -> None:
+        """Tell of the tokens of publishers, and of what is discovered by whom; each True: it is there."""
+
+    def discover(self, streams: set[str]) -> None:
+        """Announce these streams, and no others."""
+
+    def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
+        """Return what other instances have received lately of sessions, each packet with whether it is a frame."""
+
+    def pass_through(self, then: Callable[[], None]) -> None:
+        """Call `then` when all that has come until now is handed over."""
+
+
+class Intake:
+    """Decides what is received, on a thread of its own.
+
+    Args:
+        registry: where messages go.
+        member: says which partitions are held.
+        inputs: the network.
+        standby: whether detections that no cache holds are received for a takeover.
+        linger_s: how long streams are received whose partition was left.
+        idle_s: silence after which a stream without a token is announced no longer.
+    """
+
+    def __init__(
+        self, registry: Registry, member: Member, inputs: Inputs, *, standby: bool, linger_s: float, idle_s: float
+    ) -> None:
+        self._registry = registry
+        self._member = member
+        self._inputs = inputs
+        self._standby = standby
+        self._linger_ns = round(linger_s * SECOND)
+        self._directory = StreamDirectory(registry.instance, round(idle_s * SECOND))
+        self._subscribed: set[Input] = set()
+        self._known: set[str] = set()
+        self._lock = threading.Lock()
+        self._came: set[int] = set()
+        self._left: dict[int, int] = {}
+        self._owed: set[str] = set()
+        self._handed = threading.Condition()
+        self._wake = threading.Event()
+        self._ending = False
+        self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
+
+    def start(self) -> None:
+        """Receive from now on what is to be received."""
+        self._inputs.receive(self._registry.frame, self._registry.cloud, self._noticed, self._registry.passed_by)
+        self._inputs.watch_streams(self._published, self._discovered)
+        self._step()
+        self._thread.start()
+
+    def close(self) -> None:
+        """Change nothing any more."""
+        self._ending = True
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join(END_S)
+
+    def changed(self, partition: int, change: Change) -> None:
+        """Take in what has become of a partition."""
+        self._registry.changed(partition, change)
+        with self._lock:
+            if change is Change.HELD:
+                self._came.add(partition)
+                self._left.pop(partition, None)
+            elif change is Change.LOST:
+                self._came.discard(partition)
+                self._left[partition] = time.monotonic_ns() + self._linger_ns
+        with self._handed:
+            owed = self._registry.foreign({partition})
+            (self._owed.update if change is Change.LOST else self._owed.difference_update)(owed)
+        self._wake.set()
+
+    @property
+    def standing_by(self) -> int:
+        """Streams that are known here and tracked elsewhere."""
+        session_of = self._registry.fusion.session_of
+        return sum(not self._member.holds(session_of(stream)) for stream in self._directory.streams())
+
+    def hand_over(self, sessions: Iterable[str], give: Callable[[Packet], None]) -> None:
+        """Give what was received lately of sessions that are tracked elsewhere now, the oldest first.
+
+        It waits for what is on its way through this process, for a moment at most.
+        """
+        asked = [session for session in sessions if self._registry.is_foreign(session)]
+        if not asked:
+            return
+        ends = time.monotonic() + DRAIN_S
+        passed = threading.Event()
+        self._inputs.pass_through(passed.set)
+        passed.wait(DRAIN_S)
+        while any(self._registry.waits(session) for session in asked) and time.monotonic() < ends:
+            time.sleep(DRAIN_POLL_S)
+        for packet in self._registry.recent(asked):
+            give(packet)
+        with self._handed:
+            self._owed.difference_update(asked)
+            self._handed.notify_all()
+
+    def handed_over(self, timeout: float) -> bool:
+        """Wait until who has the partitions that were left has asked, at most so long (s); False when that was it."""
+        with self._handed:
+            return self._handed.wait_for(lambda: not self._owed, timeout)
+
+    # From the network
+
+    def _stream(self, key: str) -> str | None:
+        """Return the stream of a token's key; None when it is none that may publish."""
+        try:
+            stream = self._registry.keys.stream_of(key)
+        except schemas.MessageError:
+            return None
+        return None if self._registry.fusion.is_session(stream) else stream
+
+    def _published(self, key: str, token: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
+        stream = self._stream(key)
+        if stream is not None and self._directory.published(stream, token, time.monotonic_ns(), present=present):
+            self._wake.set()
+
+    def _discovered(self, key: str, instance: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
+        stream = self._stream(key)
+        if stream is None or instance == self._registry.instance:
+            return
+        if self._directory.discovered(stream, instance, time.monotonic_ns(), present=present):
+            self._wake.set()
+
+    def _noticed(self, key: str, recoverable: bool) -> bool:  # noqa: FBT001 - as the network calls it
+        """Take in detections of whatever stream; False: the publisher has a token, and its member receives them."""
+        try:
+            stream, _ = self._registry.parsed(key)
+        except schemas.MessageError:
+            return True  # to be reported
+        is_raw = self._directory.noticed(stream, time.monotonic_ns(), recoverable=recoverable)
+        if is_raw and stream not in self._known:
+            self._wake.set()
+        return is_raw
+
+    # The thread
+
+    def _run(self) -> None:
+        while not self._ending:
+            self._wake.wait(EXPIRY_S)
+            self._wake.clear()
+            try:
+                self._step()
+            except TransportError:
+                return  # the end
+            except Exception:
+                log.exception("internal_error", thread="intake")
+
+    def _step(self) -> None:
+        """Bring the subscriptions in line with what is held and known, and take up what came here."""
+        now_ns, held = time.monotonic_ns(), self._member.partitions
+        with self._lock:
+            came, self._came = self._came, set()
+            self._left = {partition: until for partition, until in self._left.items() if until > now_ns}
+            received = held | self._left.keys()
+        everything = len(held) == PARTITIONS
+        discovering = DISCOVERY in held
+        self._directory.expire(now_ns, discovering=discovering)
+        if discovering and Input("discovery") not in self._subscribed and not everything:
+            self._directory.adopt(now_ns)
+        streams = self._directory.streams()
+        coming = self._coming(streams, came, held)
+        for session in coming:
+            self._registry.hold(session)
+        wanted = self._wanted(streams, received, everything=everything, discovering=discovering)
+        for one in sorted(wanted - self._subscribed):
+            self._inputs.subscribe(one.kind, one.stream)
+            self._subscribed.add(one)
+        self._inputs.unsubscribe((one.kind, one.stream) for one in sorted(self._subscribed - wanted))
+        self._subscribed &= wanted
+        self._inputs.discover(self._directory.announced())
+        self._known = set(streams)
+        if coming:
+            self._take_up(coming)
+
+    def _wanted(
+        self, streams: dict[str, bool], received: set[int], *, everything: bool, discovering: bool
+    ) -> set[Input]:
+        if everything:
+            return {Input("detections"), Input("points")}
+        wanted = {Input("discovery")} if discovering else set()
+        for stream, cached in streams.items():
+            own = partition_of(self._registry.fusion.session_of(stream)) in received
+            if own:
+                wanted.add(Input("points", stream))
+            # What has no cache the discoverer has by its subscription to all.
+            if (own and cached) or (not cached and not discovering and (own or self._standby)):
+                wanted.add(Input("detections", stream))
+        return wanted
+
+    def _coming(self, streams: dict[str, bool], came: set[int], held: set[int]) -> list[str]:
+        """Return the sessions that others may have received something of: those that came here, and new streams."""
+        session_of = self._registry.fusion.session_of
+        own = self._directory.announced()
+        coming = {session_of(stream) for stream in streams if partition_of(session_of(stream)) in came}
+        coming |= {
+            session
+            for stream, cached in streams.items()
+            if not cached and stream not in self._known and stream not in own
+            and partition_of(session := session_of(stream)) in held
+            and self._registry.actor(session) is None
+        }  # fmt: skip
+        return sorted(coming | self._registry.foreign(came))
+
+    def _take_up(self, sessions: list[str]) -> None:
+        packets: dict[str, list[tuple[Packet, bool]]] = {session: [] for session in sessions}
+        try:
+            for packet, frame in self._inputs.ask_recent(sessions):
+                _, session = self._registry.parsed(packet.key)
+                if session in packets:
+                    packets[session].append((packet, frame))
+        finally:
+            for session, found in packets.items():
+                self._registry.take_up(session, found)

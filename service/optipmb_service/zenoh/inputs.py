@@ -1,0 +1,124 @@
+"""What a member receives: subscriptions that come and go, of single streams or of all, and one thread for each topic.
+
+A subscription is told by its topic and its key. However many there are, the samples of a topic pass through one queue
+to one thread, which hands them over in their order. When the subscription of a stream takes over from that of all
+streams, or the other way round, nothing is missing in between, and what comes twice is the newest message at most: that
+is what a new subscription asks Zenoh for. What caches hold from before is asked for once for each publisher
+(`late_join`), and again after the stream was not subscribed to.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import structlog
+import zenoh
+import zenoh.ext
+from optipmb_schemas.late_join import LateJoin
+
+from optipmb_service.runtime.ports import TransportError
+from optipmb_service.zenoh.connection import line
+from optipmb_service.zenoh.handles import undeclare
+from optipmb_service.zenoh.subscription import ask_cache
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from optipmb_service.zenoh.handles import Undeclared
+
+log = structlog.get_logger("optipmb_service")
+
+NEWEST: Final = zenoh.ext.HistoryConfig(detect_late_publishers=False, max_samples=1)
+"""Without the newest message, the first heartbeat of each publisher would bring all that its cache holds.
+
+Late publishers are not detected: after a link was lost, the newest message would come so before those that it follows,
+and Zenoh would take these for lost. Heartbeats tell of what was missed.
+"""
+
+RECOVERY: Final = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+
+
+class Topic:
+    """The subscriptions of one topic.
+
+    Args:
+        name: of the topic, for the log.
+        session: to subscribe on.
+        receive: called for each sample, one after the other.
+        waiting: samples that may wait for the thread; Zenoh waits beyond that.
+    """
+
+    def __init__(
+        self, name: str, session: zenoh.Session, receive: Callable[[zenoh.Sample], None], waiting: int
+    ) -> None:
+        self._name = name
+        self._session = session
+        self._receive = receive
+        self._waiting: queue.Queue[zenoh.Sample | Callable[[], None] | None] = queue.Queue(waiting)
+        self._subscribers: dict[str, Undeclared] = {}
+        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._hand_over, lambda *asked: ask_cache(session, *asked))
+        self._thread = threading.Thread(target=self._drain, name=f"reader-{name}", daemon=True)
+        self._thread.start()
+
+    def subscribe(self, name: str, key: str, passing: Callable[[zenoh.Sample], None] | None = None) -> None:
+        """Receive what is published under a key expression from now on, and what caches hold of it.
+
+        Args:
+            name: of the subscription.
+            key: the key expression.
+            passing: called for each sample, on the thread, instead of the topic's function; nothing is recovered then.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        put = self._waiting.put  # all that is done on the thread of the network
+        try:
+            if passing is None:
+                take: Any = zenoh.handlers.Callback(put, indirect=False)
+                subscriber: Undeclared = zenoh.ext.declare_advanced_subscriber(
+                    self._session, key, take, history=NEWEST, recovery=RECOVERY
+                )
+            else:
+                take = zenoh.handlers.Callback(lambda sample: put(partial(passing, sample)), indirect=False)
+                subscriber = self._session.declare_subscriber(key, take)
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
+        self._subscribers[name] = subscriber
+
+    def leave(self, name: str, key: str = "") -> None:
+        """Withdraw a subscription; what came before is handed over. When the key comes again, its caches are asked."""
+        undeclare(self._subscribers.pop(name))
+        self._late_join.forget({key})
+
+    def pass_through(self, then: Callable[[], None]) -> None:
+        """Call `then`, on the thread, when all that has come until now is handed over."""
+        self._waiting.put(then)
+
+    def close(self, timeout: float) -> None:
+        """End it; what came before is handed over within `timeout` seconds, and nothing afterwards."""
+        for subscriber in self._subscribers.values():
+            undeclare(subscriber)
+        self._subscribers.clear()
+        if self._thread.is_alive():
+            self._waiting.put(None)
+            self._thread.join(timeout)
+        self._late_join.close()
+
+    def _drain(self) -> None:
+        while (item := self._waiting.get()) is not None:
+            if not isinstance(item, zenoh.Sample):
+                self._guarded(item)
+            elif item.kind == zenoh.SampleKind.PUT:
+                self._late_join.take(item)
+
+    def _hand_over(self, sample: zenoh.Sample) -> None:
+        self._guarded(partial(self._receive, sample))
+
+    def _guarded(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Exception:
+            log.exception("internal_error", reader=self._name)  # one message must not end the reading
