@@ -345,8 +345,8 @@ class Settings(BaseSettings):
         default=10.0,
         ge=0,
         le=600,
-        description="time for which messages of streams that others track are kept for a takeover; longer than"
-        " `lease_s` and `checkpoint_s` together",
+        description="time for which what is received of streams that others track is kept for a takeover;"
+        " longer than `lease_s` and `checkpoint_s` together",
     )
     standby_mb: int = Field(
         default=256,
