@@ -326,6 +326,15 @@ class Settings(BaseSettings):
         description="NATS servers where the instances of many machines share streams and checkpoints, as"
         " `nats://10.0.0.1:4222`; default: none, and instances on one router share the folder `store`",
     )
+    cluster_tls: Path | None = Field(
+        default=None,
+        description="folder with `ca.pem`, the authority of `tls://` servers of `cluster`, and `cert.pem` and `key.pem`"
+        " where they ask for a certificate; default: the authorities of the system",
+    )
+    cluster_credentials: Path | None = Field(
+        default=None,
+        description="file with the credentials of a NATS user (`.creds`), or one line: `user:password`, or a token",
+    )
     store: str = Field(
         default="",
         description="folder of checkpoints and quarantined sessions; `none`: nothing is kept; default: a folder named"
@@ -512,6 +521,7 @@ def load(
         raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
     if settings.fuse and not settings.rewind_s:
         raise SettingsInvalidError("setting fuse: sensors do not come in order of their stamps: rewind_s must not be 0")
+    _check_cluster(settings)
     if settings.workers > 1 and settings.zenoh_config is not None and settings.is_router:
         # Its access control would be deaf to the workers, which come over a socket and without a certificate.
         raise SettingsInvalidError(
@@ -520,6 +530,27 @@ def load(
     known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields}
     unknown = (name for name in os.environ if name.startswith(PREFIX) and name.split("__")[0] not in known)
     return Loaded(settings, sources, tuple(sorted(unknown)))
+
+
+def _check_cluster(settings: Settings) -> None:
+    """Refuse files for NATS servers that are not there or not used.
+
+    Raises:
+        SettingsInvalidError: there are such.
+    """
+    folder, file = settings.cluster_tls, settings.cluster_credentials
+    for name, value in (("cluster_tls", folder), ("cluster_credentials", file)):
+        if value is not None and not settings.cluster:
+            raise SettingsInvalidError(f"setting {name}: without servers in `cluster`")
+    if folder is not None:
+        if any(not server.startswith("tls://") for server in settings.cluster):
+            raise SettingsInvalidError("setting cluster_tls: servers in `cluster` as tls://host:4222 expected")
+        if not (folder / "ca.pem").is_file():
+            raise SettingsInvalidError(f"setting cluster_tls: {folder}: no file ca.pem in it")
+        if (folder / "cert.pem").is_file() is not (folder / "key.pem").is_file():
+            raise SettingsInvalidError(f"setting cluster_tls: {folder}: cert.pem and key.pem belong together")
+    if file is not None and not file.is_file():
+        raise SettingsInvalidError(f"setting cluster_credentials: {file}: no such file")
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -233,13 +233,14 @@ def test_a_service_cannot_write_inputs(network: Network, viewer: Party) -> None:
 def test_a_viewer_reads_and_asks_but_changes_nothing(
     network: Network, node: Party, viewer: Party, service: ServiceProcess
 ) -> None:
-    """A viewer sees the status and all streams; its resets are not heard, and what it writes reaches nobody."""
+    """A viewer sees the status and all streams; its orders are not heard, and what it writes reaches nobody."""
     (status,) = viewer.ask(KEYS.all_status())
     assert decode(status, ServiceStatus).instance == "tracker"
     assert b"optipmb_info" in viewer.ask(KEYS.metrics("tracker"))[0]
     (density,) = viewer.ask(KEYS.query(LIDAR, "density"))
     assert decode(density, Density).stream == LIDAR
-    assert viewer.ask(KEYS.query(LIDAR, "reset"), timeout=1.0) == []
+    for order in (KEYS.query(LIDAR, "reset"), KEYS.move("tracker"), KEYS.drain("tracker")):
+        assert viewer.ask(order, timeout=1.0) == []
     with Party(network.config(VIEWER)) as writer:
         writer.put(KEYS.detections(LIDAR), b"forged")
         assert len(writer.ask(KEYS.all_status())) == 1  # this link is in order: the put has passed the router

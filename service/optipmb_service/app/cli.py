@@ -76,6 +76,12 @@ class LogOptions(RouterOptions, total=False):
         str | None,
         typer.Option(metavar="SERVERS", help="NATS servers that the members share; as nats://10.0.0.1:4222,nats://…"),
     ]
+    cluster_tls: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder with certificates for tls:// servers of --cluster.")
+    ]
+    cluster_credentials: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Credentials, user:password or token for --cluster.")
+    ]
 
 
 class GatewayOptions(RouterOptions, total=False):

@@ -16,6 +16,7 @@ from optipmb_service.runtime.persistence import DAY_S
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from optipmb_service.cluster.nats_access import NatsAccess
     from optipmb_service.cluster.store import LeaseStore
     from optipmb_service.runtime.missed_frames import MissedFrames
     from optipmb_service.settings import Settings
@@ -35,12 +36,14 @@ def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, st
         private: folder that the workers of one parent share; None: this process has no parent.
 
     Raises:
-        StoreError: the folder cannot be used, and others use it: a store of its own would give its streams two owners.
+        StoreError: the folder cannot be used, and others use it: a store of its own would give its streams two owners;
+            or what the servers want to see cannot be read.
     """
     if settings.cluster:
         from optipmb_service.cluster.jetstream import JetStream  # noqa: PLC0415 - an extra
 
-        return JetStream(settings.cluster, settings.prefix, settings.keep_days * DAY_S), None
+        access = nats_access(settings)
+        return JetStream(settings.cluster, settings.prefix, settings.keep_days * DAY_S, access), None
     folder, why = settings.folder, ""
     if folder is not None:
         try:
@@ -55,6 +58,13 @@ def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, st
     return SqliteStore(private and private / STORE_FILE), why
 
 
+def nats_access(settings: Settings) -> NatsAccess:
+    """Return what the servers of `cluster` want to see."""
+    from optipmb_service.cluster.nats_access import NatsAccess  # noqa: PLC0415 - an extra
+
+    return NatsAccess(settings.cluster_tls, settings.cluster_credentials)
+
+
 def open_log(settings: Settings) -> MissedFrames:
     """Return what is known of the frames that a session has missed: those in the log, where there is a cluster."""
     if not settings.cluster:
@@ -62,5 +72,5 @@ def open_log(settings: Settings) -> MissedFrames:
     from optipmb_service.cluster.log_reader import LogReader  # noqa: PLC0415 - an extra
     from optipmb_service.cluster.message_log import MessageLog  # noqa: PLC0415 - an extra
 
-    reader = LogReader(MessageLog(settings.cluster, settings.prefix), settings.standby_s)
+    reader = LogReader(MessageLog(settings.cluster, settings.prefix, nats_access(settings)), settings.standby_s)
     return LoggedFrames(reader, Keys(settings.prefix), Fusion(settings.fuse))

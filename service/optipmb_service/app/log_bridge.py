@@ -16,6 +16,7 @@ import optipmb_schemas as schemas
 import structlog
 
 from optipmb_service import __version__
+from optipmb_service.app.clustering import nats_access
 from optipmb_service.app.edges import monitoring
 from optipmb_service.app.loops import StopRequest, beat, settle, unless
 from optipmb_service.cluster.log_writer import LogWriter
@@ -62,7 +63,7 @@ class LogBridge:
         keep: dict[Topic, Retention] = {"detections": Retention(settings.log_s, settings.log_mb * MEGABYTE)}
         if settings.log_tracks_s:
             keep["tracks"] = Retention(settings.log_tracks_s, settings.log_tracks_mb * MEGABYTE)
-        self._log = MessageLog(settings.cluster, settings.prefix)
+        self._log = MessageLog(settings.cluster, settings.prefix, nats_access(settings))
         self._writer = LogWriter(self._log, keep, self._unlogged)
         self._subscriptions = [client.subscribe(client.keys.all(topic), self._take) for topic in keep]
 

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
     from nats.aio.msg import Msg
 
+    from optipmb_service.cluster.nats_access import NatsAccess
+
 Topic = Literal["detections", "tracks"]
 
 REPEATED_S: Final = 120
@@ -106,14 +108,15 @@ class MessageLog:
     Args:
         servers: addresses of NATS servers.
         prefix: first chunks of every key of the service.
+        access: what the servers want to see.
 
     Attributes:
         connection: to the servers; closed by the owner of the log. All methods run on its loop.
     """
 
-    def __init__(self, servers: Sequence[str], prefix: str) -> None:
+    def __init__(self, servers: Sequence[str], prefix: str, access: NatsAccess | None = None) -> None:
         self._names = {topic: f"OPTIPMB-{topic.upper()}_{token(prefix)}" for topic in ("detections", "tracks")}
-        self.connection = NatsConnection(servers, self._lost)
+        self.connection = NatsConnection(servers, self._lost, access)
         self._there: set[str] = set()
 
     def _lost(self) -> None:

@@ -14,16 +14,19 @@ from concurrent.futures import CancelledError
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import structlog
-from nats.aio.client import Client
 from nats.errors import Error as NatsError
 
+from optipmb_service.cluster.nats_access import SecuredClient
 from optipmb_service.cluster.store import StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping, Sequence
     from concurrent.futures import Future
 
+    from nats.aio.client import Client
     from nats.aio.msg import Msg
+
+    from optipmb_service.cluster.nats_access import NatsAccess
 
 log = structlog.get_logger("optipmb_service")
 
@@ -70,12 +73,19 @@ class NatsConnection:
     Args:
         servers: addresses, as `nats://host:4222`; of one cluster, where there are several.
         lost: called on the loop when it is lost.
+        access: what the servers want to see.
+
+    Raises:
+        StoreError: what they want to see cannot be read.
     """
 
-    def __init__(self, servers: Sequence[str], lost: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, servers: Sequence[str], lost: Callable[[], None] = lambda: None, access: NatsAccess | None = None
+    ) -> None:
+        self._options = access.options() if access else {}
         self._servers = list(servers)
         self._lost = lost
-        self._client = Client()
+        self._client = SecuredClient()
         self._why = f"no connection to {', '.join(map(_shown, servers))}"
         self._closed = False
         self._loop = asyncio.new_event_loop()
@@ -225,6 +235,7 @@ class NatsConnection:
             max_outstanding_pings=2,
             error_cb=self._note,
             disconnected_cb=self._disconnected,
+            **self._options,
         )
 
     async def _note(self, error: Exception) -> None:
