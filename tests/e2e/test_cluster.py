@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from contextlib import nullcontext
@@ -206,6 +208,40 @@ def test_all_members_are_restarted_in_turn(cluster: Cluster, capsys: pytest.Capt
     silent_s = max(longest_silence_s(cluster.node, sensor) for sensor in SENSORS)
     with capsys.disabled():
         print(f"\nsilent for {silent_s:.2f} s at most while three members were restarted in turn")  # noqa: T201 - the figure
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("cluster", ["nats"], indirect=True)
+def test_a_machine_becomes_a_cluster(cluster: Cluster, tmp_path: Path) -> None:
+    """Sessions that were copied out of a folder go on in the cluster, to the byte; used folders and clusters refuse."""
+    assert cluster.nats is not None
+
+    def copied(store: Path = tmp_path / "alone") -> tuple[int, str]:
+        arguments = ("copy", "--store", store, "--cluster", cluster.nats and cluster.nats.url)
+        done = subprocess.run(
+            [sys.executable, "-m", "optipmb_service", *map(str, arguments)], capture_output=True, text=True, check=False
+        )
+        return done.returncode, done.stdout + done.stderr
+
+    status, text = copied()
+    assert (status, "expected the checkpoints of a service, found none" in text) == (1, True)
+    alone = cluster.member("alone", cluster="", store=tmp_path / "alone")
+    send(cluster.node, 0, 10, sensors=SENSORS)
+    sessions = {stream: state.session for stream, state in cluster.check(10, "alone").items()}
+    status, text = copied()
+    assert (status, "a service uses it: end it first" in text) == (1, True)
+    assert alone.end()[0] == 0
+    assert copied() == (0, "copied 6 sessions; left out 0 of streams that the cluster has sessions of\n")
+    assert copied() == (0, "copied 0 sessions; left out 6 of streams that the cluster has sessions of\n")
+    names = ("a", "b")
+    members = [cluster.member(name) for name in names]
+    for member in members:
+        holds(member, PARTITIONS // 2)
+    send(cluster.node, 10, 20, sensors=SENSORS)
+    states = cluster.check(20, *names)
+    assert {stream: state.session for stream, state in states.items()} == sessions
+    status, text = copied()
+    assert (status, "tracks in the cluster: end its members, copy, and start them again" in text) == (1, True)
 
 
 @pytest.mark.timeout(600)

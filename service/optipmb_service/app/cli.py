@@ -21,6 +21,7 @@ from optipmb_service import __version__
 from optipmb_service.app import health_command, nats, router
 from optipmb_service.app.collector import collector_paused
 from optipmb_service.app.loops import leave
+from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import logs
 from optipmb_service.settings import (
     DEFAULT_GRPC,
@@ -244,6 +245,26 @@ def nats_command(
         nats.become(server, listen, (store or state_home() / "nats").absolute())
     except OSError as error:
         _wrong(f"{error.filename}: {error.strerror}")
+
+
+@app.command("copy")
+def copy_command(
+    cluster: Annotated[str, typer.Option(metavar="SERVERS", help="NATS servers of the cluster, as for `run`.")],
+    store: Annotated[Path | None, typer.Option(metavar="DIR", help="The folder; default: the setting `store`.")] = None,
+    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings, a TOML file.")] = None,
+) -> None:
+    """Copy the sessions of this machine's folder into a cluster, before its members start; their ids go on there."""
+    given: dict[str, Any] = {"settings": settings, "cluster": cluster, "store": store and str(store)}
+    loaded = _begin(_load(given))
+    _needed("optipmb_service.cluster.jetstream", "cluster")
+    from optipmb_service.app.clustering import copy_folder  # noqa: PLC0415 - it takes the tracker along
+
+    try:
+        copied, known = copy_folder(loaded)
+    except StoreError as error:
+        typer.echo(f"optipmb-service: {error}", err=True)
+        raise typer.Exit(1) from None
+    typer.echo(f"copied {copied} sessions; left out {known} of streams that the cluster has sessions of")
 
 
 @app.command("health", add_help_option=False, context_settings=PASSED_ON)

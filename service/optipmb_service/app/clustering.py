@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Final
 
 import structlog
 from optipmb_schemas import Keys
 
+from optipmb_service.cluster.copying import copy_sessions
 from optipmb_service.cluster.sqlite import SqliteStore, in_use
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.runtime.fusion import Fusion
@@ -16,6 +18,7 @@ from optipmb_service.runtime.persistence import DAY_S
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from optipmb_service.cluster.copying import Copied
     from optipmb_service.cluster.nats_access import NatsAccess
     from optipmb_service.cluster.store import LeaseStore
     from optipmb_service.runtime.missed_frames import MissedFrames
@@ -24,6 +27,9 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 STORE_FILE: Final = "sessions.db"
+CLOSE_S: Final = 5.0
+REACH_S: Final = 10.0
+AGAIN_S: Final = 0.05
 
 
 def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, str | None]:
@@ -63,6 +69,48 @@ def nats_access(settings: Settings) -> NatsAccess:
     from optipmb_service.cluster.nats_access import NatsAccess  # noqa: PLC0415 - an extra
 
     return NatsAccess(settings.cluster_tls, settings.cluster_credentials)
+
+
+def copy_folder(settings: Settings) -> Copied:
+    """Copy the sessions of the folder `store` into the store of `cluster`.
+
+    Raises:
+        StoreError: either cannot be used, or a member uses it.
+    """
+    folder = settings.folder
+    file = folder and folder / STORE_FILE
+    if file is None or not file.exists():
+        raise StoreError(f"{file or 'setting store'}: expected the checkpoints of a service, found none")
+    if in_use(file):
+        raise StoreError(f"{file}: a service uses it: end it first")
+    source = SqliteStore(file)
+    try:
+        target, _ = open_store(settings, None)
+        try:
+            _reach(target)
+            return copy_sessions(source, target)
+        finally:
+            target.close(CLOSE_S)
+    finally:
+        source.close()
+
+
+def _reach(store: LeaseStore) -> None:
+    """Wait until a store can be used, which takes a moment where it is remote.
+
+    Raises:
+        StoreError: why it cannot, for long.
+    """
+    until_s = time.monotonic() + REACH_S
+    while True:
+        try:
+            store.follow(0)
+        except StoreError:
+            if time.monotonic() > until_s:
+                raise
+            time.sleep(AGAIN_S)
+        else:
+            return
 
 
 def open_log(settings: Settings) -> MissedFrames:
