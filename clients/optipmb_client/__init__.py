@@ -6,6 +6,7 @@ The command `optipmb` does everything that needs no programming.
 """
 
 from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
+from optipmb_client.history import kept_tracks
 from optipmb_client.publisher import Publisher
 from optipmb_client.subscriber import Received, Statistics, Subscriber
 from optipmb_client.transport import DEFAULT_ENDPOINT, Connection
@@ -22,4 +23,5 @@ __all__ = [
     "Statistics",
     "Subscriber",
     "UsageError",
+    "kept_tracks",
 ]

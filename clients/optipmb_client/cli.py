@@ -27,6 +27,7 @@ from optipmb_client.commands.record import record
 from optipmb_client.commands.replay import replay
 from optipmb_client.commands.status import status
 from optipmb_client.commands.track import track
+from optipmb_client.commands.tracks import tracks
 from optipmb_client.commands.tune import tune
 from optipmb_client.commands.warm_up import warm_up
 from optipmb_client.commands.watch import watch
@@ -81,6 +82,7 @@ for command in (
     ablate,
     plot,
     status,
+    tracks,
     profiles,
     load,
     move,

@@ -108,7 +108,7 @@ def service(prefix: str, name: str) -> Role:
 def viewer(prefix: str, name: str) -> Role:
     """Give a person or program that looks: it reads everything, asks about it, and writes nothing."""
     everything = recoverable(*(f"{prefix}/*/*/*/{topic}" for topic in ("detections", "points", "tracks", "problems")))
-    questions = (f"{prefix}/*/*/*/q/state", f"{prefix}/*/*/*/q/density")
+    questions = tuple(f"{prefix}/*/*/*/q/{what}" for what in ("state", "density", "tracks"))
     questions += (f"{prefix}/service/*/q/status", f"{prefix}/service/*/q/metrics")
     presence = (f"{prefix}/service/**", f"{prefix}/owner/**")
     return Role(

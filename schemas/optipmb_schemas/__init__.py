@@ -18,6 +18,7 @@ from optipmb_schemas.control import (
     SessionParameters,
     SessionState,
     SessionSummary,
+    TracksRequest,
 )
 from optipmb_schemas.dump import STORED, Dump, DumpedFrame, decode_dump, encode_dump
 from optipmb_schemas.errors import CODES, Code, MessageError
@@ -69,6 +70,7 @@ __all__ = [
     "SessionSummary",
     "Topic",
     "Tracks",
+    "TracksRequest",
     "decode",
     "decode_dump",
     "encode",

@@ -21,6 +21,7 @@ from optipmb_schemas.control import (
     ServiceStatus,
     SessionParameters,
     SessionState,
+    TracksRequest,
 )
 from optipmb_schemas.errors import MessageError, show
 from optipmb_schemas.limits import DEFAULT, Limits
@@ -50,6 +51,7 @@ MESSAGES: Final[tuple[type[Message], ...]] = (
     DrainRequest,
     Problem,
     ServiceStatus,
+    TracksRequest,
 )
 """Every type that is sent on its own."""
 

@@ -48,6 +48,17 @@ class ResetRequest(Message):
     close: Flag = Field(default=False, description="End the session and free it instead of starting it anew.")
 
 
+class TracksRequest(Message):
+    """Query `q/tracks`, with or without a payload: tracks of a stream in a range of stamps, as far as they are kept.
+
+    Each reply is a `Tracks` message as it was published: of each frame the one that holds, by stamp. Where there are
+    more than one answer takes, a `Problem` with the code `cut` follows, and its `stamp_ns` is where the rest begins.
+    """
+
+    from_ns: Stamp = Field(default=0, description="First stamp, of the sensor's clock.")
+    to_ns: Stamp | None = Field(default=None, description="Last stamp; absent: up to the newest frame.")
+
+
 class MoveRequest(Message):
     """Query `service/<instance>/q/move`: give a stream to another worker process. The reply repeats it when it is done.
 

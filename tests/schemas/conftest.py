@@ -21,6 +21,7 @@ from optipmb_schemas import (
     SessionState,
     SessionSummary,
     Tracks,
+    TracksRequest,
 )
 
 EPOCH = bytes(range(16))
@@ -140,6 +141,7 @@ def _examples() -> list[Message]:
         ResetRequest(close=True),
         MoveRequest(stream="a/b/c", worker=1),
         DrainRequest(drain=False),
+        TracksRequest(from_ns=5, to_ns=7),
         problem,
         status,
     ]

@@ -176,6 +176,8 @@ RULES: list[tuple[str, str, Any, str]] = [
     ("SessionParameters", "restart", None, "restart"),
     ("SessionParameters", "values", [1], "values"),
     ("ResetRequest", "close", 1, "close"),
+    ("TracksRequest", "from_ns", -1, "from_ns"),
+    ("TracksRequest", "to_ns", 0.5, "to_ns"),
     ("SessionState", "state", "old", "state"),
     ("SessionState", "epoch", "", "epoch"),
     ("Density", "weight", [0.5, -1.0], "weight[1]"),

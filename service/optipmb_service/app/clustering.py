@@ -12,6 +12,7 @@ from optipmb_service.cluster.copying import copy_sessions
 from optipmb_service.cluster.sqlite import SqliteStore, in_use
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.runtime.fusion import Fusion
+from optipmb_service.runtime.kept_tracks import LoggedTracks
 from optipmb_service.runtime.missed_frames import LoggedFrames, NoLog
 from optipmb_service.runtime.persistence import DAY_S
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from optipmb_service.cluster.copying import Copied
     from optipmb_service.cluster.nats_access import NatsAccess
     from optipmb_service.cluster.store import LeaseStore
+    from optipmb_service.runtime.kept_tracks import KeptTracks
     from optipmb_service.runtime.missed_frames import MissedFrames
     from optipmb_service.settings import Settings
 
@@ -113,12 +115,17 @@ def _reach(store: LeaseStore) -> None:
             return
 
 
-def open_log(settings: Settings) -> MissedFrames:
-    """Return what is known of the frames that a session has missed: those in the log, where there is a cluster."""
+def open_log(settings: Settings, recent: KeptTracks) -> tuple[MissedFrames, KeptTracks]:
+    """Return where frames are that a session has missed, and tracks: in the log, where there is a cluster.
+
+    Args:
+        settings: what is in force.
+        recent: what is kept without a log.
+    """
     if not settings.cluster:
-        return NoLog()
+        return NoLog(), recent
     from optipmb_service.cluster.log_reader import LogReader  # noqa: PLC0415 - an extra
     from optipmb_service.cluster.message_log import MessageLog  # noqa: PLC0415 - an extra
 
     reader = LogReader(MessageLog(settings.cluster, settings.prefix, nats_access(settings)), settings.standby_s)
-    return LoggedFrames(reader, Keys(settings.prefix), Fusion(settings.fuse))
+    return LoggedFrames(reader, Keys(settings.prefix), Fusion(settings.fuse)), LoggedTracks(reader, recent)

@@ -23,6 +23,7 @@ from optipmb_service.cluster.log_writer import LogWriter
 from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
+from optipmb_service.runtime.kept_tracks import order_of
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.session.problems import problem_of
 from optipmb_service.zenoh.client import Client
@@ -119,10 +120,10 @@ class LogBridge:
             self._invalid += 1
             return
         topic: Topic = "detections"
-        order = (0, 0)
+        sensor, order = "", (0, 0)
         if isinstance(content, schemas.Tracks):
-            topic, order = "tracks", (content.delivery.run if content.delivery else 0, content.revision)
-        frame = content.epoch, content.seq, content.stamp_ns
+            topic, sensor, order = "tracks", content.sensor or "", order_of(content)
+        frame = content.epoch, content.seq, content.stamp_ns, sensor
         self._writer.put(LogMessage(topic, stream, *frame, order, message.payload, message.encoding))
 
     def _unlogged(self, stream: str, why: str) -> None:

@@ -33,11 +33,13 @@ from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.intake import Intake
+from optipmb_service.runtime.kept_tracks import RecentTracks
 from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter, NoPersistence
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.runtime.queries import Queries, members_of
 from optipmb_service.runtime.registry import Registry
 from optipmb_service.runtime.scheduler import Scheduler
+from optipmb_service.runtime.track_query import TrackQuery
 from optipmb_service.session.problems import problem_of
 from optipmb_service.zenoh import Transport
 
@@ -105,7 +107,8 @@ class Service:
             if keeps_nothing is None
             else NoPersistence(keeps_nothing)
         )
-        self._missed = open_log(settings)
+        recent = RecentTracks(self._transport.recent_tracks, settings.limits.limits())
+        self._missed, kept = open_log(settings, recent)
         self._registry = Registry(
             settings,
             profiles,
@@ -136,6 +139,7 @@ class Service:
             self._member,
             self._intake.hand_over,
             settings.workers,
+            TrackQuery(kept, settings.instance, settings.limits.limits()),
         )
 
     def start(self, *, announce: bool = True) -> None:

@@ -63,6 +63,20 @@ class LogReader:
         """
         self._log.connection.start(self._missed(wanted, take))
 
+    def tracks(
+        self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
+    ) -> None:
+        """Read the tracks of a stream from a stamp on, without waiting for it.
+
+        Args:
+            stream: whose.
+            from_ns: the stamp; some earlier ones may come, too.
+            take: called, on a thread that must not be kept, with some of them, in the order of the log, until it says
+                that it has enough (False).
+            end: called once afterwards, with the reason when not all could be read.
+        """
+        self._log.connection.start(self._tracks(stream, from_ns, take, end))
+
     def close(self, timeout: float) -> None:
         """End."""
         self._log.connection.close(timeout)
@@ -109,6 +123,21 @@ class LogReader:
                     log.warning("log_cut", stream=part.stream, frames=part.frames, bytes=part.size)
                     return
                 messages.append(message)
+
+    async def _tracks(
+        self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
+    ) -> None:
+        failure = ""
+        try:
+            async with asyncio.timeout(READ_S), self._turns:
+                number = await self._log.since("tracks", stream, lambda one: one.stamp_ns < from_ns)
+                while number is not None and (found := await self._log.read("tracks", stream, number)):
+                    number = found[-1][0] + 1
+                    if not take([message for _, message in found]):
+                        break
+        except (NatsError, RefusedError, TimeoutError, OSError) as error:
+            failure = self._log.connection.described(error)
+        end(failure)
 
 
 @dataclass(slots=True)

@@ -60,6 +60,7 @@ class LogMessage(NamedTuple):
         epoch: of its frame.
         seq: of its frame.
         stamp_ns: of its frame.
+        sensor: whose frame it is, where tracks are those of several sensors; else nothing.
         order: what tells the tracks of one frame apart: the higher ones hold. (0, 0) for detections.
         payload: its bytes, as they were published.
         encoding: the Zenoh encoding.
@@ -70,6 +71,7 @@ class LogMessage(NamedTuple):
     epoch: bytes
     seq: int
     stamp_ns: int
+    sensor: str
     order: tuple[int, int]
     payload: bytes
     encoding: str
@@ -86,7 +88,7 @@ class LogMessage(NamedTuple):
 
     @property
     def _frame(self) -> str:
-        return f"{self.epoch.hex()}:{self.seq}:{self.stamp_ns}:{self.order[0]}:{self.order[1]}"
+        return f"{self.epoch.hex()}:{self.seq}:{self.stamp_ns}:{self.sensor}:{self.order[0]}:{self.order[1]}"
 
 
 @dataclass(frozen=True)
@@ -257,13 +259,14 @@ def _found(topic: Topic, message: Msg) -> _Found:
     headers = message.headers or {}
     try:
         stream = "/".join(map(text_of, headers["Nats-Subject"].split(".")[1:]))
-        epoch, seq, stamp_ns, run, revision = headers[FRAME].split(":")
+        epoch, seq, stamp_ns, sensor, run, revision = headers[FRAME].split(":")
         content = LogMessage(
             topic,
             stream,
             bytes.fromhex(epoch),
             int(seq),
             int(stamp_ns),
+            sensor,
             (int(run), int(revision)),
             message.data,
             headers.get(ENCODING, ""),

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.ports import Packet, Request
     from optipmb_service.runtime.registry import Registry
     from optipmb_service.runtime.stream_actor import StreamActor
+    from optipmb_service.runtime.track_query import TrackQuery
     from optipmb_service.session.checkpoint import Checkpoint
 
 log = structlog.get_logger("optipmb_service")
@@ -65,6 +66,7 @@ class Queries:
         member: the partitions of this process.
         hand_over: gives what was received lately of sessions that are tracked elsewhere now.
         workers: how many processes the service has.
+        tracks: answers queries for tracks.
     """
 
     def __init__(
@@ -76,8 +78,10 @@ class Queries:
         member: Member,
         hand_over: Callable[[Iterable[str], Callable[[Packet], None]], None],
         workers: int,
+        tracks: TrackQuery,
     ) -> None:
         self._registry = registry
+        self._tracks = tracks
         self._status = status
         self._metrics = metrics
         self._samples = samples
@@ -187,6 +191,9 @@ class Queries:
             shared = schemas.MessageError("invalid_value", "key", f"{session}, the session that it shares", stream)
             _guarded(request, lambda: request.refuse(self._problem(stream, shared)))
             return
+        if name == "tracks":
+            self._tracks.answer(request, stream)
+            return
         commands: dict[str, tuple[Callable[[StreamActor, Request], None], bool]] = {
             "state": (lambda *_: None, True),
             "density": (self._density, True),
@@ -194,7 +201,9 @@ class Queries:
             "parameters": (self._parameters, False),
         }
         if name not in commands:
-            unknown = schemas.MessageError("invalid_value", "key", f"one of q/{', q/'.join(commands)}", f"q/{name}")
+            unknown = schemas.MessageError(
+                "invalid_value", "key", f"one of q/{', q/'.join((*commands, 'tracks'))}", f"q/{name}"
+            )
             _guarded(request, lambda: request.refuse(self._problem(stream, unknown)))
             return
         command, urgent = commands[name]

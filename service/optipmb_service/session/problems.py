@@ -55,6 +55,10 @@ CODES: Final = {
         "Another instance on the network tracks the stream too, for the two have no `store` in common.",
         "Give them one folder `store`, or servers of `cluster`; or let each have routers of its own.",
     ),
+    "cut": (
+        "In answers to `q/tracks`: there are more tracks than one answer takes.",
+        "Ask again from `stamp_ns` on, as `optipmb_client.kept_tracks` does.",
+    ),
     "unlogged": (
         "A message is not in the log: NATS was away for longer than the bridge can hold messages, or does not take it.",
         "Nothing for the tracks. See the NATS servers; a successor has to get the frame from the publisher's cache.",

@@ -42,6 +42,9 @@ RECENT_S: Final = 2.0
 TRACKS_CACHE: Final = 50
 """Tracks kept per stream for subscribers that lost some or come late: 5 s at 10 Hz. Most of what a stream holds."""
 
+CACHES_S: Final = 1.0
+"""How long the caches may take to answer."""
+
 log = structlog.get_logger("optipmb_service")
 
 
@@ -237,6 +240,14 @@ class Transport:
             release()
             raise TransportError(line(error)) from error
         return release
+
+    def recent_tracks(self, stream: str) -> list[tuple[bytes, str]]:
+        """Return what those who track a stream keep of its tracks for subscribers, each message with its encoding.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        return [(one.payload, one.encoding) for one in self.client().recent(self._keys.tracks(stream), CACHES_S)]
 
     def client(self) -> Client:
         """Return what an edge in this process uses of the session."""
