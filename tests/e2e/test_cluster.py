@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import threading
 import time
 from contextlib import nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import pytest
@@ -17,13 +20,14 @@ from optipmb_schemas import ServiceStatus
 from optipmb_service.cluster.leases import PARTITIONS
 from proxy import Proxy
 from router import Node, Sensor, until
+from routers import free_endpoint
+from service_process import READY_S
 from takeovers import KEYS, check, longest_silence_s, outage_s, published_by, send
 
 import optipmb
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
     from types import TracebackType
 
     from optipmb_schemas import SessionState
@@ -374,3 +378,29 @@ def test_the_server_is_gone_for_longer_than_a_lease(cluster: Cluster) -> None:
         cluster.check(50 - 10 * worker, "pair-w0", "pair-w1")
         assert cluster.owners()[SENSORS[0].stream] == f"pair-w{worker}"
     assert service.end()[0] == 0
+
+
+@pytest.mark.timeout(600)
+def test_the_topology_of_kubernetes_runs_as_processes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The example starts it with one command, tracks come through either router, and an interrupt ends all of it."""
+    routers = [free_endpoint() for _ in range(2)]
+    names = {"ROUTER_A": routers[0], "ROUTER_B": routers[1], "NATS": free_endpoint().removeprefix("tcp/")}
+    script = Path(__file__).parents[2] / "examples" / "cluster.sh"
+    program = Path(sys.executable).with_name("optipmb-service")
+    environment = os.environ | names | {"SERVICE": str(program), "STORE": str(tmp_path)}
+    with (
+        (tmp_path / "log").open("w") as log,
+        subprocess.Popen(["/bin/sh", script], env=environment, stdout=log, stderr=log, process_group=0) as process,
+    ):
+        try:
+            until(lambda: (tmp_path / "log").read_text().count("\nready ") == 6, "all are ready", READY_S)
+            for endpoint in routers:
+                arguments = ("replay", "--dataset", "scene", "--option", "frames=20", "--connect", endpoint)
+                assert run_here(capsys, *arguments).returncode == 0
+            status = run_here(capsys, "status", "--connect", routers[1]).stdout
+            assert all(name in status for name in ("service-0", "service-1"))
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 0
+        with pytest.raises(ProcessLookupError):
+            os.killpg(process.pid, 0)
