@@ -35,7 +35,7 @@ def table(name: str) -> str:
         return _markdown(("limit", "default", "of"), ((f"`{n}`", f"{v:,}", text) for n, v, text in DEFAULT.described()))
     if name == "codes":
         return _markdown(("code", "meaning"), ((f"`{code}`", text) for code, text in CODES.items()))
-    return _markdown(("field", "type", "required", "meaning"), _rows(_KIND[name]))
+    return _markdown(("field", "type", "meaning"), _rows(_KIND[name]))
 
 
 def _rows(kind: type[Message]) -> Iterable[tuple[str, ...]]:
@@ -47,7 +47,7 @@ def _rows(kind: type[Message]) -> Iterable[tuple[str, ...]]:
         known = set(_fields(first))
         same = [row for row in rows if row in known]
         if len(same) > 1:
-            yield ", ".join(name for name, *_ in same), "", "", f"As in `{first.__name__}`."
+            yield ", ".join(name for name, *_ in same), "", f"As in `{first.__name__}`."
             rows = [row for row in rows if row not in known]
     yield from rows
 
@@ -55,12 +55,12 @@ def _rows(kind: type[Message]) -> Iterable[tuple[str, ...]]:
 def _fields(kind: type[Message]) -> Iterable[tuple[str, ...]]:
     properties = kind.model_json_schema()["properties"]
     for name, info in kind.model_fields.items():
-        required = "yes" if info.is_required() else _default(info)
-        yield f"`{name}`", _type(kind, name, properties[name]), required, info.description or ""
+        kept = "" if info.is_required() else _default(info)
+        yield f"`{name}`", _type(kind, name, properties[name]) + kept, info.description or ""
 
 
 def _default(info: FieldInfo) -> str:
-    return "no" if info.default in (None, (), "") else f"no: {str(info.default).lower()}"
+    return ", optional" if info.default in (None, (), "") else f", default {str(info.default).lower()}"
 
 
 def _type(kind: type[Message], name: str, schema: JsonSchemaValue) -> str:
