@@ -66,13 +66,18 @@ class LateJoin(Generic[_S]):
         receive: takes a sample; never called by two threads at once, nor after `close`. It must not raise.
         ask: queries a selector; calls its second argument with each reply, and its third when no more will come, on any
             thread but the one that asks.
+        answered: told the key of a publisher when all has been handed over that its cache held. It must not raise.
     """
 
     def __init__(
-        self, receive: Callable[[_S], object], ask: Callable[[str, Callable[[_S], None], Callable[[], None]], object]
+        self,
+        receive: Callable[[_S], object],
+        ask: Callable[[str, Callable[[_S], None], Callable[[], None]], object],
+        answered: Callable[[str], object] = lambda _: None,
     ) -> None:
         self._receive = receive
         self._ask = ask
+        self._told = answered
         self._sources: dict[_Source, list[_S] | None] = {}  # what waits for the answer of a cache; None: nothing does
         self._keys: dict[_Source, str] = {}
         self._waiting_bytes = 0
@@ -138,15 +143,16 @@ class LateJoin(Generic[_S]):
 
         zid, eid = source
         selector = f"{key}/@adv/pub/{zid}/{eid}/**?_sn=..{number - 1}"
-        self._ask(selector, reply, lambda: self._answered(source, early))
+        self._ask(selector, reply, lambda: self._answered(source, early, str(key)))
 
-    def _answered(self, source: _Source, early: list[tuple[int, _S]]) -> None:
+    def _answered(self, source: _Source, early: list[tuple[int, _S]], key: str) -> None:
         with self._lock:
             if self._closed:
                 return
             for _, sample in sorted(early, key=lambda one: one[0]):
                 self._receive(sample)
             self._release(source)
+            self._told(key)
 
     def _release(self, source: _Source) -> None:
         waiting, self._sources[source] = self._sources.get(source), None

@@ -255,7 +255,10 @@ class Settings(BaseSettings):
         default=False, description="a cloud that arrives after its frame was tracked corrects the tracks"
     )
     recovery_wait_s: float = Field(
-        default=2.0, ge=0, le=60, description="after a restart, longest wait for missing frames"
+        default=2.0,
+        ge=0,
+        le=60,
+        description="after a restart, longest wait for missing frames; it ends when the publisher's cache has answered",
     )
     max_speed: float = Field(
         default=100.0,

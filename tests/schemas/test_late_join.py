@@ -44,6 +44,7 @@ class Joined:
         self.join: LateJoin[Sample] = LateJoin(
             lambda sample: self.received.append(sample.source_info and sample.source_info.source_sn),
             lambda *query: self.asked.append(query),
+            self.received.append,
         )
 
     def take(self, *numbers: int, source: Entity = Entity()) -> None:
@@ -79,7 +80,7 @@ def test_what_came_before_the_first_sample_comes_first() -> None:
     assert (one.received, [selector for selector, _, _ in one.asked]) == ([], ["a/b/@adv/pub/abc/7/**?_sn=..2"])
     one.answer(2, 1)
     one.take(5)
-    assert (one.received, one.asked) == ([1, 2, 3, 4, 5], [])
+    assert (one.received, one.asked) == ([1, 2, 3, 4, "a/b", 5], [])
 
 
 def test_one_publisher_does_not_wait_for_another() -> None:
@@ -89,7 +90,7 @@ def test_one_publisher_does_not_wait_for_another() -> None:
     one.take(0, 1, source=Entity("def"))
     assert one.received == [0, 1]
     one.answer()
-    assert one.received == [0, 1, 3]
+    assert one.received == [0, 1, 3, "a/b"]
 
 
 def test_closing_hands_over_what_waits_and_nothing_afterwards() -> None:
@@ -110,7 +111,7 @@ def test_what_waits_and_who_is_known_are_bounded(monkeypatch: pytest.MonkeyPatch
     one.take(3, 4, 5, 6)
     assert one.received == [3, 4, 5, 6]
     one.answer(2)
-    assert one.received == [3, 4, 5, 6, 2]
+    assert one.received == [3, 4, 5, 6, 2, "a/b"]
     for name in ("second", "third"):
         one.take(0, source=Entity(name))
     assert one.asked == []

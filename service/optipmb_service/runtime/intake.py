@@ -71,8 +71,9 @@ class Inputs(Protocol):
         on_cloud: Callable[[Packet], None],
         noticed: Callable[[str, bool], bool],
         passed_by: Callable[[int], None],
+        answered: Callable[[str], None],
     ) -> None:
-        """Say where messages go, who decides which of those discovered do, and who counts the others."""
+        """Say where messages go, who decides which of those discovered do, who counts the rest, who hears of caches."""
 
     def subscribe(self, kind: Kind, stream: str) -> None:
         """Receive a stream, or all of them."""
@@ -129,7 +130,10 @@ class Intake:
 
     def start(self) -> None:
         """Receive from now on what is to be received."""
-        self._inputs.receive(self._registry.frame, self._registry.cloud, self._noticed, self._registry.passed_by)
+        registry = self._registry
+        self._inputs.receive(
+            registry.frame, registry.cloud, self._noticed, registry.passed_by, registry.caches_answered
+        )
         self._inputs.watch_streams(self._published, self._discovered)
         self._step()
         self._thread.start()

@@ -203,6 +203,22 @@ class Registry:
             if not self._over_quota(stream, packet, frame=frame):
                 self._hand(session, packet, frame=frame)
 
+    def caches_answered(self, key: str) -> None:
+        """Tell a session that all has come which the cache of its publisher held."""
+        try:
+            _, session = self.parsed(key)
+        except schemas.MessageError:
+            return
+        with self._foreign_lock:
+            buffer = self._foreign.get(session)
+            if buffer is not None:
+                buffer.answered = True
+                return
+        with self._lock:
+            actor = self._actors.get(session)
+        if actor is not None and actor.mailbox.offer_command(actor.on_caches_answered, urgent=False):
+            self._scheduler.submit(actor)
+
     def _hand(self, stream: str, packet: Packet, *, frame: bool) -> None:
         offered = Mailbox.offer_frame if frame else Mailbox.offer_cloud
         self._offer(stream, lambda actor: offered(actor.mailbox, packet))
@@ -299,7 +315,7 @@ class Registry:
                 return
             known = {(packet.key, packet.payload) for packet, _ in packets}
             packets = packets + [one for one in buffer.take() if (one[0].key, one[0].payload) not in known]
-            self._offer(session, partial(_take_up, packets=packets), limited=False)
+            self._offer(session, partial(_take_up, packets=packets, answered=buffer.answered), limited=False)
             del self._foreign[session]  # from now on readers hand over newer ones
 
     def elsewhere(self, stream: str) -> bool:
@@ -534,8 +550,8 @@ def _save(folder: Path | None, stream: str, dump: bytes) -> str:
         return ""
 
 
-def _take_up(actor: StreamActor, packets: list[tuple[Packet, bool]]) -> bool | None:
-    return actor.mailbox.offer_command(lambda: actor.take_up(packets), urgent=True)
+def _take_up(actor: StreamActor, packets: list[tuple[Packet, bool]], *, answered: bool) -> bool | None:
+    return actor.mailbox.offer_command(lambda: actor.take_up(packets, answered=answered), urgent=True)
 
 
 def _flush(actor: StreamActor) -> None:

@@ -282,14 +282,27 @@ class StreamActor:
 
     # Who tracks the stream; to be called by the worker alone
 
-    def take_up(self, packets: Sequence[tuple[Packet, bool]]) -> None:
+    def take_up(self, packets: Sequence[tuple[Packet, bool]], *, answered: bool = False) -> None:
         """Go on with a stream that has come here, and with what it sent before, each packet with whether it is a frame.
 
-        A session that is kept goes on at once; without one the first valid packet begins it.
+        A session that is kept goes on at once; without one the first valid packet begins it. `answered`: all that the
+        publisher's cache holds is among them.
         """
         if not self.occupied and self._context.member.holds(self.stream) and not self._context.room(self.stream):
             self._seeking = self._open()
         self._receive_all(packets)
+        if answered:
+            self.on_caches_answered()
+
+    def on_caches_answered(self) -> None:
+        """Go on behind gaps: what is missing is in no cache. Several sensors have several; they wait for a time."""
+        self.ask(StreamActor._recovered, seek=False)
+
+    def _recovered(self) -> None:
+        session = self.session
+        if session is not None and session.recovering and not self.fused:
+            self._changed = True
+            self._deliver(session.recovered(time.monotonic_ns()))
 
     def _receive_all(self, packets: Sequence[tuple[Packet, bool]]) -> None:
         for packet, frame in packets:

@@ -28,6 +28,8 @@ class TakeoverBuffer:
         self._keep_ns = keep_ns
         self._budget = budget
         self._packets: deque[tuple[Packet, bool]] = deque()
+        self.answered = False
+        """Whether all has come that the publisher's cache holds."""
         self.seen_ns = 0
         """When the stream was last heard of, monotonic; set by whoever keeps the buffer."""
 

@@ -49,17 +49,25 @@ class Topic:
         session: to subscribe on.
         receive: called for each sample, one after the other.
         waiting: samples that may wait for the thread; Zenoh waits beyond that.
+        answered: told the key of a publisher when all has been handed over that its cache held.
     """
 
     def __init__(
-        self, name: str, session: zenoh.Session, receive: Callable[[zenoh.Sample], None], waiting: int
+        self,
+        name: str,
+        session: zenoh.Session,
+        receive: Callable[[zenoh.Sample], None],
+        waiting: int,
+        answered: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._name = name
         self._session = session
         self._receive = receive
         self._waiting: queue.Queue[zenoh.Sample | Callable[[], None] | None] = queue.Queue(waiting)
         self._subscribers: dict[str, Undeclared] = {}
-        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._hand_over, lambda *asked: ask_cache(session, *asked))
+        self._late_join: LateJoin[zenoh.Sample] = LateJoin(
+            self._hand_over, lambda *asked: ask_cache(session, *asked), answered
+        )
         self._thread = threading.Thread(target=self._drain, name=f"reader-{name}", daemon=True)
         self._thread.start()
 

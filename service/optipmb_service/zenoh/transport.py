@@ -82,6 +82,7 @@ class Transport:
         on_cloud: Callable[[Packet], None],
         noticed: Callable[[str, bool], bool],
         passed_by: Callable[[int], None],
+        answered: Callable[[str], None],
     ) -> None:
         """Hand over the detections and point clouds that are subscribed to, each on a thread of its own.
 
@@ -91,6 +92,7 @@ class Transport:
             noticed: told of detections that come by a subscription to all, by key and whether they can be recovered;
                 where that is `discovery`, those alone are handed over for which it returns True.
             passed_by: told the sizes of the others.
+            answered: told a key when all detections have been handed over that a publisher's cache held.
         """
 
         def discover(sample: zenoh.Sample) -> None:
@@ -106,7 +108,7 @@ class Transport:
 
         self._discover = discover
         self._topics = {
-            "detections": Topic("detections", self._session, detected, CHANNEL),
+            "detections": Topic("detections", self._session, detected, CHANNEL, answered),
             "points": Topic("points", self._session, lambda one: self._receive(one, on_cloud), CHANNEL // 16),
         }
 

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+import zenoh.ext
 from lease_log import Alone
-from optipmb_schemas import Keys, ServiceStatus, SessionState
+from optipmb_schemas import Keys, ServiceStatus, SessionState, encode
 from optipmb_service.app.clustering import STORE_FILE
 from optipmb_service.cluster.leases import ALIVE, member_key
 from optipmb_service.cluster.sqlite import SqliteStore
@@ -78,6 +79,32 @@ def test_a_restart_goes_on(start: Callable[..., Any], tmp_path: Path) -> None:
         until(lambda: node.ask(state, SessionState).duplicates == 1, "the session is there")
         after = node.ask(state, SessionState)
     assert (after.digest, after.session, after.frames) == (before.digest, before.session, 20)
+
+
+def test_what_no_cache_holds_is_not_waited_for(start: Callable[..., Any], tmp_path: Path) -> None:
+    """Fault 1: after a restart frames wait for those missing until the caches have answered, and no longer."""
+    options = {"store": str(tmp_path), "recovery_wait_s": 60.0}
+    service, endpoint = start(**options)
+    with Node(endpoint) as node:
+        publisher = zenoh.ext.declare_advanced_publisher(
+            node.session,
+            KEYS.detections(SENSOR.stream),
+            cache=zenoh.ext.CacheConfig(3),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.1, sporadic_heartbeat=None),
+            publisher_detection=True,
+        )
+        for seq in range(5):
+            publisher.put(encode(SENSOR.detections(seq)))
+            node.tracks(SENSOR.stream, seq + 1)
+        assert service.stop()
+        for seq in range(5, 15):
+            publisher.put(encode(SENSOR.detections(seq)))
+        start(listen=[endpoint], **options)
+        began = time.monotonic()
+        found = node.tracks(SENSOR.stream, 8)
+        assert time.monotonic() - began < 50.0
+        assert [(tracks.seq, tracks.gap) for tracks in found[5:]] == [(12, 7), (13, 0), (14, 0)]
+        publisher.undeclare()
 
 
 def test_a_torn_checkpoint_is_set_aside(start: Callable[..., Any], tmp_path: Path) -> None:
