@@ -16,7 +16,8 @@ import numba
 import numpy as np
 
 from optipmb.association import associate
-from optipmb.hypotheses import enumerate_hypotheses
+from optipmb.density import BernoulliArrays, PoissonArrays, columns_of_rows
+from optipmb.hypotheses import local_hypotheses
 from optipmb.motion import predict_state
 from optipmb.predict import predict
 from optipmb.preprocess import preprocess
@@ -24,9 +25,12 @@ from optipmb.table import ClassTable
 from optipmb.update import ukf_update, workspace
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     import optipmb
+    from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
@@ -38,15 +42,12 @@ def bare(
     covariance: Array,
     label: Index,
     dt: float,
-    process_noise: Array,
-    acceleration_time: Array,
-    constant_velocity: NDArray[np.bool_],
+    classes: Sequence[ClassRow],
     row: Index,
     measurement: Index,
     existence: Array,
     p_d: Array,
     position: Array,
-    noise_position: Array,
     won: Index,
     z: Array,
     sigma: Array,
@@ -65,9 +66,7 @@ def bare(
             mean[n],
             covariance[n],
             dt,
-            process_noise[label[n]],
-            acceleration_time[label[n]],
-            constant_velocity[label[n]],
+            classes[label[n]],
             root,
             points,
             mean_predicted[n],
@@ -75,7 +74,7 @@ def bare(
         )
     for k in range(row.shape[0]):
         n, m = row[k], measurement[k]
-        r_xy = noise_position[label[n]] ** 2
+        r_xy = classes[label[n]].noise_position ** 2
         s_xx, s_xy = covariance_predicted[n, 0, 0] + r_xy, covariance_predicted[n, 0, 1]
         s_yy = covariance_predicted[n, 1, 1] + r_xy
         determinant = s_xx * s_yy - s_xy * s_xy
@@ -104,9 +103,12 @@ def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: o
     predicted, _ = predict(density, frame.stamp_ns, table)
     measurements, _, _ = preprocess(frame, table)
     old, undetected = predicted.bernoulli, predicted.poisson
-    p_d, p_d_poisson = table.detection[old.label], table.detection[undetected.label]
-    found = enumerate_hypotheses(old, p_d, undetected, p_d_poisson, measurements, table.period, table)
-    assigned = associate(found, len(old))
+    p_d, p_d_poisson = table["detection"][old.label], table["detection"][undetected.label]
+    objects, components = BernoulliArrays(*columns_of_rows(old)), PoissonArrays(*columns_of_rows(undetected))
+    found = local_hypotheses(
+        objects, p_d, components, p_d_poisson, measurements, table.period, table.period, table.classes
+    )
+    assigned = associate(found.row, found.measurement, found.detection_cost, found.first_cost, len(old))
     before, waiting = density.bernoulli, density.poisson
     count = len(before) + len(waiting)
     # Predicted rows that a limit has removed are not in a settled scene; the bound counts on it.
@@ -115,22 +117,19 @@ def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: o
     winners = np.flatnonzero(assigned >= 0)
     z = np.column_stack([measurements.position, measurements.velocity, measurements.yaw])
     sigma = np.column_stack(
-        [table.noise_position, table.noise_position, table.noise_velocity, table.noise_velocity, table.noise_heading]
+        [table[f"noise_{name}"] for name in ("position", "position", "velocity", "velocity", "heading")]
     )
     return (
         np.concatenate([before.mean, waiting.mean]),
         np.concatenate([before.covariance, waiting.covariance]),
         np.concatenate([before.label, waiting.label]),
         (frame.stamp_ns - density.stamp_ns) * 1e-9,
-        table.process_noise,
-        table.acceleration_time,
-        table.constant_velocity,
+        table.classes,
         np.concatenate([found.row, found.component + len(before)]),
         np.concatenate([found.measurement, found.announced]),
         np.concatenate([old.existence, undetected.weight]),
         np.concatenate([p_d, p_d_poisson]),
         measurements.position,
-        table.noise_position,
         np.column_stack([winners, assigned[winners]]),
         z,
         sigma,

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from optipmb.tracker import STAGES
-
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -16,6 +14,8 @@ if TYPE_CHECKING:
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
 PEER_STYLES = {"Stone Soup": (RED, "s"), "motpy": (ORANGE, "^"), "norfair": (PURPLE, "D")}
 DPI = 110
+STAGES = ("predict", "preprocess", "detection_probability", "update", "extract")
+"""The parts of a step, by the names of their functions."""
 
 
 def scaling(found: dict[str, Any], path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -10,11 +10,12 @@ from settled import PARAMETERS, settled
 
 import optipmb
 from optipmb.association import associate
-from optipmb.hypotheses import enumerate_hypotheses
+from optipmb.density import BernoulliArrays, PoissonArrays, columns_of_rows
+from optipmb.hypotheses import local_hypotheses
 from optipmb.points import points_in_boxes
 from optipmb.predict import predict
 from optipmb.preprocess import non_maximum_suppression, preprocess
-from optipmb.table import ClassTable
+from optipmb.table import CLASS, ClassTable
 
 if TYPE_CHECKING:
     from pytest_benchmark.fixture import BenchmarkFixture
@@ -45,32 +46,37 @@ def test_suppression(benchmark: BenchmarkFixture, apart: float) -> None:
     rng = np.random.default_rng(0)
     boxes = rng.uniform([-16, -16, 3, 1.5, -3], [16, 16, 5, 2, 3], (1000, 5))
     boxes[:, :2] *= apart
-    keep = benchmark(non_maximum_suppression, boxes, np.zeros(1000, np.int64), np.array([0.1]), np.zeros(1, np.int64))
+    classes = np.zeros(1, CLASS)
+    classes["nms_iou"] = 0.1
+    keep = benchmark(non_maximum_suppression, boxes, np.zeros(1000, np.int64), classes)
     assert 0 < keep.sum() < 1000
+
+
+def before_association(objects: int) -> tuple[Any, ...]:
+    """The arguments of `local_hypotheses`."""
+    _, density, frame = settled(objects)
+    density, _ = predict(density, frame.stamp_ns, TABLE)
+    measurements, _, _ = preprocess(frame, TABLE)
+    old, new = density.bernoulli, density.poisson
+    p_d = TABLE["detection"][old.label], TABLE["detection"][new.label]
+    known, undetected = BernoulliArrays(*columns_of_rows(old)), PoissonArrays(*columns_of_rows(new))
+    return known, p_d[0], undetected, p_d[1], measurements, TABLE.period, TABLE.period, TABLE.classes
 
 
 @OBJECTS
 def test_hypotheses(benchmark: BenchmarkFixture, objects: int) -> None:
     """Gates, likelihoods and costs."""
-    _, density, frame = settled(objects)
-    density, _ = predict(density, frame.stamp_ns, TABLE)
-    measurements, _, _ = preprocess(frame, TABLE)
-    old, new = density.bernoulli, density.poisson
-    p_d = TABLE.detection[old.label], TABLE.detection[new.label]
-    found = benchmark(enumerate_hypotheses, old, p_d[0], new, p_d[1], measurements, TABLE)
+    found = benchmark(local_hypotheses, *before_association(objects))
     assert len(found.row) > 0.5 * objects
 
 
 @OBJECTS
 def test_associate(benchmark: BenchmarkFixture, objects: int) -> None:
     """Clusters and assignment."""
-    _, density, frame = settled(objects)
-    density, _ = predict(density, frame.stamp_ns, TABLE)
-    measurements, _, _ = preprocess(frame, TABLE)
-    old, new = density.bernoulli, density.poisson
-    p_d = TABLE.detection[old.label], TABLE.detection[new.label]
-    found = enumerate_hypotheses(old, p_d[0], new, p_d[1], measurements, TABLE)
-    assigned = benchmark(associate, found, len(old))
+    given = before_association(objects)
+    found = local_hypotheses(*given)
+    pairs = found.row, found.measurement, found.detection_cost, found.first_cost
+    assigned = benchmark(associate, *pairs, given[1].size)
     assert (assigned >= 0).sum() > 0.5 * objects
 
 

@@ -22,12 +22,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.records import INDEX
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from optipmb.hypotheses import Hypotheses
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
@@ -36,24 +33,9 @@ UNASSIGNED: Final = -1
 """No measurement of an object, no object of a measurement."""
 
 
-def associate(hypotheses: Hypotheses, n_objects: int) -> Index:
-    """Find the global hypothesis of least cost.
-
-    Args:
-        hypotheses: all local hypotheses of the frame.
-        n_objects: number N of predicted objects.
-
-    Returns:
-        (N,) the measurement of each object, `UNASSIGNED` for the missed ones.
-    """
-    assigned = np.empty(n_objects, INDEX)
-    assign(hypotheses.row, hypotheses.measurement, hypotheses.detection_cost, hypotheses.first_cost, assigned)
-    return assigned
-
-
 @kernel
-def assign(row: Index, measurement: Index, cost: Array, first_cost: Array, assigned: Index) -> None:
-    """Assign measurements to objects at least total cost, by shortest augmenting paths over the pairs.
+def associate(row: Index, measurement: Index, cost: Array, first_cost: Array, n_objects: int) -> Index:
+    """Find the global hypothesis of least cost, by shortest augmenting paths over the pairs.
 
     The gain of a pair is what it costs more than the first-time detection of its measurement; a missed object gains
     zero. Prices u of objects and v of measurements keep ``gain - u - v >= 0`` on every pair that lowers the total, with
@@ -64,10 +46,13 @@ def assign(row: Index, measurement: Index, cost: Array, first_cost: Array, assig
         measurement: (K,) measurement of each pair.
         cost: (K,) w of each pair.
         first_cost: (M,) w of the first-time detection of each measurement.
-        assigned: (N,) receives the measurement of each object, `UNASSIGNED` for the missed ones.
+        n_objects: number N of predicted objects.
+
+    Returns:
+        (N,) the measurement of each object, `UNASSIGNED` for the missed ones.
     """
-    n_objects, n_measurements = assigned.shape[0], first_cost.shape[0]
-    assigned[:] = UNASSIGNED
+    n_measurements = first_cost.shape[0]
+    assigned = np.full(n_objects, UNASSIGNED)
     start = np.zeros(n_objects + 1, np.int64)  # where the pairs of each object start
     for n in row:
         start[n + 1] += 1
@@ -124,3 +109,4 @@ def assign(row: Index, measurement: Index, cost: Array, first_cost: Array, assig
             n = before[end]
             owner[end] = n
             end, assigned[n] = assigned[n], end
+    return assigned

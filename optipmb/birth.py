@@ -22,12 +22,14 @@ from optipmb.position_noise import PLAIN
 from optipmb.update import ukf_updates
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from optipmb.density import Poissons
     from optipmb.hypotheses import Hypotheses
     from optipmb.preprocess import Measurements
-    from optipmb.table import ClassTable
+    from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
@@ -35,40 +37,28 @@ if TYPE_CHECKING:
 
 @kernel
 def birth_states(
-    rows: Index,
-    position: Array,
-    yaw: Array,
-    velocity: Array,
-    label: Index,
-    heading_speed: Array,
-    known: Array,
-    unknown: Array,
-    mean_out: Array,
-    covariance_out: Array,
+    rows: Index, measurements: Measurements, classes: Sequence[ClassRow], mean_out: Array, covariance_out: Array
 ) -> None:
     """Compute m^0 and P^0 of the measurements in `rows` (eq. Newborn Hypothesis).
 
     Args:
         rows: (K,) measurements.
-        position: (M, 2) z_xy, or (M, 5) with rho of `optipmb.position_noise`: P^0_xy is that of the class times rho.
-        yaw: (M,) z_phi.
-        velocity: (M, 2) z_v, NaN where unknown.
-        label: (M,) z_c.
-        heading_speed: (C,) speed from which the heading is that of the velocity.
-        known: (C, 6) standard deviations of P^0 with a velocity.
-        unknown: (C, 6) without.
+        measurements: Z_k; where it has rho of `optipmb.position_noise`, P^0_xy is that of the class times rho.
+        classes: (C,) parameters: P^0, and the speed from which the heading is that of the velocity.
         mean_out: (K, 6) receives the means.
         covariance_out: (K, 6, 6) receives the covariances, diagonal but for x and y.
     """
+    position, velocity, yaw = measurements.position, measurements.velocity, measurements.yaw
     own_noise = position.shape[1] > PLAIN
     for k in range(rows.shape[0]):
         m = rows[k]
+        own = classes[measurements.label[m]]
         speed, heading = 0.0, yaw[m]
-        spread = unknown[label[m]]
+        spread = own.birth_unknown
         if not (math.isnan(velocity[m, 0]) or math.isnan(velocity[m, 1])):
-            spread = known[label[m]]
+            spread = own.birth_known
             speed = math.hypot(velocity[m, 0], velocity[m, 1])
-            if speed >= heading_speed[label[m]] and speed > 0.0:
+            if speed >= own.birth_heading_speed and speed > 0.0:
                 heading = math.atan2(velocity[m, 1], velocity[m, 0])
             else:
                 speed = velocity[m, 0] * math.cos(heading) + velocity[m, 1] * math.sin(heading)
@@ -88,110 +78,36 @@ def birth_states(
             covariance_out[k, 0, 1] = covariance_out[k, 1, 0] = spread[0] * spread[1] * position[m, 3]
 
 
+@kernel
 def first_detected_states(
     rows: Index,
-    measurements: Measurements,
     hypotheses: Hypotheses,
-    poisson: Poissons,
-    table: ClassTable,
+    components: Poissons,
+    measurements: Measurements,
+    classes: Sequence[ClassRow],
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
     """Compute the states of the objects that the measurements in `rows` detect for the first time.
 
-    A newborn is N(m^0, P^0) (eq. Newborn Hypothesis). An announced object is the mixture of its components, each
-    updated by the measurement, matched by one Gaussian (eq. First-Time Detection Hypothesis Update 1).
+    A newborn is N(m^0, P^0) (eq. Newborn Hypothesis). An announced object is the mixture of its components J^m, each
+    updated by the measurement, with weights ``e^j / e``, matched by one Gaussian (eq. First-Time Detection Hypothesis
+    Update 1).
 
     Args:
         rows: (K,) measurements, none of them clutter.
-        measurements: Z_k.
         hypotheses: of this frame.
-        poisson: predicted components.
-        table: parameters as columns.
+        components: predicted Poisson components.
+        measurements: Z_k.
+        classes: (C,) parameters.
         mean_out: (K, 6) receives the means.
         covariance_out: (K, 6, 6) receives the covariances.
 
     Returns:
         How many covariances had to be repaired.
     """
-    repaired: int = first_states(
-        rows,
-        hypotheses.first_kind,
-        hypotheses.component,
-        hypotheses.announced,
-        hypotheses.log_e,
-        poisson.mean,
-        poisson.covariance,
-        measurements.position,
-        measurements.velocity,
-        measurements.yaw,
-        measurements.label,
-        table.birth_heading_speed,
-        table.birth_known,
-        table.birth_unknown,
-        table.noise_position,
-        table.noise_velocity,
-        table.noise_heading,
-        table.linearisations,
-        mean_out,
-        covariance_out,
-    )
-    return repaired
-
-
-@kernel
-def first_states(
-    rows: Index,
-    first_kind: Index,
-    component: Index,
-    announced: Index,
-    log_e: Array,
-    mean: Array,
-    covariance: Array,
-    position: Array,
-    velocity: Array,
-    yaw: Array,
-    label: Index,
-    heading_speed: Array,
-    known: Array,
-    unknown: Array,
-    noise_position: Array,
-    noise_velocity: Array,
-    noise_heading: Array,
-    linearisations: Index,
-    mean_out: Array,
-    covariance_out: Array,
-) -> int:
-    """Write the births m^0 and P^0 of the newborn, and the moment-matched posteriors of the components in J^m.
-
-    Equations Newborn Hypothesis and First-Time Detection Hypothesis Update 1; the weights are ``e^j / e``.
-
-    Args:
-        rows: (K,) measurements.
-        first_kind: (M,) kind of the first-time detection of each measurement.
-        component: (L,) component of each pair.
-        announced: (L,) measurement of each pair.
-        log_e: (L,) ln e^j of each pair.
-        mean: (J, 6) predicted means of the components.
-        covariance: (J, 6, 6) their covariances.
-        position: (M, 2) z_xy.
-        velocity: (M, 2) z_v.
-        yaw: (M,) z_phi.
-        label: (M,) z_c.
-        heading_speed: (C,) this and the next two as in `birth_states`.
-        known: (C, 6).
-        unknown: (C, 6).
-        noise_position: (C,) this and the next three as in `ukf_updates`.
-        noise_velocity: (C,).
-        noise_heading: (C,).
-        linearisations: (C,).
-        mean_out: (K, 6) receives the means.
-        covariance_out: (K, 6, 6) receives the covariances.
-
-    Returns:
-        How many covariances had to be repaired.
-    """
-    birth_states(rows, position, yaw, velocity, label, heading_speed, known, unknown, mean_out, covariance_out)
+    first_kind, announced, log_e = hypotheses.first_kind, hypotheses.announced, hypotheses.log_e
+    birth_states(rows, measurements, classes, mean_out, covariance_out)
     wanted = np.flatnonzero(first_kind[rows] == FROM_POISSON)
     if wanted.shape[0] == 0:
         return 0
@@ -228,18 +144,12 @@ def first_states(
     pairs = pairs[: start[-1]]
     parts, spreads = np.empty((pairs.shape[0], STATE)), np.empty((pairs.shape[0], STATE, STATE))
     repaired = ukf_updates(
-        component[pairs],
+        hypotheses.component[pairs],
         announced[pairs],
-        mean,
-        covariance,
-        position,
-        velocity,
-        yaw,
-        label,
-        noise_position,
-        noise_velocity,
-        noise_heading,
-        linearisations,
+        components.mean,
+        components.covariance,
+        measurements,
+        classes,
         parts,
         spreads,
     )

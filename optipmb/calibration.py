@@ -25,8 +25,12 @@ from typing import TYPE_CHECKING, Final
 from optipmb.compiled import kernel
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
     from numpy.typing import NDArray
+
+    from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
@@ -47,12 +51,7 @@ def calibrate_rows(
     label: Index,
     evidence: Array,
     yaw: Array,
-    knots: Index,
-    knot_evidence: Array,
-    knot_existence: Array,
-    knot_along: Array,
-    knot_across: Array,
-    score_of_evidence: Array,
+    classes: Sequence[ClassRow],
     existence: Array,
     score: Array,
     covariance: Array,
@@ -63,37 +62,32 @@ def calibrate_rows(
         label: (K,) classes.
         evidence: (K,) e_k.
         yaw: (K,) headings.
-        knots: (C,) number of knots of each class, zero without a calibration.
-        knot_evidence: (C, K) where the curves bend, ascending.
-        knot_existence: (C, K) f there.
-        knot_along: (C, K) standard deviation of the lasting error along the heading, m.
-        knot_across: (C, K) across it, m.
-        score_of_evidence: (C,) w, the weight of the evidence in the score.
+        classes: (C,) parameters: the knots of f, along and across, and w.
         existence: (K,) in: r, out: f(e_k).
         score: (K,) in: x_s, out: the score that is told.
         covariance: (K, 6, 6) in: P, out: with the lasting error.
     """
     for row in range(existence.shape[0]):
-        c = label[row]
-        count = knots[c]
+        own = classes[label[row]]
+        count = own.knots
         if count == 0:
             continue
         e = evidence[row]
         k = 0
-        while k < count and knot_evidence[c, k] <= e:
+        while k < count and own.knot_evidence[k] <= e:
             k += 1
         low, high = max(k - 1, 0), min(k, count - 1)
         share = 0.0
         if high > low:
-            share = (e - knot_evidence[c, low]) / (knot_evidence[c, high] - knot_evidence[c, low])
-        existence[row] = knot_existence[c, low] + share * (knot_existence[c, high] - knot_existence[c, low])
-        along = knot_along[c, low] + share * (knot_along[c, high] - knot_along[c, low])
-        across = knot_across[c, low] + share * (knot_across[c, high] - knot_across[c, low])
+            share = (e - own.knot_evidence[low]) / (own.knot_evidence[high] - own.knot_evidence[low])
+        existence[row] = own.knot_existence[low] + share * (own.knot_existence[high] - own.knot_existence[low])
+        along = own.knot_along[low] + share * (own.knot_along[high] - own.knot_along[low])
+        across = own.knot_across[low] + share * (own.knot_across[high] - own.knot_across[low])
         cos, sin = math.cos(yaw[row]), math.sin(yaw[row])
         covariance[row, 0, 0] += along * along * cos * cos + across * across * sin * sin
         covariance[row, 1, 1] += along * along * sin * sin + across * across * cos * cos
         mixed = (along * along - across * across) * cos * sin
         covariance[row, 0, 1] += mixed
         covariance[row, 1, 0] += mixed
-        w = score_of_evidence[c]
+        w = own.score_of_evidence
         score[row] = (1.0 - w) * score[row] + w * (0.5 + 0.5 * e / SURE)

@@ -8,16 +8,28 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from numba.core.errors import NumbaError
+from numba.core.errors import NumbaError, NumbaWarning
 
 from optipmb.compiled import kernel
-from optipmb.density import NO_FRAME, STATE, Bernoullis, Density, Misses, Poissons
+from optipmb.density import (
+    NO_FRAME,
+    STATE,
+    BernoulliArrays,
+    Bernoullis,
+    Density,
+    Misses,
+    PoissonArrays,
+    Poissons,
+    columns_of_rows,
+)
 from optipmb.errors import DensityError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
+
+    from optipmb.records import Columns
 
 _Rows = TypeVar("_Rows", Bernoullis, Misses, Poissons)
 
@@ -27,39 +39,32 @@ def fitting(density: Density, classes: int) -> bool:
 
     What `density_of` and the tracker make does; somebody else's arrays may not.
     """
-    b, p, misses = density.bernoulli, density.poisson, density.misses
+    misses, objects = density.misses, density.bernoulli
     try:
-        return bool(
-            rows_fit(b.mean, b.covariance, b.label, b.auxiliary, classes)
-            and rows_fit(p.mean, p.covariance, p.label, p.auxiliary, classes)
-            and b.existence.shape == b.id.shape == b.born_ns.shape == b.seen_ns.shape == b.label.shape
-            and b.score.shape
-            == b.evidence.shape
-            == b.heading_odds.shape
-            == b.extracted.shape
-            == b.confirmed.shape
-            == b.label.shape
-            and p.weight.shape == p.born_ns.shape == p.label.shape
-            and (misses is None or misses.missed_from_ns.shape == misses.looked_ns.shape == b.label.shape)
+        return bool(columns_fit(columns_of_rows(objects), columns_of_rows(density.poisson), classes)) and (
+            misses is None or misses.missed_from_ns.shape == misses.looked_ns.shape == objects.label.shape
         )
-    except (AttributeError, TypeError, NumbaError):
+    except (AttributeError, TypeError, NumbaError, NumbaWarning):  # it warns of lists
         return False
 
 
 @kernel
-def rows_fit(
-    mean: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    label: NDArray[np.int64],
-    auxiliary: NDArray[np.float64],
-    classes: int,
-) -> bool:
-    """Tell whether (N, 6) means, (N, 6, 6) covariances, (N,) classes and (N, 4) boxes are so, and the classes exist."""
-    count = label.shape[0]
-    good = mean.shape == (count, STATE) and covariance.shape == (count, STATE, STATE) and auxiliary.shape == (count, 4)
-    for c in label:
+def columns_fit(objects: Columns, components: Columns, classes: int) -> bool:
+    """Tell whether columns have rows of their shapes, as many as there are labels, and the classes exist."""
+    objects, components = BernoulliArrays(*objects), PoissonArrays(*components)
+    count, others = objects.label.shape[0], components.label.shape[0]
+    good = objects.mean.shape == (count, STATE) and components.mean.shape == (others, STATE)
+    good &= objects.covariance.shape == (count, STATE, STATE) and components.covariance.shape == (others, STATE, STATE)
+    good &= objects.auxiliary.shape == (count, 4) and components.auxiliary.shape == (others, 4)
+    good &= components.weight.shape == components.born_ns.shape == (others,)
+    good &= objects.existence.shape == objects.id.shape == objects.born_ns.shape == objects.seen_ns.shape == (count,)
+    good &= objects.score.shape == objects.evidence.shape == objects.heading_odds.shape == (count,)
+    good &= objects.extracted.shape == objects.confirmed.shape == (count,)
+    for c in objects.label:
         good &= 0 <= c < classes
-    return good
+    for c in components.label:
+        good &= 0 <= c < classes
+    return bool(good)
 
 
 def check_fitting(density: Density, labels: tuple[str, ...]) -> None:

@@ -11,13 +11,15 @@ Auxiliary state x_A = [length, width, height, z]: box size and height of the box
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from dataclasses import fields
-from typing import TYPE_CHECKING, Final, Self
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.records import INDEX, record
+from optipmb.records import INDEX, Columns, record
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -109,6 +111,11 @@ class Bernoullis(_Rows):
         )
 
 
+def _arrays(rows: type[_Rows], name: str) -> Any:
+    names = [field.name for field in fields(rows)]  # type: ignore[arg-type]  # every subclass is a dataclass
+    return namedtuple(name, names, module=__name__)  # noqa: PYI024 - the fields are those of rows
+
+
 @record
 class Misses(_Rows):
     """From when the misses of each detected object count, where sensors have fields of view; a row for each.
@@ -170,6 +177,19 @@ class Poissons(_Rows):
             np.empty((count, 4)),  # auxiliary
             np.empty(count, INDEX),  # born_ns
         )
+
+
+BernoulliArrays: Final[Any] = _arrays(Bernoullis, "BernoulliArrays")
+PoissonArrays: Final[Any] = _arrays(Poissons, "PoissonArrays")
+"""The columns of the records by the same names, as kernels know them: they take no dataclass."""
+
+_objects: Final = attrgetter(*BernoulliArrays._fields)
+_components: Final = attrgetter(*PoissonArrays._fields)
+
+
+def columns_of_rows(rows: Bernoullis | Poissons) -> Columns:
+    """Return the columns as kernels take them."""
+    return _objects(rows) if isinstance(rows, Bernoullis) else _components(rows)
 
 
 @record

@@ -41,16 +41,16 @@ def detection_probability(
     Returns:
         (N,) in (0, 1).
     """
-    p_d0 = table.detection[label]
+    p_d0: Array = table["detection"][label]
     if cloud is None or not label.size:
         return p_d0
-    cut = np.minimum(table.ground_clearance[label], auxiliary[:, 2])
+    cut = np.minimum(table["ground_clearance"][label], auxiliary[:, 2])
     center = np.column_stack((mean[:, :2], auxiliary[:, 3] + 0.5 * cut))
     size = auxiliary[:, :3].copy()
     size[:, 2] -= cut
     points = points_in_boxes(cloud, center, size, mean[:, PHI].copy())
-    s_d = table.detection_floor[label]
-    scaled: Array = p_d0 * np.minimum(1.0, (1.0 - s_d) * points / table.expected_points[label] + s_d)
+    s_d = table["detection_floor"][label]
+    scaled: Array = p_d0 * np.minimum(1.0, (1.0 - s_d) * points / table["expected_points"][label] + s_d)
     return scaled
 
 

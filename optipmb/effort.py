@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.errors import EffortError
-from optipmb.gating import gate_radii
+from optipmb.gating import gate_radii, gate_widening
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
 
 if TYPE_CHECKING:
@@ -43,26 +44,34 @@ def check_effort(
     Raises:
         EffortError: there are more.
     """
-    count = len(measurements)
+    count = measurements.score.shape[0]
     if (len(bernoulli) + len(poisson) + count) * count <= most:
         return
     positions = np.concatenate((bernoulli.mean[:, :2], poisson.mean[:, :2], measurements.position[:, :2]))
     labels = np.concatenate((bernoulli.label, poisson.label, measurements.label))
-    gates = table.period, table.gate, table.gate_growth, table.gate_deviations
     radius = np.concatenate(
         (
-            gate_radii(bernoulli.covariance, bernoulli.label, dt, *gates),
-            gate_radii(poisson.covariance, poisson.label, dt, *gates),
-            table.gate[measurements.label],
+            gate_radii(bernoulli.covariance, bernoulli.label, dt, table.period, table.classes),
+            gate_radii(poisson.covariance, poisson.label, dt, table.period, table.classes),
+            table["gate"][measurements.label],
         )
     )
-    if count_pairs(positions, labels, radius, measurements.position, measurements.label, len(table.gate), most) > most:
+    widening = gate_widening(measurements.position, measurements.label, table.classes)
+    measured = measurements.position, measurements.label, widening
+    if count_pairs(positions, labels, radius, *measured, len(table.classes), most) > most:
         raise EffortError("center", f"at most {most} pairs of an object and a detection in its gate", "more")
 
 
 @kernel
 def count_pairs(
-    center: Array, label: Index, radius: Array, position: Array, measured_label: Index, classes: int, most: int
+    center: Array,
+    label: Index,
+    radius: Array,
+    position: Array,
+    measured_label: Index,
+    widening: Array,
+    classes: int,
+    most: int,
 ) -> int:
     """Count the measurements of an object's class within its gate, over all objects; no further than `most` + 1.
 
@@ -72,25 +81,29 @@ def count_pairs(
         radius: (N,) gating distances, m.
         position: (M, 2) z_xy, m.
         measured_label: (M,) z_c.
+        widening: (M,) of the gates, m^2.
         classes: C.
         most: where counting ends.
     """
-    widest = np.zeros(classes)
+    widest, wider = np.zeros(classes), np.zeros(classes)
+    for m in range(position.shape[0]):
+        wider[measured_label[m]] = max(wider[measured_label[m]], widening[m])
     for n in range(center.shape[0]):
-        widest[label[n]] = max(widest[label[n]], radius[n])
+        widest[label[n]] = max(widest[label[n]], math.sqrt(radius[n] ** 2 + wider[label[n]]))
     head, following, side = empty_torus(position.shape[0])
     for m in range(position.shape[0]):
         insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * widest[measured_label[m]])
     count = 0
     for n in range(center.shape[0]):
-        eta = radius[n]
-        first_x, last_x, first_y, last_y = block(center[n, 0], center[n, 1], eta, 2.0 * widest[label[n]])
+        eta_2 = radius[n] ** 2
+        reach = math.sqrt(eta_2 + wider[label[n]])
+        first_x, last_x, first_y, last_y = block(center[n, 0], center[n, 1], reach, 2.0 * widest[label[n]])
         for i in range(first_x, last_x + 1):
             for j in range(first_y, last_y + 1):
                 m = head[(i & (side - 1)) * side + (j & (side - 1))]
                 while m != NOBODY:
                     dx, dy = position[m, 0] - center[n, 0], position[m, 1] - center[n, 1]
-                    if dx * dx + dy * dy <= eta * eta and measured_label[m] == label[n]:
+                    if dx * dx + dy * dy <= eta_2 + widening[m] and measured_label[m] == label[n]:
                         count += 1
                         if count > most:
                             return count

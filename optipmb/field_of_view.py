@@ -270,7 +270,7 @@ def follow_looks(
         stamp_ns: stamp of the frame.
         table: parameters as columns.
     """
-    count, known = len(survivors), survivors.known
+    count, known = len(objects), survivors.known
     row, hit = survivors.row[:known], survivors.measurement[:known] >= 0
     missed_from_ns, looked_ns = np.full(count, stamp_ns, np.int64), np.full(count, stamp_ns, np.int64)
     missed_from_ns[:known] = np.where(hit, stamp_ns, looks.misses.missed_from_ns[row])
@@ -279,9 +279,9 @@ def follow_looks(
     hidden = ~hit & (share == 0.0)
     objects.score[:known][hidden] = before.score[row][hidden]
     label = objects.label[:known]
-    latest = -table.missed_evidence[label]
+    latest = -table["missed_evidence"][label]
     latest[hit] = [log_odds(score) for score in measurements.score[survivors.measurement[:known][hit]].tolist()]
-    kept = table.memory[label] ** (np.where(hit, 1.0, share) * looks.time[row] / table.period)
+    kept = table["memory"][label] ** (np.where(hit, 1.0, share) * looks.time[row] / table.period)
     kept[objects.born_ns[:known] == stamp_ns] = 1.0
     objects.evidence[:known] = kept * before.evidence[row] + (1.0 - kept) * latest
     return Misses(missed_from_ns, looked_ns)

@@ -13,10 +13,17 @@ from optipmb.neighbours import NOBODY, block, empty_torus, insert
 from optipmb.position_noise import PLAIN
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
+
+    from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
+
+DEVIATIONS_2: Final = 9.21
+"""Squared standard deviations of a position in the plane that 99 % of detections are within: chi^2 of 2 dimensions."""
 
 MAX_RADIUS: Final = 1e6
 """No gate is wider, m, however uncertain a speed and however long a silence."""
@@ -31,9 +38,7 @@ def gate_radii(
     label: Index,
     dt: float,
     period: float,
-    distance: Array,
-    growth: Array,
-    deviations: Array,
+    classes: Sequence[ClassRow],
 ) -> Array:
     """Compute the gating distance of each object.
 
@@ -45,9 +50,7 @@ def gate_radii(
         label: (N,) classes.
         dt: s since the last frame.
         period: nominal period, s.
-        distance: (C,) eta_dist, m.
-        growth: (C,) share of eta_dist per nominal period.
-        deviations: (C,) standard deviations of v.
+        classes: (C,) parameters: eta_dist, its growth per nominal period, and how many standard deviations of v.
 
     Returns:
         (N,) m.
@@ -55,13 +58,39 @@ def gate_radii(
     radius = np.empty(label.shape[0])
     beyond = max(0.0, dt / period - 1.0)
     for n in range(label.shape[0]):
-        c = label[n]
-        radius[n] = distance[c] * (1.0 + growth[c] * beyond)
-        reach = deviations[c] * math.sqrt(max(covariance[n, V, V], 0.0)) * dt
+        own = classes[label[n]]
+        radius[n] = own.gate * (1.0 + own.gate_growth * beyond)
+        reach = own.gate_deviations * math.sqrt(max(covariance[n, V, V], 0.0)) * dt
         if reach > radius[n]:  # noqa: PLR1730 - max() would keep NaN
             radius[n] = reach
         radius[n] = min(radius[n], MAX_RADIUS)
     return radius
+
+
+@kernel
+def gate_widening(position: Array, label: Index, classes: Sequence[ClassRow]) -> Array:
+    """Compute by how much each detection widens the gates that it may lie in.
+
+    eta_dist is chosen for detections with R of their class. What R_m of a detection has beyond it widens the gate, as
+    variances add up: ``eta^2 + chi^2 max(0, lambda_1(R_m) - sigma^2)``, lambda_1 the larger eigenvalue, chi^2 the
+    quantile `DEVIATIONS_2`. A detection that is more accurate than its class has the gate of the class.
+
+    Args:
+        position: (M, 2) z_xy, or (M, 5) with rho, R_m = sigma^2 rho.
+        label: (M,) z_c.
+        classes: (C,) parameters: sigma.
+
+    Returns:
+        (M,) m^2, to be added to the squares of gating distances.
+    """
+    widening = np.zeros(label.shape[0])
+    if position.shape[1] > PLAIN:
+        for m in range(label.shape[0]):
+            rho_xx, rho_xy, rho_yy = position[m, 2], position[m, 3], position[m, 4]
+            largest = 0.5 * (rho_xx + rho_yy) + math.hypot(0.5 * (rho_xx - rho_yy), rho_xy)
+            variance = classes[label[m]].noise_position ** 2
+            widening[m] = min(DEVIATIONS_2 * variance * max(0.0, largest - 1.0), MAX_RADIUS**2)
+    return widening
 
 
 @kernel
@@ -72,7 +101,7 @@ def gate(
     radius: Array,
     position: Array,
     measured_label: Index,
-    noise_position: Array,
+    classes: Sequence[ClassRow],
 ) -> tuple[Index, Index, Array]:
     """Find the measurements of an object's class within its gate and their position likelihoods.
 
@@ -80,19 +109,20 @@ def gate(
         mean: (N, 6) predicted means.
         covariance: (N, 6, 6) predicted covariances.
         label: (N,) classes.
-        radius: (N,) gating distances, m; nothing lies in a negative one.
+        radius: (N,) gating distances, m, for detections with R of their class; nothing lies in a negative one.
         position: (M, 2) z_xy, or (M, 5) with rho.
         measured_label: (M,) z_c.
-        noise_position: (C,) standard deviation of z_x and z_y; R_xy = sigma^2 rho, and rho = I without one.
+        classes: (C,) parameters: sigma of R_xy = sigma^2 rho, and rho = I without one.
 
     Returns:
         Objects, measurements and log-likelihoods ln N(z_xy; z_hat, S) of the pairs (eq. Predicted Measurement),
         ordered by object, then measurement.
     """
+    widening = gate_widening(position, measured_label, classes)
     if position.shape[0] <= FEW:
-        row, measurement = pairs_of_few(mean, label, radius, position, measured_label, noise_position.shape[0])
+        row, measurement = pairs_of_few(mean, label, radius, position, measured_label, widening, len(classes))
     else:
-        row, measurement = pairs_of_many(mean, label, radius, position, measured_label, noise_position.shape[0])
+        row, measurement = pairs_of_many(mean, label, radius, position, measured_label, widening, len(classes))
     log_likelihood = np.empty(row.shape[0])
     own_noise = position.shape[1] > PLAIN
     rho_xx, rho_xy, rho_yy = 1.0, 0.0, 1.0
@@ -102,7 +132,7 @@ def gate(
         n, m = row[k], measurement[k]
         if n != before or own_noise:  # what the pairs of an object share
             before = n
-            variance = noise_position[label[n]] ** 2
+            variance = classes[label[n]].noise_position ** 2
             if own_noise:
                 rho_xx, rho_xy, rho_yy = position[m, 2], position[m, 3], position[m, 4]
             s_xx, s_yy = covariance[n, 0, 0] + variance * rho_xx, covariance[n, 1, 1] + variance * rho_yy
@@ -117,7 +147,13 @@ def gate(
 
 @kernel
 def pairs_of_few(
-    mean: Array, label: Index, radius: Array, position: Array, measured_label: Index, classes: int
+    mean: Array,
+    label: Index,
+    radius: Array,
+    position: Array,
+    measured_label: Index,
+    widening: Array,
+    classes: int,
 ) -> tuple[Index, Index]:
     """Find the pairs within the gates by looking at every measurement of a class; arguments and order as in `gate`."""
     n_measurements = position.shape[0]
@@ -130,9 +166,10 @@ def pairs_of_few(
     for c in range(classes):
         start[c + 2] += start[c + 1]
     x, y, which = np.empty(n_measurements), np.empty(n_measurements), np.empty(n_measurements, np.int64)
+    wider = np.empty(n_measurements)
     for m in range(n_measurements):
         k = start[measured_label[m] + 1]
-        x[k], y[k], which[k] = position[m, 0], position[m, 1], m
+        x[k], y[k], wider[k], which[k] = position[m, 0], position[m, 1], widening[m], m
         start[measured_label[m] + 1] += 1  # in the end where the next class starts
 
     count = 0
@@ -140,10 +177,13 @@ def pairs_of_few(
         if count + n_measurements > capacity:
             capacity = 2 * (count + n_measurements)
             row, measurement = _grown(row, capacity), _grown(measurement, capacity)
-        eta, x_n, y_n = radius[n], mean[n, 0], mean[n, 1]
+        if radius[n] < 0.0:
+            continue
+        eta_2, x_n, y_n = radius[n] * radius[n], mean[n, 0], mean[n, 1]
         for k in range(start[label[n]], start[label[n] + 1]):
             dx, dy = x[k] - x_n, y[k] - y_n
-            if abs(dx) <= eta and dx * dx + dy * dy <= eta * eta:  # most are too far along x already
+            limit = eta_2 + wider[k]
+            if dx * dx <= limit and dx * dx + dy * dy <= limit:  # most are too far along x already
                 row[count], measurement[count] = n, which[k]
                 count += 1
     return row[:count], measurement[:count]
@@ -151,7 +191,13 @@ def pairs_of_few(
 
 @kernel
 def pairs_of_many(
-    mean: Array, label: Index, radius: Array, position: Array, measured_label: Index, classes: int
+    mean: Array,
+    label: Index,
+    radius: Array,
+    position: Array,
+    measured_label: Index,
+    widening: Array,
+    classes: int,
 ) -> tuple[Index, Index]:
     """Find the pairs within the gates by looking at neighbours; arguments and order as in `gate`.
 
@@ -160,9 +206,11 @@ def pairs_of_many(
     """
     capacity = 2 * (mean.shape[0] + position.shape[0]) + 16 if mean.shape[0] else 0
     row, measurement = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
-    widest = np.zeros(classes)
+    widest, most = np.zeros(classes), np.zeros(classes)
+    for m in range(position.shape[0]):
+        most[measured_label[m]] = max(most[measured_label[m]], widening[m])
     for n in range(mean.shape[0]):
-        widest[label[n]] = max(widest[label[n]], radius[n])
+        widest[label[n]] = max(widest[label[n]], math.sqrt(radius[n] * radius[n] + most[label[n]]))
     head, following, side = empty_torus(position.shape[0])
     for m in range(position.shape[0]):
         insert(head, following, side, m, position[m, 0], position[m, 1], 2.0 * widest[measured_label[m]])
@@ -171,14 +219,15 @@ def pairs_of_many(
         eta = radius[n]
         if eta < 0.0:
             continue
-        begin = count
-        first_x, last_x, first_y, last_y = block(mean[n, 0], mean[n, 1], eta, 2.0 * widest[label[n]])
+        begin, eta_2 = count, eta * eta
+        reach = math.sqrt(eta_2 + most[label[n]])
+        first_x, last_x, first_y, last_y = block(mean[n, 0], mean[n, 1], reach, 2.0 * widest[label[n]])
         for i in range(first_x, last_x + 1):
             for j in range(first_y, last_y + 1):
                 m = head[(i & (side - 1)) * side + (j & (side - 1))]
                 while m != NOBODY:
                     dx, dy = position[m, 0] - mean[n, 0], position[m, 1] - mean[n, 1]
-                    if dx * dx + dy * dy <= eta * eta and measured_label[m] == label[n]:
+                    if dx * dx + dy * dy <= eta_2 + widening[m] and measured_label[m] == label[n]:
                         if count == capacity:
                             capacity *= 2
                             row, measurement = _grown(row, capacity), _grown(measurement, capacity)

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from optipmb.table import ClassRow
+
     Array = NDArray[np.float64]
 
 TAIL: Final = 0.025
@@ -42,10 +44,7 @@ CERTAIN: Final = 2.0
 def follow_sign(
     odds: float,
     kept: float,
-    memory: float,
-    detection: float,
-    motion: float,
-    speed: float,
+    own: ClassRow,
     score: float,
     yaw: float,
     mean: Array,
@@ -56,19 +55,16 @@ def follow_sign(
     Args:
         odds: h_{k-1}; zero before the first detection.
         kept: kappa.
-        memory: lambda; zero, like the next two, keeps h at zero.
-        detection: b_d.
-        motion: b_v.
-        speed: v_0, m/s.
+        own: parameters of its class: lambda, b_d, b_v and v_0.
         score: z_s.
         yaw: z_phi.
         mean: (6,) posterior mean.
         covariance: (6, 6) posterior covariance.
     """
-    latest = detection * score * math.cos(yaw - mean[PHI])
-    if abs(mean[V]) >= speed + CERTAIN * math.sqrt(covariance[V, V]):
-        latest += math.copysign(motion, mean[V])
-    odds = kept * odds + (1.0 - kept) / (1.0 - memory) * latest
+    latest = own.sign_detection * score * math.cos(yaw - mean[PHI])
+    if abs(mean[V]) >= own.sign_speed + CERTAIN * math.sqrt(covariance[V, V]):
+        latest += math.copysign(own.sign_motion, mean[V])
+    odds = kept * odds + (1.0 - kept) / (1.0 - own.sign_memory) * latest
     if odds < 0.0:
         turn_around(mean, covariance)
         odds = -odds

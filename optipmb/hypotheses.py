@@ -8,20 +8,21 @@ hypotheses that win (`optipmb.update`). Likelihoods are kept as logarithms: weig
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.gating import gate, gate_radii
-from optipmb.records import INDEX, record
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from optipmb.density import Bernoullis, Poissons
     from optipmb.preprocess import Measurements
-    from optipmb.table import ClassTable
+    from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
@@ -34,8 +35,7 @@ NEWBORN: Final = 2
 """No component, high score: a newborn object (M_high)."""
 
 
-@record
-class Hypotheses:
+class Hypotheses(NamedTuple):
     """All local hypotheses of one frame. Pairs are ordered by object or component, then by measurement.
 
     Attributes:
@@ -63,14 +63,16 @@ class Hypotheses:
     association: Array
 
 
-def enumerate_hypotheses(
-    bernoulli: Bernoullis,
+@kernel
+def local_hypotheses(
+    objects: Bernoullis,
     p_d: Array,
-    poisson: Poissons,
+    components: Poissons,
     p_d_poisson: Array,
     measurements: Measurements,
     dt: float,
-    table: ClassTable,
+    period: float,
+    classes: Sequence[ClassRow],
 ) -> Hypotheses:
     """Enumerate the hypotheses that pass the class gate and the distance gate, with their costs.
 
@@ -78,107 +80,33 @@ def enumerate_hypotheses(
     contains the survival probability that Algorithm 1 writes beside it.
 
     Args:
-        bernoulli: predicted detected objects.
+        objects: predicted detected objects.
         p_d: (N,) their detection probabilities.
-        poisson: predicted Poisson components.
+        components: predicted Poisson components.
         p_d_poisson: (J,) theirs.
         measurements: Z_k.
         dt: s since the last frame.
-        table: parameters as columns.
+        period: nominal period, s.
+        classes: (C,) parameters.
     """
-    count = len(measurements)
-    first_kind, first_cost = np.empty(count, INDEX), np.empty(count)
-    first_existence, association = np.empty(count), np.empty(count)
-    pairs = local_hypotheses(
-        bernoulli.mean,
-        bernoulli.covariance,
-        bernoulli.label,
-        bernoulli.existence,
-        p_d,
-        poisson.mean,
-        poisson.covariance,
-        poisson.label,
-        poisson.weight,
-        p_d_poisson,
-        dt,
-        table.period,
-        table.gate,
-        table.gate_growth,
-        table.gate_deviations,
-        measurements.position,
-        measurements.label,
-        measurements.score,
-        table.noise_position,
-        table.clutter_intensity,
-        table.birth_intensity,
-        table.birth_score,
-        table.birth_over_clutter,
-        first_kind,
-        first_cost,
-        first_existence,
-        association,
-    )
-    return Hypotheses(*pairs, first_kind, first_cost, first_existence, association)
-
-
-@kernel
-def local_hypotheses(
-    mean: Array,
-    covariance: Array,
-    label: Index,
-    existence: Array,
-    p_d: Array,
-    mean_poisson: Array,
-    covariance_poisson: Array,
-    label_poisson: Index,
-    weight: Array,
-    p_d_poisson: Array,
-    dt: float,
-    period: float,
-    distance: Array,
-    growth: Array,
-    deviations: Array,
-    position: Array,
-    measured_label: Index,
-    score: Array,
-    noise_position: Array,
-    clutter_intensity: Array,
-    birth_intensity: Array,
-    birth_score: Array,
-    birth_over_clutter: NDArray[np.bool_],
-    first_kind: Index,
-    first_cost: Array,
-    first_existence: Array,
-    association: Array,
-) -> tuple[Index, Index, Array, Index, Index, Array]:
-    """Enumerate the local hypotheses: return the columns of `Hypotheses` over pairs, write those over measurements."""
-    radius = gate_radii(covariance, label, dt, period, distance, growth, deviations)
-    radius_poisson = gate_radii(covariance_poisson, label_poisson, dt, period, distance, growth, deviations)
+    position, label = measurements.position, measurements.label
+    radius = gate_radii(objects.covariance, objects.label, dt, period, classes)
+    radius_poisson = gate_radii(components.covariance, components.label, dt, period, classes)
     close_gates(p_d, radius)
     close_gates(p_d_poisson, radius_poisson)
-    row, measurement, log_likelihood = gate(mean, covariance, label, radius, position, measured_label, noise_position)
-    detection_cost = detection_costs(row, measurement, log_likelihood, existence, p_d, association)
+    row, measurement, log_likelihood = gate(
+        objects.mean, objects.covariance, objects.label, radius, position, label, classes
+    )
+    association = np.empty(label.shape[0])
+    detection_cost = detection_costs(row, measurement, log_likelihood, objects.existence, p_d, association)
     component, announced, log_e = gate(
-        mean_poisson, covariance_poisson, label_poisson, radius_poisson, position, measured_label, noise_position
+        components.mean, components.covariance, components.label, radius_poisson, position, label, classes
     )
     for k in range(component.shape[0]):
         j = component[k]
-        log_e[k] = math.log(weight[j] * p_d_poisson[j]) + log_e[k]
-    first_detections(
-        announced,
-        log_e,
-        score,
-        association,
-        measured_label,
-        clutter_intensity,
-        birth_intensity,
-        birth_score,
-        birth_over_clutter,
-        first_kind,
-        first_cost,
-        first_existence,
-    )
-    return row, measurement, detection_cost, component, announced, log_e
+        log_e[k] = math.log(components.weight[j] * p_d_poisson[j]) + log_e[k]
+    kind, cost, existence = first_detections(announced, log_e, measurements.score, association, label, classes)
+    return Hypotheses(row, measurement, detection_cost, component, announced, log_e, kind, cost, existence, association)
 
 
 @kernel
@@ -236,14 +164,8 @@ def first_detections(
     score: Array,
     association: Array,
     label: Index,
-    clutter_intensity: Array,
-    birth_intensity: Array,
-    birth_score: Array,
-    birth_over_clutter: NDArray[np.bool_],
-    kind: Index,
-    cost: Array,
-    existence: Array,
-) -> None:
+    classes: Sequence[ClassRow],
+) -> tuple[Index, Array, Array]:
     """Compute kind, cost and existence of the first-time detection hypothesis of each measurement.
 
     With components in the gate (eq. First-Time Detection Hypothesis Update 1): ``w = -ln(e + lambda_c)``, ``r = e /
@@ -261,15 +183,13 @@ def first_detections(
         score: (M,) z_s.
         association: (M,) p_a.
         label: (M,) z_c.
-        clutter_intensity: (C,) lambda_c.
-        birth_intensity: (C,) mu_b0 / A.
-        birth_score: (C,) eta_score.
-        birth_over_clutter: (C,) whether a high score needs a component that is likelier than clutter.
-        kind: (M,) receives `FROM_POISSON`, `CLUTTER` or `NEWBORN`.
-        cost: (M,) receives w.
-        existence: (M,) receives r.
+        classes: (C,) parameters: lambda_c, mu_b0 / A, eta_score and `birth_over_clutter`.
+
+    Returns:
+        (M,) `FROM_POISSON`, `CLUTTER` or `NEWBORN`, (M,) w and (M,) r.
     """
     n_measurements = score.shape[0]
+    kind, cost, existence = np.empty(n_measurements, np.int64), np.empty(n_measurements), np.empty(n_measurements)
     log_sum = np.full(n_measurements, -math.inf)  # ln e, e = sum_j e^j
     kind[:] = CLUTTER
     for k in range(measurement.shape[0]):
@@ -278,17 +198,18 @@ def first_detections(
         larger, smaller = max(log_sum[m], log_e[k]), min(log_sum[m], log_e[k])
         log_sum[m] = larger if smaller == -math.inf else larger + math.log1p(math.exp(smaller - larger))
     for m in range(n_measurements):
-        c = label[m]
-        clutter = clutter_intensity[c]
-        shadowed = birth_over_clutter[c] and score[m] >= birth_score[c] and log_sum[m] < math.log(clutter)
+        own = classes[label[m]]
+        clutter = own.clutter_intensity
+        shadowed = own.birth_over_clutter and score[m] >= own.birth_score and log_sum[m] < math.log(clutter)
         if kind[m] == FROM_POISSON and not shadowed:
             ratio = math.exp(min(log_sum[m] - math.log(clutter), 700.0))  # e / lambda_c
             cost[m] = -math.log(clutter) - math.log1p(ratio)
             existence[m] = ratio / (1.0 + ratio)
-        elif score[m] < birth_score[c]:
+        elif score[m] < own.birth_score:
             cost[m] = -math.log(clutter)
             existence[m] = 0.0
         else:
             kind[m] = NEWBORN
-            cost[m] = -math.log(birth_intensity[c] * (1.0 - association[m]) + clutter)
+            cost[m] = -math.log(own.birth_intensity * (1.0 - association[m]) + clutter)
             existence[m] = 1.0
+    return kind, cost, existence

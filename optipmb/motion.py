@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from optipmb.table import ClassRow
+
     Array = NDArray[np.float64]
 
 SPREAD = math.sqrt(STATE)
@@ -144,9 +146,7 @@ def predict_state(
     mean: Array,
     covariance: Array,
     dt: float,
-    process_noise: Array,
-    tau: float,
-    straight: bool,
+    own: ClassRow,
     root: Array,
     points: Array,
     mean_out: Array,
@@ -158,9 +158,7 @@ def predict_state(
         mean: (6,) posterior mean.
         covariance: (6, 6) posterior covariance.
         dt: time to predict over, s, positive.
-        process_noise: (6,) standard deviations per square root of a second; ``Q = diag(q^2) dt``.
-        tau: time constant with which the acceleration decays, s.
-        straight: whether the model is that of constant velocity; else CTRA.
+        own: parameters of its class: the motion model and its time constant tau, and q of ``Q = diag(q^2) dt``.
         root: (6, 6) buffer for the square root.
         points: (12, 6) buffer for the transformed points, as deviations from the transformed centre; the mean is
             added last, so that large world coordinates cost no digits.
@@ -171,6 +169,7 @@ def predict_state(
         Number of pivots that had to be repaired.
     """
     repaired = square_root(covariance, root)
+    straight, tau, process_noise = own.constant_velocity, own.acceleration_time, own.process_noise
     v, phi = mean[V], mean[PHI]
     omega, a = (0.0, 0.0) if straight else (mean[OMEGA], mean[A])
     along0, across0, v0, a0 = travel(v, omega, a, dt, tau)

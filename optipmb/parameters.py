@@ -46,6 +46,9 @@ MAX_HORIZON_S: Final = 30.0
 MAX_HORIZONS: Final = 100
 """Most horizons of a predicted path."""
 
+MAX_KNOTS: Final = 32
+"""Most knots of a calibration."""
+
 HORIZONS: Final = f"at most {MAX_HORIZONS} ascending times above 0 s up to {MAX_HORIZON_S:g} s"
 
 
@@ -139,7 +142,7 @@ class Calibration(_Table):
         default=0.0,
         description="w: weight of the evidence, brought to [0, 1], in the score; the rest is x_s of the paper",
     )
-    evidence: Annotated[tuple[float, ...], Field(min_length=1, max_length=32)] = Field(
+    evidence: Annotated[tuple[float, ...], Field(min_length=1, max_length=MAX_KNOTS)] = Field(
         description="mean log odds of the latest detections, ascending"
     )
     existence: tuple[Probability, ...] = Field(description="share of such tracks that are of an object, not descending")
@@ -161,7 +164,7 @@ class Calibration(_Table):
         return self
 
 
-Knots = Annotated[tuple[OpenProbability, ...], Field(min_length=2, max_length=32)]
+Knots = Annotated[tuple[OpenProbability, ...], Field(min_length=2, max_length=MAX_KNOTS)]
 
 
 class ScoreCalibration(_Table):

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from optipmb.extract import Tracks
     from optipmb.parameters import Parameters
+    from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
@@ -148,9 +149,7 @@ def _predict(
         paths.label,
         times,
         table.period,
-        table.process_noise,
-        table.acceleration_time,
-        table.constant_velocity,
+        table.classes,
         paths.mean,
         paths.covariance,
     )
@@ -172,9 +171,7 @@ def predict_paths(
     label: Index,
     horizons: Array,
     period: float,
-    process_noise: Array,
-    acceleration_time: Array,
-    constant_velocity: NDArray[np.bool_],
+    classes: Sequence[ClassRow],
     mean_out: Array,
     covariance_out: Array,
 ) -> None:
@@ -186,34 +183,21 @@ def predict_paths(
         label: (N,) classes.
         horizons: (H,) ascending times ahead, s.
         period: nominal period, s.
-        process_noise: (C, 6) standard deviations per square root of a second.
-        acceleration_time: (C,) time constant of the acceleration, s.
-        constant_velocity: (C,) whether a class moves at constant velocity.
+        classes: (C,) parameters.
         mean_out: (N, H, 6) receives the states at the horizons.
         covariance_out: (N, H, 6, 6) receives their covariances.
     """
     root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
     state, spread = np.empty((2, STATE)), np.empty((2, STATE, STATE))
     for n in range(mean.shape[0]):
-        c = label[n]
+        own = classes[label[n]]
         copy_state(mean, covariance, n, state, spread, 0)
         before = 0.0
         for h in range(horizons.shape[0]):
             ahead = horizons[h] - before
             steps = max(1, math.ceil(min(ahead / period - ROUNDING, MAX_STEPS * ahead / horizons[-1])))
             for _ in range(steps):
-                predict_state(
-                    state[0],
-                    spread[0],
-                    ahead / steps,
-                    process_noise[c],
-                    acceleration_time[c],
-                    constant_velocity[c],
-                    root,
-                    points,
-                    state[1],
-                    spread[1],
-                )
+                predict_state(state[0], spread[0], ahead / steps, own, root, points, state[1], spread[1])
                 copy_state(state, spread, 1, state, spread, 0)
             copy_state(state, spread, 0, mean_out[n], covariance_out[n], h)
             before = horizons[h]

@@ -9,7 +9,8 @@ class has a growth g:
 It is kept relative to that of the class, rho = R_xy / sigma^2, in the columns behind a measured position. All that a
 profile says beside sigma scales with it: the innovation covariance is S = P_xy + sigma^2 rho, R has sigma^2 rho, the
 birth covariance P^0 has its variance of x and y times rho, and R_x of `optipmb.reported` its own times rho_xx and
-rho_yy. With rho = I everything is as without, to the last bit.
+rho_yy. The gate widens by the larger variance that rho adds (`optipmb.gating.gate_widening`). With rho = I everything
+is as without, to the last bit.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ def relative_noise(frame: Frame, rows: Index, table: ClassTable) -> Array:
         table: parameters as columns.
     """
     label = frame.label[rows]
-    variance, growth = table.noise_position[label] ** 2, table.noise_growth[label]
+    variance, growth = table["noise_position"][label] ** 2, table["noise_growth"][label]
     sensor = np.zeros(2) if frame.pose is None else frame.pose.translation[:2]
     away = frame.center[rows, :2] - sensor
     noise = np.zeros((rows.shape[0], 3))

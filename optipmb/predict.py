@@ -5,19 +5,34 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numba.core.errors import NumbaError, NumbaWarning
 
+from optipmb.columns import check_fitting, columns_fit
 from optipmb.compiled import kernel
-from optipmb.density import NO_FRAME, STATE, Bernoullis, Density, Poissons, whole_periods
+from optipmb.density import (
+    NO_FRAME,
+    STATE,
+    BernoulliArrays,
+    Bernoullis,
+    Density,
+    PoissonArrays,
+    Poissons,
+    columns_of_rows,
+    whole_periods,
+)
 from optipmb.motion import predict_state
-from optipmb.records import INDEX
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
-    from optipmb.table import ClassTable
+    from optipmb.records import Columns
+    from optipmb.table import ClassRow, ClassTable
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
+    Predicted = tuple[Index, Array, Array, Array, int]
 
 
 LONGEST_STEP_S: Final = 6.0
@@ -41,26 +56,32 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
 
     Returns:
         The predicted density and how many covariances had to be repaired.
+
+    Raises:
+        DensityError: the columns of the density do not fit together.
     """
     bernoulli, poisson, misses = density.bernoulli, density.poisson, density.misses
-    dt = 0.0 if density.stamp_ns == NO_FRAME else (stamp_ns - density.stamp_ns) * 1e-9
-    if dt == 0.0:
-        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, density.misses), 0
-    survival = table.survival ** (dt / table.period)
-
     before_ns = density.stamp_ns
-    seen_from_ns = before_ns if dt <= LONGEST_STEP_S else stamp_ns
-    kept, mean, covariance, existence, repaired_mb = _carry(
-        bernoulli,
-        bernoulli.existence,
-        density.missed_from_ns,
-        table.max_misses,
-        survival,
-        dt,
-        seen_from_ns,
-        stamp_ns,
-        table,
-    )
+    dt = 0.0 if before_ns == NO_FRAME else (stamp_ns - before_ns) * 1e-9
+    if dt == 0.0 or misses is not None:
+        check_fitting(density, density.labels)
+    if dt == 0.0:
+        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses), 0
+    try:
+        objects, components = predict_density(
+            columns_of_rows(bernoulli),
+            density.missed_from_ns,
+            columns_of_rows(poisson),
+            dt,
+            before_ns,
+            stamp_ns,
+            table.period,
+            table.classes,
+        )
+    except (AttributeError, TypeError, ValueError, NumbaError, NumbaWarning):
+        check_fitting(density, density.labels)  # names the column
+        raise
+    kept, mean, covariance, existence, repaired = objects
     if kept.shape[0] < len(bernoulli):
         bernoulli = bernoulli.take(kept)
         misses = None if misses is None else misses.take(kept)
@@ -79,55 +100,66 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
         bernoulli.extracted,
         bernoulli.confirmed,
     )
-    if not len(poisson):
-        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses), repaired_mb
-    kept, mean, covariance, weight, repaired_ppp = _carry(
-        poisson, poisson.weight, poisson.born_ns, table.poisson_steps, survival, dt, before_ns, stamp_ns, table
-    )
+    kept, mean, covariance, weight, repaired_poisson = components
     if kept.shape[0] < len(poisson):
         poisson = poisson.take(kept)
     poisson = Poissons(mean, covariance, weight, poisson.label, poisson.auxiliary, poisson.born_ns)
-    return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses), repaired_mb + repaired_ppp
+    return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses), repaired + repaired_poisson
 
 
-def _carry(
-    rows: Bernoullis | Poissons,
-    weight: Array,
-    since_ns: Index,
-    limit: Index,
-    survival: Array,
+@kernel
+def predict_density(
+    objects: Columns,
+    missed_from_ns: Index,
+    components: Columns,
     dt: float,
     before_ns: int,
     stamp_ns: int,
-    table: ClassTable,
-) -> tuple[Index, Array, Array, Array, int]:
-    """Predict the rows within their limit: which they are, their mean, covariance and weight, and the repairs."""
-    count = weight.shape[0]
-    kept, mean, covariance = np.empty(count, INDEX), np.empty((count, STATE)), np.empty((count, STATE, STATE))
-    carried = np.empty(count)
-    left, repaired = predict_components(
-        rows.mean,
-        rows.covariance,
-        rows.label,
-        weight,
-        since_ns,
-        limit,
-        survival,
-        dt,
-        before_ns,
-        stamp_ns,
-        table.period,
-        table.process_noise,
-        table.acceleration_time,
-        table.constant_velocity,
-        kept,
-        mean,
-        covariance,
-        carried,
+    period: float,
+    classes: Sequence[ClassRow],
+) -> tuple[Predicted, Predicted]:
+    """Predict objects and components: of each the rows that stay, m_+, P_+, r or mu, and the repairs.
+
+    Raises:
+        ValueError: columns do not fit together, and reading them would leave them.
+    """
+    if not columns_fit(objects, components, len(classes)):
+        raise ValueError("columns that do not fit together")
+    objects, components = BernoulliArrays(*objects), PoissonArrays(*components)
+    survival = np.empty(len(classes))
+    for c in range(len(classes)):
+        survival[c] = classes[c].survival ** (dt / period)
+    seen_from_ns = before_ns if dt <= LONGEST_STEP_S else stamp_ns
+    return (
+        predict_components(
+            objects.mean,
+            objects.covariance,
+            objects.label,
+            objects.existence,
+            missed_from_ns,
+            seen_from_ns,
+            False,
+            survival,
+            dt,
+            stamp_ns,
+            period,
+            classes,
+        ),
+        predict_components(
+            components.mean,
+            components.covariance,
+            components.label,
+            components.weight,
+            components.born_ns,
+            before_ns,
+            True,
+            survival,
+            dt,
+            stamp_ns,
+            period,
+            classes,
+        ),
     )
-    if left < count:
-        return kept[:left], mean[:left], covariance[:left], carried[:left], repaired
-    return kept, mean, covariance, carried, repaired
 
 
 @kernel
@@ -137,20 +169,14 @@ def predict_components(
     label: Index,
     weight: Array,
     since_ns: Index,
-    limit: Index,
+    seen_from_ns: int,
+    undetected: bool,
     survival: Array,
     dt: float,
-    before_ns: int,
     stamp_ns: int,
     period: float,
-    process_noise: Array,
-    acceleration_time: Array,
-    constant_velocity: NDArray[np.bool_],
-    kept: Index,
-    mean_out: Array,
-    covariance_out: Array,
-    weight_out: Array,
-) -> tuple[int, int]:
+    classes: Sequence[ClassRow],
+) -> Predicted:
     """Predict the components that are within the limit of their class (eq. PPP_prediction, MB_prediction).
 
     Args:
@@ -159,44 +185,32 @@ def predict_components(
         label: (N,) classes.
         weight: (N,) existence probability r or weight mu.
         since_ns: (N,) stamp from which periods are counted.
-        limit: (C,) periods after which a component goes.
+        seen_from_ns: rows counted from this stamp on stay, whatever the limit.
+        undetected: whether the limit is `poisson_steps`; else `max_misses`.
         survival: (C,) p_s over dt.
         dt: time to predict over, s, positive.
-        before_ns: rows seen from this stamp on stay, whatever the limit.
         stamp_ns: stamp of the new frame.
         period: nominal period, s.
-        process_noise: (C, 6) standard deviations per square root of a second.
-        acceleration_time: (C,) time constant of the acceleration, s.
-        constant_velocity: (C,) whether a class moves at constant velocity.
-        kept: (N,) receives the rows that stay, in front.
-        mean_out: (N, 6) receives m_+ of those.
-        covariance_out: (N, 6, 6) receives P_+.
-        weight_out: (N,) receives ``weight p_s``.
+        classes: (C,) parameters.
 
     Returns:
-        How many rows stay, and how many covariances had to be repaired.
+        The K rows that stay, (K, 6) m_+ and (K, 6, 6) P_+ of those, (K,) ``weight p_s``, and how many covariances had
+        to be repaired.
     """
+    size = mean.shape[0]
+    kept, carried = np.empty(size, np.int64), np.empty(size)
+    mean_out, covariance_out = np.empty((size, STATE)), np.empty((size, STATE, STATE))
     root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
     count, repaired = 0, 0
     for n in range(mean.shape[0]):
-        c = label[n]
+        own = classes[label[n]]
+        limit = own.poisson_steps if undetected else own.max_misses
         # The frame at hand may still bring the detection that is missing, hence one period less.
-        if since_ns[n] < before_ns and whole_periods(since_ns[n], stamp_ns, period) - 1 > limit[c]:
+        if since_ns[n] < seen_from_ns and whole_periods(since_ns[n], stamp_ns, period) - 1 > limit:
             continue
         kept[count] = n
-        weight_out[count] = weight[n] * survival[c]
-        if predict_state(
-            mean[n],
-            covariance[n],
-            dt,
-            process_noise[c],
-            acceleration_time[c],
-            constant_velocity[c],
-            root,
-            points,
-            mean_out[count],
-            covariance_out[count],
-        ):
+        carried[count] = weight[n] * survival[label[n]]
+        if predict_state(mean[n], covariance[n], dt, own, root, points, mean_out[count], covariance_out[count]):
             repaired += 1
         count += 1
-    return count, repaired
+    return kept[:count], mean_out[:count], covariance_out[:count], carried[:count], repaired

@@ -7,7 +7,7 @@ depends on the order in which a detector lists its boxes.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,20 +17,21 @@ from optipmb.errors import EffortError
 from optipmb.geometry import iou_exceeds
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
 from optipmb.position_noise import PLAIN, relative_noise
-from optipmb.records import INDEX, record
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from optipmb.frame import Frame
-    from optipmb.table import ClassTable
+    from optipmb.records import Columns
+    from optipmb.table import ClassRow, ClassTable
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
 
 
-@record
-class Measurements:
+class Measurements(NamedTuple):
     """The measurement set Z_k, best score first.
 
     Attributes:
@@ -52,9 +53,6 @@ class Measurements:
     label: Index
     source: Index
 
-    def __len__(self) -> int:
-        return len(self.score)
-
 
 def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[Measurements, int, int]:
     """Remove detections scored below eta_sf, then those that overlap a better one by more than eta_iou.
@@ -67,35 +65,8 @@ def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[
     Raises:
         EffortError: more than `most` pairs of detections may overlap.
     """
-    count = frame.score.shape[0]
-    chosen = np.empty(count, INDEX)
-    above, kept = select(
-        frame.center,
-        frame.size,
-        frame.yaw,
-        frame.score,
-        frame.label,
-        frame.source,
-        table.score_filter,
-        table.nms_iou,
-        table.group,
-        chosen,
-        most,
-    )
-    if kept < 0:
-        raise EffortError("center", f"at most {most} pairs of detections that may overlap", "more")
     own_noise = frame.position_covariance is not None or table.noise_grows
-    measurements = Measurements(
-        np.empty((kept, PLAIN + 3 if own_noise else PLAIN)),  # position
-        np.empty(kept),  # yaw
-        np.empty((kept, 2)),  # velocity
-        np.empty((kept, 4)),  # auxiliary
-        np.empty(kept),  # score
-        np.empty(kept, INDEX),  # label
-        np.empty(kept, INDEX),  # source
-    )
-    gather(
-        chosen,
+    above, chosen, columns = select(
         frame.center,
         frame.size,
         frame.yaw,
@@ -103,17 +74,16 @@ def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[
         frame.score,
         frame.label,
         frame.source,
-        measurements.position,
-        measurements.yaw,
-        measurements.velocity,
-        measurements.auxiliary,
-        measurements.score,
-        measurements.label,
-        measurements.source,
+        PLAIN + 3 if own_noise else PLAIN,
+        table.classes,
+        most,
     )
+    if above < 0:
+        raise EffortError("center", f"at most {most} pairs of detections that may overlap", "more")
+    measurements = Measurements(*columns)
     if own_noise:
-        measurements.position[:, PLAIN:] = relative_noise(frame, chosen[:kept], table)
-    return measurements, count - above, above - kept
+        measurements.position[:, PLAIN:] = relative_noise(frame, chosen, table)
+    return measurements, frame.score.shape[0] - above, above - chosen.shape[0]
 
 
 @kernel
@@ -121,24 +91,25 @@ def select(
     center: Array,
     size: Array,
     yaw: Array,
+    velocity: Array,
     score: Array,
     label: Index,
     source: Index,
-    score_filter: Array,
-    nms_iou: Array,
-    group: Index,
-    chosen: Index,
-    most: int = UNLIMITED,
-) -> tuple[int, int]:
-    """Write the rows of the measurements, in their order, to the front of `chosen` (M,).
+    width: int,
+    classes: Sequence[ClassRow],
+    most: int,
+) -> tuple[int, Index, Columns]:
+    """Choose the detections that are measurements.
 
     Returns:
-        How many rows pass the score filter, and how many of those the suppression too; -1 when more than `most` pairs
-        of boxes had to be looked at.
+        How many detections pass the score filter, or -1 when more than `most` pairs of boxes had to be looked at; the
+        rows of those that pass the suppression too, in their order; their columns of `Measurements`, `width` of them
+        for the position.
     """
+    chosen = np.empty(score.shape[0], np.int64)
     above = 0
     for m in range(score.shape[0]):
-        if score[m] >= score_filter[label[m]]:
+        if score[m] >= classes[label[m]].score_filter:
             chosen[above] = m
             above += 1
     order = chosen[:above]
@@ -150,15 +121,16 @@ def select(
         boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = center[m, 0], center[m, 1], size[m, 0], size[m, 1]
         boxes[k, 4] = yaw[m]
         ordered_label[k] = label[m]
-    keep = non_maximum_suppression(boxes, ordered_label, nms_iou, group, most)
+    keep = non_maximum_suppression(boxes, ordered_label, classes, most)
     if keep.shape[0] < above:
-        return above, -1
+        above = -1
     kept = 0
     for k in range(above):
         if keep[k]:
             chosen[kept] = chosen[k]
             kept += 1
-    return above, kept
+    chosen = chosen[:kept]
+    return above, chosen, gather(chosen, center, size, yaw, velocity, score, label, source, width)
 
 
 @kernel
@@ -202,15 +174,14 @@ def sort_canonically(order: Index, score: Array, center: Array, size: Array, yaw
 
 @kernel
 def non_maximum_suppression(
-    boxes: Array, label: Index, threshold: Array, group: Index, most: int = UNLIMITED
+    boxes: Array, label: Index, classes: Sequence[ClassRow], most: int = UNLIMITED
 ) -> NDArray[np.bool_]:
     """Keep each box unless a kept box of its group before it overlaps it by more than the threshold of its class.
 
     Args:
         boxes: (M, 5) bird's-eye boxes, best first.
         label: (M,) class of each.
-        threshold: (C,) eta_iou of each class.
-        group: (C,) group of each class.
+        classes: (C,) parameters: eta_iou and the group.
         most: pairs of boxes whose overlap is computed before it gives up.
 
     Returns:
@@ -219,28 +190,28 @@ def non_maximum_suppression(
     count, left = boxes.shape[0], most
     keep = np.ones(count, np.bool_)
     radius = np.empty(count)
-    widest = np.zeros(threshold.shape[0])
+    widest = np.zeros(len(classes))
     for m in range(count):
         radius[m] = 0.5 * math.hypot(boxes[m, 2], boxes[m, 3])
-        g = group[label[m]]
+        g = classes[label[m]].group
         widest[g] = max(widest[g], radius[m])
     # Only kept boxes stand in the torus; the cells of a group are as wide as two of its boxes reach.
     head, following, side = empty_torus(count)
     for m in range(count):
-        g = group[label[m]]
+        g, threshold = classes[label[m]].group, classes[label[m]].nms_iou
         cell_size = 2.0 * widest[g]
         first_x, last_x, first_y, last_y = block(boxes[m, 0], boxes[m, 1], radius[m] + widest[g], cell_size)
         for i in range(first_x, last_x + 1):
             for j in range(first_y, last_y + 1):
                 k = head[(i & (side - 1)) * side + (j & (side - 1))]
                 while k != NOBODY and keep[m]:
-                    if group[label[k]] == g:
+                    if classes[label[k]].group == g:
                         dx, dy, reach = boxes[k, 0] - boxes[m, 0], boxes[k, 1] - boxes[m, 1], radius[k] + radius[m]
                         if dx * dx + dy * dy < reach * reach:
                             left -= 1
                             if left < 0:
                                 return keep[:0]
-                            keep[m] = not iou_exceeds(boxes[k], boxes[m], threshold[label[m]])
+                            keep[m] = not iou_exceeds(boxes[k], boxes[m], threshold)
                     k = following[k]
         if keep[m]:
             insert(head, following, side, m, boxes[m, 0], boxes[m, 1], cell_size)
@@ -257,21 +228,20 @@ def gather(
     score: Array,
     label: Index,
     source: Index,
-    position_out: Array,
-    yaw_out: Array,
-    velocity_out: Array,
-    auxiliary_out: Array,
-    score_out: Array,
-    label_out: Index,
-    source_out: Index,
-) -> None:
-    """Copy the chosen detections to the columns of `Measurements`."""
-    for k in range(score_out.shape[0]):
+    width: int,
+) -> Columns:
+    """Copy the chosen detections to the columns of `Measurements`; columns of the position behind y stay unwritten."""
+    count = chosen.shape[0]
+    position, velocity_out, auxiliary = np.empty((count, width)), np.empty((count, 2)), np.empty((count, 4))
+    yaw_out, score_out = np.empty(count), np.empty(count)
+    label_out, source_out = np.empty(count, np.int64), np.empty(count, np.int64)
+    for k in range(count):
         m = chosen[k]
         for s in range(2):
-            position_out[k, s] = center[m, s]
+            position[k, s] = center[m, s]
             velocity_out[k, s] = velocity[m, s]
         for s in range(3):
-            auxiliary_out[k, s] = size[m, s]
-        auxiliary_out[k, 3] = center[m, 2]
+            auxiliary[k, s] = size[m, s]
+        auxiliary[k, 3] = center[m, 2]
         yaw_out[k], score_out[k], label_out[k], source_out[k] = yaw[m], score[m], label[m], source[m]
+    return position, yaw_out, velocity_out, auxiliary, score_out, label_out, source_out

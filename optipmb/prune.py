@@ -5,7 +5,7 @@ It is decided before the update is computed, so that nothing is computed for wha
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -13,15 +13,15 @@ from optipmb.association import UNASSIGNED
 from optipmb.compiled import kernel
 from optipmb.density import whole_periods
 from optipmb.hypotheses import CLUTTER
-from optipmb.records import INDEX, record
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from optipmb.density import Bernoullis
     from optipmb.hypotheses import Hypotheses
-    from optipmb.preprocess import Measurements
-    from optipmb.table import ClassTable
+    from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
@@ -30,8 +30,7 @@ NEW: Final = -1
 """`Survivors.row` of a first-time detection."""
 
 
-@record
-class Survivors:
+class Survivors(NamedTuple):
     """The local hypotheses of the best global hypothesis that outlive pruning: one per object of the posterior.
 
     Known objects come first, in their order; then the new ones, in the order of their measurements.
@@ -50,100 +49,58 @@ class Survivors:
     known: int
     detected: int
 
-    def __len__(self) -> int:
-        return len(self.row)
 
-
+@kernel
 def surviving_objects(
-    bernoulli: Bernoullis,
+    objects: Bernoullis,
     p_d: Array,
     assigned: Index,
     hypotheses: Hypotheses,
-    measurements: Measurements,
+    measured_label: Index,
     missed_from_ns: Index,
     stamp_ns: int,
-    table: ClassTable,
+    period: float,
+    classes: Sequence[ClassRow],
 ) -> Survivors:
     """Select the objects of the posterior: likely enough (`min_existence`), not missed too long (`max_misses`).
 
     The second limit is ours: with p_s = 1, as the paper sets it for KITTI, r stays 1 through any number of misses.
-
-    Args:
-        bernoulli: predicted objects.
-        p_d: (N,) their detection probabilities.
-        assigned: (N,) the measurement of each, `UNASSIGNED` for the missed ones.
-        hypotheses: of this frame.
-        measurements: Z_k.
-        missed_from_ns: (N,) stamps from which misses count.
-        stamp_ns: stamp of the frame.
-        table: parameters as columns.
-    """
-    capacity = len(bernoulli) + len(measurements)
-    row, measurement, existence = np.empty(capacity, INDEX), np.empty(capacity, INDEX), np.empty(capacity)
-    count, known, detected = select_objects(
-        bernoulli.existence,
-        missed_from_ns,
-        bernoulli.label,
-        p_d,
-        assigned,
-        hypotheses.first_kind,
-        hypotheses.first_existence,
-        measurements.label,
-        stamp_ns,
-        table.period,
-        table.max_misses,
-        table.min_existence,
-        row,
-        measurement,
-        existence,
-    )
-    return Survivors(row[:count], measurement[:count], existence[:count], known, detected)
-
-
-@kernel
-def select_objects(
-    existence: Array,
-    missed_from_ns: Index,
-    label: Index,
-    p_d: Array,
-    assigned: Index,
-    first_kind: Index,
-    first_existence: Array,
-    measured_label: Index,
-    stamp_ns: int,
-    period: float,
-    max_misses: Index,
-    min_existence: Array,
-    row: Index,
-    measurement: Index,
-    existence_out: Array,
-) -> tuple[int, int, int]:
-    """Write the rows of `Survivors`.
-
     A detected object has r = 1; a missed one ``r (1 - p_d) / [1 - r + r (1 - p_d)]`` (eq. Misdetect Hypothesis
     Update); of the measurements that no object took, those that are not clutter make one.
 
-    Returns:
-        The number of rows, of known objects among them, and of detected ones among those.
+    Args:
+        objects: predicted objects.
+        p_d: (N,) their detection probabilities.
+        assigned: (N,) the measurement of each, `UNASSIGNED` for the missed ones.
+        hypotheses: of this frame.
+        measured_label: (M,) z_c.
+        missed_from_ns: (N,) stamps from which misses count.
+        stamp_ns: stamp of the frame.
+        period: nominal period, s.
+        classes: (C,) parameters.
     """
+    capacity = assigned.shape[0] + measured_label.shape[0]
+    row, measurement, existence = np.empty(capacity, np.int64), np.empty(capacity, np.int64), np.empty(capacity)
     free = np.ones(measured_label.shape[0], np.bool_)
     count, detected = 0, 0
-    for n in range(existence.shape[0]):
-        m, r = assigned[n], existence[n]
+    for n in range(assigned.shape[0]):
+        m, r = assigned[n], objects.existence[n]
         if m != UNASSIGNED:
             free[m] = False
             r = 1.0
             detected += 1
         else:
+            own = classes[objects.label[n]]
             r = r * (1.0 - p_d[n]) / (1.0 - r + r * (1.0 - p_d[n]))
             misses = whole_periods(missed_from_ns[n], stamp_ns, period)
-            if not r >= min_existence[label[n]] or misses > max_misses[label[n]]:
+            if not r >= own.min_existence or misses > own.max_misses:
                 continue
-        row[count], measurement[count], existence_out[count] = n, m, r
+        row[count], measurement[count], existence[count] = n, m, r
         count += 1
     known = count
     for m in range(measured_label.shape[0]):
-        if free[m] and first_kind[m] != CLUTTER and first_existence[m] >= min_existence[measured_label[m]]:
-            row[count], measurement[count], existence_out[count] = NEW, m, first_existence[m]
+        r = hypotheses.first_existence[m]
+        if free[m] and hypotheses.first_kind[m] != CLUTTER and r >= classes[measured_label[m]].min_existence:
+            row[count], measurement[count], existence[count] = NEW, m, r
             count += 1
-    return count, known, detected
+    return Survivors(row[:count], measurement[:count], existence[:count], known, detected)

@@ -8,11 +8,18 @@ For the same reason a step gives the fields of the long records by position.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, TypeVar, dataclass_transform
+from typing import Any, Final, TypeAlias, TypeVar, dataclass_transform
 
 import numpy as np
 
 T = TypeVar("T")
+
+Columns: TypeAlias = Any
+"""The columns of a record in their order, as a plain tuple: what kernels take and return in its place.
+
+Numba takes no dataclass, and reads all names of a named tuple in every call, which doubles the time of the call. A
+kernel that takes columns names them first, as `BernoulliArrays(*objects)`.
+"""
 
 INDEX: Final = np.dtype(np.int64)
 FLAG: Final = np.dtype(np.bool_)

@@ -1,205 +1,189 @@
-"""The parameters as columns, one entry per class, ready for kernels and for indexing by class."""
+"""The parameters as a table with a row for each class, as kernels take them."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
+from optipmb.parameters import MAX_KNOTS
+
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from optipmb.parameters import Calibration, ClassParameters, Parameters
+    from optipmb.parameters import ClassParameters, Parameters
 
-    Array = NDArray[np.float64]
+    Spread = NDArray[np.float64]
+    Curve = NDArray[np.float64]
+
+
+class ClassRow(Protocol):
+    """What kernels read of a class; names as in `optipmb.parameters.ClassParameters`, where they are described.
+
+    Attributes:
+        group: the first class of the group, the class itself without one.
+        clutter_intensity: lambda_c = mu_c / A, 1/m^2.
+        birth_intensity: mu_b0 / A, 1/m^2.
+        acceleration_time: time constant of the acceleration, s, infinite where it is constant.
+        constant_velocity: whether the motion model is that of constant velocity.
+        process_noise: (6,) standard deviations in state order, per square root of a second.
+        noise_position: standard deviation of z_x and z_y.
+        noise_growth: g of `optipmb.position_noise`.
+        noise_velocity: of z_vx and z_vy.
+        noise_heading: of z_phi.
+        reported_position: variance that R_x of `optipmb.reported` leaves for z_x and z_y; zero without it.
+        reported_heading: for z_phi.
+        birth_known: (6,) standard deviations of P^0 when the detection brings a velocity.
+        birth_unknown: (6,) when it does not.
+        sign_known: whether the sign of the heading is followed; the next four are zero where not.
+        sign_memory: lambda of the sign.
+        sign_detection: b_d.
+        sign_motion: b_v.
+        sign_speed: v_0.
+        memory: lambda; one without a calibration, and so the evidence stays zero.
+        missed_evidence: l_miss.
+        score_of_evidence: weight of the evidence in the score.
+        knots: number of knots of the calibration, zero without one.
+        knot_evidence: (`MAX_KNOTS`,) where its curves bend, ascending; this and the next are zero from `knots` on.
+        knot_existence: (`MAX_KNOTS`,) existence probability there.
+        knot_along: (`MAX_KNOTS`,) standard deviation of the lasting error along the heading, m.
+        knot_across: (`MAX_KNOTS`,) across it, m.
+    """
+
+    score_filter: float
+    nms_iou: float
+    survival: float
+    gate: float
+    gate_growth: float
+    gate_deviations: float
+    detection: float
+    expected_points: float
+    detection_floor: float
+    ground_clearance: float
+    birth_score: float
+    birth_over_clutter: bool
+    birth_heading_speed: float
+    adaptive_birth_rate: float
+    poisson_steps: int
+    extract_new: float
+    extract_known: float
+    extract_misses: int
+    confirm_from: float
+    confirm_until: float
+    max_misses: int
+    min_existence: float
+    linearisations: int
+    group: int
+    clutter_intensity: float
+    birth_intensity: float
+    acceleration_time: float
+    constant_velocity: bool
+    process_noise: Spread
+    noise_position: float
+    noise_growth: float
+    noise_velocity: float
+    noise_heading: float
+    reported_position: float
+    reported_heading: float
+    birth_known: Spread
+    birth_unknown: Spread
+    sign_known: bool
+    sign_memory: float
+    sign_detection: float
+    sign_motion: float
+    sign_speed: float
+    memory: float
+    missed_evidence: float
+    score_of_evidence: float
+    knots: int
+    knot_evidence: Curve
+    knot_existence: Curve
+    knot_along: Curve
+    knot_across: Curve
+
+
+_TYPES: Final = MappingProxyType(
+    {
+        "float": np.float64,
+        "int": np.int64,
+        "bool": np.bool_,
+        "Spread": (np.float64, (6,)),
+        "Curve": (np.float64, (MAX_KNOTS,)),
+    }
+)
+
+CLASS: Final = np.dtype([(name, _TYPES[kind]) for name, kind in ClassRow.__annotations__.items()], align=True)
+"""A row of the table; the same for all profiles, so that kernels are compiled once."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClassTable:
-    """Columns over the classes; names as in `optipmb.parameters.ClassParameters`, where they are described.
+    """The classes of a profile, and what it says of all of them.
 
     Attributes:
-        group: (C,) the first class of the group of each, itself without one.
-        clutter_intensity: lambda_c = mu_c / A, 1/m^2.
-        birth_intensity: mu_b0 / A, 1/m^2.
-        process_noise: (C, 6) standard deviations in state order, per square root of a second.
-        noise_position: (C,) standard deviation of z_x and z_y.
-        noise_growth: (C,) g of `optipmb.position_noise`; noise_grows: whether any is above zero.
-        noise_velocity: (C,) of z_vx and z_vy.
-        noise_heading: (C,) of z_phi.
-        acceleration_time: (C,) time constant of the acceleration, s, infinite where it is constant.
-        constant_velocity: (C,) whether the motion model is that of constant velocity.
-        linearisations: (C,) of measured velocities, zero for the UKF.
-        reported_position: (C,) variance that R_x of `optipmb.reported` leaves for z_x and z_y; zero without it.
-        reported_heading: (C,) for z_phi.
-        birth_known: (C, 6) standard deviations of P^0 when the detection brings a velocity.
-        birth_unknown: (C, 6) when it does not.
-        sign_known: (C,) whether the sign of the heading is followed; the next four are zero where not.
-        sign_memory: (C,) lambda of the sign.
-        sign_detection: (C,) b_d.
-        sign_motion: (C,) b_v.
-        sign_speed: (C,) v_0.
-        memory: (C,) lambda; one without a calibration, and so the evidence stays zero.
-        missed_evidence: (C,) l_miss.
-        score_of_evidence: (C,) weight of the evidence in the score.
-        knots: (C,) number of knots of the calibration, zero without one.
-        knot_evidence: (C, K) and the other columns at the knots, zero from `knots` on.
+        classes: (C,) array of `CLASS`, for kernels; `table["gate"]` is a column of it.
+        period: nominal period, s.
+        detection_over_time: whether p_d holds per nominal period (`optipmb.detection_probability.over_time`).
+        noise_grows: whether the position noise of any class grows with the distance.
     """
 
+    classes: Sequence[ClassRow]
     period: float
     detection_over_time: bool
-    score_filter: Array
-    nms_iou: Array
-    group: NDArray[np.int64]
-    survival: Array
-    gate: Array
-    detection: Array
-    expected_points: Array
-    detection_floor: Array
-    birth_score: Array
-    adaptive_birth_rate: Array
-    clutter_intensity: Array
-    birth_intensity: Array
-    poisson_steps: NDArray[np.int64]
-    extract_new: Array
-    extract_known: Array
-    extract_misses: NDArray[np.int64]
-    max_misses: NDArray[np.int64]
-    min_existence: Array
-    birth_heading_speed: Array
-    acceleration_time: Array
-    constant_velocity: NDArray[np.bool_]
-    gate_growth: Array
-    gate_deviations: Array
-    birth_over_clutter: NDArray[np.bool_]
-    ground_clearance: Array
-    confirm_from: Array
-    confirm_until: Array
-    process_noise: Array
-    noise_position: Array
-    noise_growth: Array
     noise_grows: bool
-    noise_velocity: Array
-    noise_heading: Array
-    linearisations: NDArray[np.int64]
-    reported_position: Array
-    reported_heading: Array
-    birth_known: Array
-    birth_unknown: Array
-    sign_known: NDArray[np.bool_]
-    sign_memory: Array
-    sign_detection: Array
-    sign_motion: Array
-    sign_speed: Array
-    memory: Array
-    missed_evidence: Array
-    score_of_evidence: NDArray[np.float64]
-    knots: NDArray[np.int64]
-    knot_evidence: Array
-    knot_existence: Array
-    knot_along: Array
-    knot_across: Array
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        column: NDArray[Any] = np.asarray(self.classes)[name]
+        return column
 
     @classmethod
     def of(cls, parameters: Parameters) -> ClassTable:
-        """Lay out the classes of a profile as columns."""
+        """Lay out the classes of a profile as a table."""
         rows = tuple(parameters.classes.values())
-
-        def column(value: Callable[[ClassParameters], float]) -> Array:
-            return np.array([value(row) for row in rows], dtype=np.float64)
-
-        def count(value: Callable[[ClassParameters], int]) -> NDArray[np.int64]:
-            return np.array([value(row) for row in rows], dtype=np.int64)
-
-        def spread(speed: Callable[[ClassParameters], float]) -> Array:
-            return np.array(
-                [
-                    [
-                        p.birth.position,
-                        p.birth.position,
-                        speed(p),
-                        p.birth.heading,
-                        p.birth.turn_rate,
-                        p.birth.acceleration,
-                    ]
-                    for p in rows
-                ]
-            )
-
-        calibrations = [row.calibration for row in rows]
-        knots = [len(one.evidence) if one else 0 for one in calibrations]
-
-        def curve(value: Callable[[Calibration], tuple[float, ...]]) -> Array:
-            values = np.zeros((len(rows), max(knots)))
-            for row, one in enumerate(calibrations):
-                if one is not None:
-                    values[row, : knots[row]] = value(one)
-            return values
-
         groups = [(p.group,) if p.group is not None else row for row, p in enumerate(rows)]
-        noise = [p.process_noise for p in rows]
-        signs = [p.heading_sign for p in rows]
-        return cls(
-            period=parameters.nominal_period,
-            detection_over_time=parameters.detection_over_time,
-            score_filter=column(lambda p: p.score_filter),
-            nms_iou=column(lambda p: p.nms_iou),
-            group=np.array([groups.index(group) for group in groups], dtype=np.int64),
-            survival=column(lambda p: p.survival),
-            gate=column(lambda p: p.gate),
-            detection=column(lambda p: p.detection),
-            expected_points=column(lambda p: p.expected_points),
-            detection_floor=column(lambda p: p.detection_floor),
-            birth_score=column(lambda p: p.birth_score),
-            adaptive_birth_rate=column(lambda p: p.adaptive_birth_rate),
-            clutter_intensity=column(lambda p: p.clutter_rate / p.area),
-            birth_intensity=column(lambda p: p.undetected_birth_rate / p.area),
-            poisson_steps=count(lambda p: p.poisson_steps),
-            extract_new=column(lambda p: p.extract_new),
-            extract_known=column(lambda p: p.extract_known),
-            extract_misses=count(lambda p: p.extract_misses),
-            max_misses=count(lambda p: p.max_misses),
-            min_existence=column(lambda p: p.min_existence),
-            birth_heading_speed=column(lambda p: p.birth_heading_speed),
-            acceleration_time=column(lambda p: math.inf if p.acceleration_time is None else p.acceleration_time),
-            constant_velocity=np.array([p.motion == "cv" for p in rows], dtype=np.bool_),
-            gate_growth=column(lambda p: p.gate_growth),
-            gate_deviations=column(lambda p: p.gate_deviations),
-            birth_over_clutter=np.array([p.birth_over_clutter for p in rows], dtype=np.bool_),
-            ground_clearance=column(lambda p: p.ground_clearance),
-            confirm_from=column(lambda p: p.confirm_from),
-            confirm_until=column(lambda p: p.confirm_until),
-            process_noise=np.array(
-                [[q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration] for q in noise]
-            ),
-            noise_position=column(lambda p: p.measurement_noise.position),
-            noise_growth=column(lambda p: p.measurement_noise.position_growth),
-            noise_grows=any(p.measurement_noise.position_growth > 0.0 for p in rows),
-            noise_velocity=column(lambda p: p.measurement_noise.velocity),
-            noise_heading=column(lambda p: p.measurement_noise.heading),
-            linearisations=count(lambda p: p.linearisations),
-            reported_position=column(lambda p: _left_over(p, "position")),
-            reported_heading=column(lambda p: _left_over(p, "heading")),
-            birth_known=spread(lambda p: p.birth.speed),
-            birth_unknown=spread(lambda p: p.birth.unknown_speed),
-            sign_known=np.array([one is not None for one in signs], np.bool_),
-            sign_memory=np.array([one.memory if one else 0.0 for one in signs]),
-            sign_detection=np.array([one.detection if one else 0.0 for one in signs]),
-            sign_motion=np.array([one.motion if one else 0.0 for one in signs]),
-            sign_speed=np.array([one.speed if one else 0.0 for one in signs]),
-            memory=np.array([one.memory if one else 1.0 for one in calibrations]),
-            missed_evidence=np.array([one.missed if one else 0.0 for one in calibrations]),
-            score_of_evidence=np.array([one.score_of_evidence if one else 0.0 for one in calibrations]),
-            knots=np.array(knots, np.int64),
-            knot_evidence=curve(lambda one: one.evidence),
-            knot_existence=curve(lambda one: one.existence),
-            knot_along=curve(lambda one: one.along),
-            knot_across=curve(lambda one: one.across),
-        )
+        classes: Any = np.zeros(len(rows), CLASS)
+        for c, (p, group) in enumerate(zip(rows, groups, strict=True)):
+            for name, value in (_values(p) | {"group": groups.index(group)}).items():
+                classes[name][c] = value
+        grows = any(p.measurement_noise.position_growth > 0.0 for p in rows)
+        return cls(classes, parameters.nominal_period, parameters.detection_over_time, grows)
+
+
+def _values(p: ClassParameters) -> dict[str, Any]:
+    """Return the row of a class but for its group, which depends on the other classes."""
+    q, noise, birth, sign, told = p.process_noise, p.measurement_noise, p.birth, p.heading_sign, p.calibration
+    values = {name: getattr(p, name) for name in ClassRow.__annotations__ if hasattr(p, name)}
+    values |= {
+        "clutter_intensity": p.clutter_rate / p.area,
+        "birth_intensity": p.undetected_birth_rate / p.area,
+        "acceleration_time": math.inf if p.acceleration_time is None else p.acceleration_time,
+        "constant_velocity": p.motion == "cv",
+        "process_noise": (q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration),
+        "noise_position": noise.position,
+        "noise_growth": noise.position_growth,
+        "noise_velocity": noise.velocity,
+        "noise_heading": noise.heading,
+        "reported_position": _left_over(p, "position"),
+        "reported_heading": _left_over(p, "heading"),
+        "memory": 1.0,
+    }
+    for name, speed in (("birth_known", birth.speed), ("birth_unknown", birth.unknown_speed)):
+        values[name] = (birth.position, birth.position, speed, birth.heading, birth.turn_rate, birth.acceleration)
+    if sign is not None:
+        values |= {"sign_known": True, "sign_memory": sign.memory, "sign_detection": sign.detection}
+        values |= {"sign_motion": sign.motion, "sign_speed": sign.speed}
+    if told is not None:
+        values |= {"memory": told.memory, "missed_evidence": told.missed, "knots": len(told.evidence)}
+        values["score_of_evidence"] = told.score_of_evidence
+        for name in ("evidence", "existence", "along", "across"):
+            curve = getattr(told, name)
+            values[f"knot_{name}"] = (*curve, *(0.0,) * (MAX_KNOTS - len(curve)))
+    return values
 
 
 def _left_over(parameters: ClassParameters, name: str) -> float:

@@ -3,64 +3,122 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from operator import sub
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optipmb.association import associate
 from optipmb.birth import first_detected_states
-from optipmb.columns import check_fitting
-from optipmb.density import NO_FRAME, STATE, Density, Poissons
+from optipmb.compiled import kernel
+from optipmb.density import (
+    NO_FRAME,
+    STATE,
+    BernoulliArrays,
+    Bernoullis,
+    Density,
+    PoissonArrays,
+    Poissons,
+    columns_of_rows,
+)
 from optipmb.detection_probability import detection_probability, over_time
 from optipmb.effort import UNLIMITED, check_effort
 from optipmb.errors import FrameError
 from optipmb.extract import extract
 from optipmb.field_of_view import detection_probability_in_view, follow_looks, look
-from optipmb.hypotheses import enumerate_hypotheses
+from optipmb.hypotheses import local_hypotheses
 from optipmb.lightweight import light_weight_filter
 from optipmb.paths import paths_of
 from optipmb.predict import predict
-from optipmb.preprocess import preprocess
-from optipmb.prune import surviving_objects
+from optipmb.preprocess import Measurements, preprocess
+from optipmb.prune import Survivors, surviving_objects
 from optipmb.records import record
 from optipmb.table import ClassTable
 from optipmb.undetected import update_undetected, with_measurement_births
-from optipmb.update import update_states
+from optipmb.update import ukf_updates
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from optipmb.density import Bernoullis
     from optipmb.extract import Tracks
     from optipmb.field_of_view import Looks
     from optipmb.frame import Frame, PointCloud
-    from optipmb.hypotheses import Hypotheses
     from optipmb.parameters import Parameters
     from optipmb.paths import PredictedPaths
-    from optipmb.preprocess import Measurements
-    from optipmb.prune import Survivors
+    from optipmb.records import Columns
+    from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
 
 
-STAGES: Final = (
-    "predict",
-    "preprocess",
-    "detection_probability",
-    "hypotheses",
-    "associate",
-    "update",
-    "undetected",
-    "extract",
-)
-"""The stages of a step, in their order, as `Diagnostics.stage_ns` has them."""
+@kernel
+def update(
+    objects: Columns,
+    p_d: Array,
+    missed_from_ns: Index,
+    components: Columns,
+    p_d_poisson: Array,
+    n_predicted: int,
+    measurements: Columns,
+    dt: float,
+    stamp_ns: int,
+    before_ns: int,
+    next_id: int,
+    adaptive: bool,
+    period: float,
+    classes: Sequence[ClassRow],
+) -> tuple[Columns, Columns, Index, Index, int, int, int]:
+    """Update the prediction with the measurements: the PMB update of Algorithm 1.
 
+    Args:
+        objects: predicted objects.
+        p_d: (N,) their detection probabilities.
+        missed_from_ns: (N,) stamps from which their misses count.
+        components: predicted Poisson components, and behind them, without HABM, those of the measurements.
+        p_d_poisson: (J,) their detection probabilities.
+        n_predicted: how many of them were predicted.
+        measurements: Z_k.
+        dt: s since the frame before.
+        stamp_ns: stamp of the frame.
+        before_ns: stamp of the frame before.
+        next_id: id of the first new object.
+        adaptive: whether HABM is on.
+        period: nominal period, s.
+        classes: (C,) parameters.
 
-def _no_clock() -> int:
-    return 0
+    Returns:
+        The columns of the objects and of the Poisson components of the posterior; the other fields of `Survivors`;
+        how many covariances had to be repaired.
+    """
+    z = Measurements(*measurements)
+    objects, components = BernoulliArrays(*objects), PoissonArrays(*components)
+
+    # Local hypotheses: missed, detected, first-time detected; HABM
+    hypotheses = local_hypotheses(objects, p_d, components, p_d_poisson, z, dt, period, classes)
+
+    # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
+    row, measurement, cost = hypotheses.row, hypotheses.measurement, hypotheses.detection_cost
+    assigned = associate(row, measurement, cost, hypotheses.first_cost, p_d.shape[0])
+    kept = surviving_objects(objects, p_d, assigned, hypotheses, z.label, missed_from_ns, stamp_ns, period, classes)
+
+    # Motion states: detected and missed objects by the UKF, then the births of first-time detections
+    count, known = kept.row.shape[0], kept.known
+    mean, covariance = np.empty((count, STATE)), np.empty((count, STATE, STATE))
+    repaired = ukf_updates(kept.row, kept.measurement, objects.mean, objects.covariance, z, classes, mean, covariance)
+    repaired += first_detected_states(
+        kept.measurement[known:], hypotheses, components, z, classes, mean[known:], covariance[known:]
+    )
+
+    # Other states: light-weight filter
+    posterior = light_weight_filter(kept, mean, covariance, objects, next_id, z, stamp_ns, before_ns, period, classes)
+
+    # Undetected objects: PPP update, RPP, and the births of HABM
+    undetected = update_undetected(
+        components, p_d_poisson, n_predicted, hypotheses, z, stamp_ns, period, classes, adaptive
+    )
+    return posterior, undetected, kept.row, kept.measurement, known, kept.detected, repaired
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +151,6 @@ class Diagnostics:
         associated: measurements given to objects.
         born: new objects.
         repaired: covariances that had lost rank in rounding and were repaired.
-        stage_ns: nanoseconds that each of `STAGES` took by the clock of the tracker; zeros without one.
     """
 
     cloud_used: bool
@@ -103,7 +160,6 @@ class Diagnostics:
     associated: int
     born: int
     repaired: int
-    stage_ns: tuple[int, ...]
 
 
 @record
@@ -120,13 +176,17 @@ class Tracker:
     """The OptiPMB filter of one set of parameters. It holds no state: a density goes in, a density comes out.
 
         lambda_u, {(r, p)} at k-1
-            │ predict            eq. PPP_prediction, MB_prediction
-            │ preprocess         eta_sf, NMS
-            │ hypotheses         eq. Misdetect, Detection, First-Time Detection Hypothesis Update; HABM
-            │ associate          shortest augmenting paths
-            │ prune              r, misses
-            │ update             UKF for the pairs of the best global hypothesis, light-weight filter
-            ▼ extract, calibrate eta_ext1, eta_ext2, eta_cnt
+            │ predict                     eq. PPP_prediction, MB_prediction
+            │ preprocess                  eta_sf, NMS
+            │ update
+            │     local_hypotheses        eq. Misdetect, Detection, First-Time Detection Hypothesis Update; HABM
+            │     associate               shortest augmenting paths
+            │     surviving_objects       r, misses
+            │     ukf_updates             eq. UKF Update, for the pairs of the best global hypothesis
+            │     first_detected_states   eq. Newborn Hypothesis, First-Time Detection Hypothesis Update 1
+            │     light_weight_filter     eq. Confidence Score
+            │     update_undetected       eq. PPP Update; RPP, HABM
+            ▼ extract                     eta_ext1, eta_ext2, eta_cnt; calibration
         lambda_u, {(r, p)} at k, tracks
 
     Attributes:
@@ -135,9 +195,6 @@ class Tracker:
 
     `max_pairs` bounds the pairs of a step that are near each other: detections that may overlap, and detections in the
     gates of objects. What a step costs is nearly proportional to them, about a microsecond each.
-
-    `clock` returns nanoseconds and is read between the stages of a step for `Diagnostics.stage_ns`, as
-    `time.perf_counter_ns`; nothing else depends on it.
     """
 
     def __init__(
@@ -146,12 +203,10 @@ class Tracker:
         modules: Modules | None = None,
         *,
         max_pairs: int = UNLIMITED,
-        clock: Callable[[], int] = _no_clock,
     ) -> None:
         self._max_pairs = max_pairs
         self.parameters = parameters
         self.modules = modules if modules is not None else Modules()
-        self._clock = clock
         self._table = ClassTable.of(parameters)
         self._horizons = np.array(parameters.horizons, np.float64)
 
@@ -176,84 +231,72 @@ class Tracker:
             EffortError: the frame needs more than `max_pairs` pairs looked at; nothing costly was done yet.
         """
         self._check(density, frame)
-        if density.stamp_ns != NO_FRAME and frame.stamp_ns < density.stamp_ns:
-            raise FrameError("stamp_ns", f"a stamp from {density.stamp_ns} on", str(frame.stamp_ns))
-        now, table, modules, clock = frame.stamp_ns, self._table, self.modules, self._clock
+        now, table, modules = frame.stamp_ns, self._table, self.modules
         dt = table.period if density.stamp_ns == NO_FRAME else (now - density.stamp_ns) * 1e-9
-        times = [clock()]
 
         # PMB prediction
         predicted, repaired = predict(density, now, table)
         bernoulli, poisson = predicted.bernoulli, predicted.poisson
-        times.append(clock())
 
-        # PMB update: measurements, detection probabilities, local hypotheses
+        # Measurements, and the detection probabilities p_d(x_+) of what is in view
         measurements, below_score, suppressed = preprocess(frame, table, self._max_pairs)
         check_effort(bernoulli, poisson, measurements, dt, table, self._max_pairs)
-        n_predicted = len(poisson)
         if not modules.habm:
             poisson = with_measurement_births(poisson, measurements, now, table)
-        times.append(clock())
-        cloud = frame.cloud if modules.adp else None
         looks, poisson = look(frame.field_of_view, predicted, poisson, density.stamp_ns, table)
+        cloud = frame.cloud if modules.adp else None
         p_d, p_d_poisson = self._detection_probabilities(bernoulli, poisson, cloud, looks, dt)
-        times.append(clock())
-        hypotheses = enumerate_hypotheses(bernoulli, p_d, poisson, p_d_poisson, measurements, dt, table)
-        times.append(clock())
 
-        # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
+        # PMB update: hypotheses, association, states, births
         missed_from_ns = predicted.missed_from_ns if looks is None else looks.misses.missed_from_ns
-        assigned = associate(hypotheses, len(bernoulli))
-        survivors = surviving_objects(bernoulli, p_d, assigned, hypotheses, measurements, missed_from_ns, now, table)
-        times.append(clock())
-
-        # Detected, missed and new objects: motion states, then the light-weight filter
-        mean, covariance, repaired_now = self._update_states(survivors, bernoulli, poisson, hypotheses, measurements)
-        objects = light_weight_filter(
-            survivors, mean, covariance, bernoulli, predicted.next_id, measurements, now, density.stamp_ns, table
+        columns, undetected, row, hits, known, detected, repaired_now = update(
+            columns_of_rows(bernoulli),
+            p_d,
+            missed_from_ns,
+            columns_of_rows(poisson),
+            p_d_poisson,
+            len(predicted.poisson),
+            tuple(measurements),
+            dt,
+            now,
+            density.stamp_ns,
+            predicted.next_id,
+            modules.habm,
+            table.period,
+            table.classes,
         )
-        times.append(clock())
-
-        # PPP update and redundant PPP pruning
-        undetected = (
-            update_undetected(
-                poisson, p_d_poisson, n_predicted, hypotheses, measurements, now, table, adaptive=modules.habm
-            )
-            if modules.rpp
-            else Poissons.empty()
-        )
-        times.append(clock())
+        objects, misses = Bernoullis(*columns), None
+        if looks is not None:
+            survivors = Survivors(row, hits, objects.existence, known, detected)
+            misses = follow_looks(looks, survivors, bernoulli, objects, measurements, now, table)
+        born = len(objects) - known
+        poisson = Poissons(*undetected) if modules.rpp else Poissons.empty()
+        posterior = Density(now, predicted.next_id + born, objects, poisson, density.labels, misses)
 
         # Track extraction
-        misses = None
-        if looks is not None:
-            misses = follow_looks(looks, survivors, bernoulli, objects, measurements, now, table)
-        born = len(survivors) - survivors.known
-        posterior = Density(now, predicted.next_id + born, objects, undetected, density.labels, misses)
         since_ns = posterior.missed_from_ns
-        tracks = extract(objects, since_ns, survivors.measurement, measurements, now, table, two_thresholds=modules.ote)
+        tracks = extract(objects, since_ns, hits, measurements, now, table, two_thresholds=modules.ote)
         paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None
-        times.append(clock())
 
         diagnostics = Diagnostics(
             cloud is not None,
             frame.score.shape[0],
             below_score,
             suppressed,
-            survivors.detected,
+            detected,
             born,
             repaired + repaired_now,
-            tuple(map(sub, times[1:], times)),  # stage_ns
         )
         return StepResult(posterior, tracks, diagnostics, paths)
 
     def _check(self, density: Density, frame: Frame) -> None:
-        """Refuse what kernels would read or write out of bounds for."""
+        """Refuse other classes, which kernels would read out of bounds for, and frames of the past."""
         labels = self.parameters.labels
         for path, given in (("labels", frame.labels), ("density.labels", density.labels)):
             if given != labels:
                 raise FrameError(path, f"the classes of profile {self.parameters.name}, {labels}", str(given)[:200])
-        check_fitting(density, labels)
+        if density.stamp_ns != NO_FRAME and frame.stamp_ns < density.stamp_ns:
+            raise FrameError("stamp_ns", f"a stamp from {density.stamp_ns} on", str(frame.stamp_ns))
 
     def _detection_probabilities(
         self, bernoulli: Bernoullis, poisson: Poissons, cloud: PointCloud | None, looks: Looks | None, dt: float
@@ -261,7 +304,7 @@ class Tracker:
         """Compute p_d(x_+) of objects and of Poisson components, in one pass over the cloud if there is one."""
         share = dt / self._table.period if self._table.detection_over_time else 1.0
         if cloud is None and looks is None:
-            p_d0 = over_time(self._table.detection, share)
+            p_d0 = over_time(self._table["detection"], share)
             return p_d0[bernoulli.label], p_d0[poisson.label]
         p_d = detection_probability(
             np.concatenate((bernoulli.mean, poisson.mean)),
@@ -272,22 +315,3 @@ class Tracker:
         )
         p_d = over_time(p_d, share) if looks is None else detection_probability_in_view(p_d, looks, share, self._table)
         return p_d[: len(bernoulli)], p_d[len(bernoulli) :]
-
-    def _update_states(
-        self,
-        survivors: Survivors,
-        bernoulli: Bernoullis,
-        poisson: Poissons,
-        hypotheses: Hypotheses,
-        measurements: Measurements,
-    ) -> tuple[Array, Array, int]:
-        """Compute the motion states of the posterior: by the UKF for known objects, as births for new ones."""
-        count, known = len(survivors), survivors.known
-        mean, covariance = np.empty((count, STATE)), np.empty((count, STATE, STATE))
-        repaired = update_states(survivors, bernoulli, measurements, self._table, mean, covariance)
-        if known < count:
-            rows = survivors.measurement[known:]
-            repaired += first_detected_states(
-                rows, measurements, hypotheses, poisson, self._table, mean[known:], covariance[known:]
-            )
-        return mean, covariance, repaired

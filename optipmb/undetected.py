@@ -12,32 +12,35 @@ import numpy as np
 
 from optipmb.birth import birth_states
 from optipmb.compiled import kernel
-from optipmb.density import Poissons, copy_state, whole_periods
+from optipmb.density import STATE, PoissonArrays, Poissons, columns_of_rows, copy_state, whole_periods
 from optipmb.hypotheses import CLUTTER
-from optipmb.records import INDEX
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from optipmb.hypotheses import Hypotheses
     from optipmb.preprocess import Measurements
-    from optipmb.table import ClassTable
+    from optipmb.records import Columns
+    from optipmb.table import ClassRow, ClassTable
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
 
 
+@kernel
 def update_undetected(
-    poisson: Poissons,
+    components: Poissons,
     p_d: Array,
     n_predicted: int,
     hypotheses: Hypotheses,
     measurements: Measurements,
     stamp_ns: int,
-    table: ClassTable,
-    *,
+    period: float,
+    classes: Sequence[ClassRow],
     adaptive: bool,
-) -> Poissons:
+) -> Columns:
     """Select the Poisson components that stay under RPP, and add lambda_b.
 
     Components that took part in any first-time detection hypothesis are marked and go, so that they cannot start a
@@ -51,218 +54,84 @@ def update_undetected(
     a zero weight makes none.
 
     Args:
-        poisson: the components.
+        components: the components.
         p_d: (J,) their detection probabilities.
         n_predicted: how many of them were predicted; those behind were made by the measurements of this frame
             (without HABM), and are not used up by the very measurement that has just made them.
         hypotheses: of this frame.
         measurements: Z_k.
         stamp_ns: stamp of the frame.
-        table: parameters as columns.
+        period: nominal period, s.
+        classes: (C,) parameters.
         adaptive: whether HABM is on; off: nothing is born here.
     """
-    capacity = len(poisson) + len(measurements)
-    chosen, weight = np.empty(capacity, INDEX), np.empty(capacity)
-    old, count = select_undetected(
-        poisson.weight,
-        p_d,
-        poisson.label,
-        poisson.born_ns,
-        n_predicted,
-        hypotheses.component,
-        stamp_ns,
-        table.period,
-        table.poisson_steps,
-        adaptive,
-        hypotheses.first_kind,
-        hypotheses.association,
-        measurements.label,
-        table.adaptive_birth_rate,
-        chosen,
-        weight,
-    )
-    return with_births(poisson, chosen, old, weight[:count], measurements, stamp_ns, table)
+    marked = np.zeros(p_d.shape[0], np.bool_)
+    for j in hypotheses.component:
+        marked[j] = j < n_predicted
+    capacity = p_d.shape[0] + measurements.score.shape[0]
+    chosen, weight = np.empty(capacity, np.int64), np.empty(capacity)
+    old = 0
+    for j in range(p_d.shape[0]):
+        steps = whole_periods(components.born_ns[j], stamp_ns, period)
+        if not marked[j] and steps <= classes[components.label[j]].poisson_steps:
+            chosen[old], weight[old] = j, components.weight[j] * (1.0 - p_d[j])
+            old += 1
+    count = old
+    for m in range(measurements.score.shape[0]):
+        born = classes[measurements.label[m]].adaptive_birth_rate * (1.0 - hypotheses.association[m])
+        if adaptive and hypotheses.first_kind[m] == CLUTTER and born > 0.0:
+            chosen[count], weight[count] = m, born
+            count += 1
+    return with_births(components, chosen[:old], chosen[old:count], weight[:count], measurements, stamp_ns, classes)
+
+
+@kernel
+def with_births(
+    components: Poissons,
+    kept: Index,
+    born: Index,
+    weight: Array,
+    measurements: Measurements,
+    stamp_ns: int,
+    classes: Sequence[ClassRow],
+) -> Columns:
+    """Put the components that stay and those that are born together.
+
+    Args:
+        components: the components.
+        kept: (K,) which of them stay.
+        born: (L,) measurements that make a component each.
+        weight: (K + L,) weights of all.
+        measurements: Z_k.
+        stamp_ns: stamp of the frame.
+        classes: (C,) parameters.
+    """
+    old, count = kept.shape[0], weight.shape[0]
+    mean, covariance = np.empty((count, STATE)), np.empty((count, STATE, STATE))
+    label, auxiliary, born_ns = np.empty(count, np.int64), np.empty((count, 4)), np.empty(count, np.int64)
+    for k in range(old):
+        j = kept[k]
+        copy_state(components.mean, components.covariance, j, mean, covariance, k)
+        for s in range(4):
+            auxiliary[k, s] = components.auxiliary[j, s]
+        label[k], born_ns[k] = components.label[j], components.born_ns[j]
+    birth_states(born, measurements, classes, mean[old:], covariance[old:])
+    for k in range(old, count):
+        m = born[k - old]
+        for s in range(4):
+            auxiliary[k, s] = measurements.auxiliary[m, s]
+        label[k], born_ns[k] = measurements.label[m], stamp_ns
+    return mean, covariance, weight, label, auxiliary, born_ns
 
 
 def with_measurement_births(
     poisson: Poissons, measurements: Measurements, stamp_ns: int, table: ClassTable
 ) -> Poissons:
     """Add a component of weight mu_ab for every measurement: GNN-PMB's birth model, the baseline of the ablation."""
-    old = len(poisson)
-    chosen = np.concatenate((np.arange(old), np.arange(len(measurements))))
-    weight = np.concatenate((poisson.weight, table.adaptive_birth_rate[measurements.label]))
-    return with_births(poisson, chosen, old, weight, measurements, stamp_ns, table)
-
-
-def with_births(
-    poisson: Poissons,
-    chosen: Index,
-    old: int,
-    weight: Array,
-    measurements: Measurements,
-    stamp_ns: int,
-    table: ClassTable,
-) -> Poissons:
-    """Put the components that stay and those that are born together.
-
-    Args:
-        poisson: the components.
-        chosen: (>= K,) which of them stay, and behind those the measurements that make a component each.
-        old: how many stay.
-        weight: (K,) weights of all.
-        measurements: Z_k.
-        stamp_ns: stamp of the frame.
-        table: parameters as columns.
-    """
-    count = weight.shape[0]
-    if not count:
-        return poisson if not len(poisson) else Poissons.empty()
-    joined = Poissons.unfilled(weight)
-    fill_components(
-        chosen,
-        old,
-        poisson.mean,
-        poisson.covariance,
-        poisson.label,
-        poisson.auxiliary,
-        poisson.born_ns,
-        measurements.position,
-        measurements.yaw,
-        measurements.velocity,
-        measurements.label,
-        measurements.auxiliary,
-        stamp_ns,
-        table.birth_heading_speed,
-        table.birth_known,
-        table.birth_unknown,
-        joined.mean,
-        joined.covariance,
-        joined.label,
-        joined.auxiliary,
-        joined.born_ns,
+    weight = np.concatenate((poisson.weight, table["adaptive_birth_rate"][measurements.label]))
+    kept, born = np.arange(len(poisson)), np.arange(measurements.score.shape[0])
+    return Poissons(
+        *with_births(
+            PoissonArrays(*columns_of_rows(poisson)), kept, born, weight, measurements, stamp_ns, table.classes
+        )
     )
-    return joined
-
-
-@kernel
-def select_undetected(
-    weight: Array,
-    p_d: Array,
-    label: Index,
-    born_ns: Index,
-    n_predicted: int,
-    component: Index,
-    stamp_ns: int,
-    period: float,
-    poisson_steps: Index,
-    adaptive: bool,
-    first_kind: Index,
-    association: Array,
-    measured_label: Index,
-    birth_rate: Array,
-    chosen: Index,
-    weight_out: Array,
-) -> tuple[int, int]:
-    """Write the components that stay, behind them the measurements of lambda_b, and the weights of both.
-
-    Returns:
-        How many components stay, and how many there are with those that are born.
-    """
-    old = select_components(
-        weight, p_d, label, born_ns, n_predicted, component, stamp_ns, period, poisson_steps, chosen, weight_out
-    )
-    if not adaptive:
-        return old, old
-    born = select_births(first_kind, association, measured_label, birth_rate, chosen[old:], weight_out[old:])
-    return old, old + born
-
-
-@kernel
-def select_components(
-    weight: Array,
-    p_d: Array,
-    label: Index,
-    born_ns: Index,
-    n_predicted: int,
-    component: Index,
-    stamp_ns: int,
-    period: float,
-    poisson_steps: Index,
-    kept: Index,
-    weight_out: Array,
-) -> int:
-    """Write the rows that stay and their weights ``mu_+ (1 - p_d)`` (eq. PPP Update); return how many."""
-    marked = np.zeros(weight.shape[0], np.bool_)
-    for j in component:
-        marked[j] = j < n_predicted
-    count = 0
-    for j in range(weight.shape[0]):
-        if not marked[j] and whole_periods(born_ns[j], stamp_ns, period) <= poisson_steps[label[j]]:
-            kept[count], weight_out[count] = j, weight[j] * (1.0 - p_d[j])
-            count += 1
-    return count
-
-
-@kernel
-def select_births(
-    first_kind: Index, association: Array, label: Index, birth_rate: Array, rows: Index, weight: Array
-) -> int:
-    """Write the measurements of lambda_b and their weights ``mu_ab (1 - p_a)`` (eq. HABM); return how many they are."""
-    count = 0
-    for m in range(first_kind.shape[0]):
-        born = birth_rate[label[m]] * (1.0 - association[m])
-        if first_kind[m] == CLUTTER and born > 0.0:
-            rows[count], weight[count] = m, born
-            count += 1
-    return count
-
-
-@kernel
-def fill_components(
-    chosen: Index,
-    old: int,
-    mean: Array,
-    covariance: Array,
-    label: Index,
-    auxiliary: Array,
-    born_ns: Index,
-    position: Array,
-    yaw: Array,
-    velocity: Array,
-    measured_label: Index,
-    measured_auxiliary: Array,
-    stamp_ns: int,
-    heading_speed: Array,
-    known: Array,
-    unknown: Array,
-    mean_out: Array,
-    covariance_out: Array,
-    label_out: Index,
-    auxiliary_out: Array,
-    born_ns_out: Index,
-) -> None:
-    """Copy the `old` components that `chosen` has in front, and put behind them those of the measurements behind."""
-    for k in range(old):
-        j = chosen[k]
-        copy_state(mean, covariance, j, mean_out, covariance_out, k)
-        for s in range(4):
-            auxiliary_out[k, s] = auxiliary[j, s]
-        label_out[k], born_ns_out[k] = label[j], born_ns[j]
-    count = label_out.shape[0]
-    birth_states(
-        chosen[old:count],
-        position,
-        yaw,
-        velocity,
-        measured_label,
-        heading_speed,
-        known,
-        unknown,
-        mean_out[old:],
-        covariance_out[old:],
-    )
-    for k in range(old, count):
-        m = chosen[k]
-        for s in range(4):
-            auxiliary_out[k, s] = measured_auxiliary[m, s]
-        label_out[k], born_ns_out[k] = measured_label[m], stamp_ns

@@ -22,58 +22,18 @@ from optipmb.position_noise import PLAIN
 from optipmb.prune import NEW
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
-    from optipmb.density import Bernoullis
     from optipmb.preprocess import Measurements
-    from optipmb.prune import Survivors
-    from optipmb.table import ClassTable
+    from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
 
 MEASURED = 5
 """Rows of z_M with a velocity; three without."""
-
-
-def update_states(
-    survivors: Survivors,
-    bernoulli: Bernoullis,
-    measurements: Measurements,
-    table: ClassTable,
-    mean_out: Array,
-    covariance_out: Array,
-) -> int:
-    """Update the known objects of the posterior with their measurements; missed ones stay as predicted.
-
-    Args:
-        survivors: which objects, and the measurement of each.
-        bernoulli: predicted objects.
-        measurements: Z_k.
-        table: parameters as columns.
-        mean_out: (K, 6) receives the means of the known objects; rows of new ones are left as they are.
-        covariance_out: (K, 6, 6) receives their covariances, likewise.
-
-    Returns:
-        How many covariances had to be repaired.
-    """
-    repaired: int = ukf_updates(
-        survivors.row,
-        survivors.measurement,
-        bernoulli.mean,
-        bernoulli.covariance,
-        measurements.position,
-        measurements.velocity,
-        measurements.yaw,
-        measurements.label,
-        table.noise_position,
-        table.noise_velocity,
-        table.noise_heading,
-        table.linearisations,
-        mean_out,
-        covariance_out,
-    )
-    return repaired
 
 
 @kernel
@@ -95,14 +55,8 @@ def ukf_updates(
     measurement: Index,
     mean: Array,
     covariance: Array,
-    position: Array,
-    velocity: Array,
-    yaw: Array,
-    label: Index,
-    noise_position: Array,
-    noise_velocity: Array,
-    noise_heading: Array,
-    linearisations: Index,
+    measurements: Measurements,
+    classes: Sequence[ClassRow],
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
@@ -113,20 +67,15 @@ def ukf_updates(
         measurement: (K,) index of the associated measurement, or negative.
         mean: (N, 6) predicted means.
         covariance: (N, 6, 6) predicted covariances.
-        position: (M, 2) z_xy, or (M, 5) with rho of `optipmb.position_noise`.
-        velocity: (M, 2) z_v.
-        yaw: (M,) z_phi.
-        label: (M,) z_c.
-        noise_position: (C,) standard deviations of z_x and z_y where rho is I.
-        noise_velocity: (C,) of z_vx and z_vy.
-        noise_heading: (C,) of z_phi.
-        linearisations: (C,) how often measured velocities are linearised; zero for the UKF.
+        measurements: Z_k.
+        classes: (C,) parameters: R, and `linearisations`, zero for the UKF.
         mean_out: (K, 6) receives the posterior means.
         covariance_out: (K, 6, 6) receives the posterior covariances.
 
     Returns:
         How many covariances had to be repaired.
     """
+    position, velocity = measurements.position, measurements.velocity
     repaired = 0
     z = np.empty(MEASURED)
     sigma = np.empty(MEASURED + 1)
@@ -139,20 +88,20 @@ def ukf_updates(
         if m < 0:
             copy_state(mean, covariance, n, mean_out, covariance_out, k)
             continue
-        c = label[m]
-        z[0], z[1], z[4] = position[m, 0], position[m, 1], yaw[m]
+        own = classes[measurements.label[m]]
+        z[0], z[1], z[4] = position[m, 0], position[m, 1], measurements.yaw[m]
         z[2], z[3] = velocity[m, 0], velocity[m, 1]
-        sigma[0] = sigma[1] = noise_position[c]
+        sigma[0] = sigma[1] = own.noise_position
         sigma[MEASURED] = 0.0
         if own_noise:
-            variance = noise_position[c] * noise_position[c]
+            variance = own.noise_position * own.noise_position
             sigma[0], sigma[1] = math.sqrt(variance * position[m, 2]), math.sqrt(variance * position[m, 4])
             sigma[MEASURED] = variance * position[m, 3]
-        sigma[2] = sigma[3] = noise_velocity[c]
-        sigma[4] = noise_heading[c]
-        if linearisations[c] > 0 and not (math.isnan(z[2]) or math.isnan(z[3])):
+        sigma[2] = sigma[3] = own.noise_velocity
+        sigma[4] = own.noise_heading
+        if own.linearisations > 0 and not (math.isnan(z[2]) or math.isnan(z[3])):
             linearised_update(
-                mean[n], covariance[n], z, sigma, linearisations[c], buffers, mean_out[k], covariance_out[k]
+                mean[n], covariance[n], z, sigma, own.linearisations, buffers, mean_out[k], covariance_out[k]
             )
         elif ukf_update(mean[n], covariance[n], z, sigma, buffers, mean_out[k], covariance_out[k]) > 0:
             repaired += 1

@@ -83,7 +83,7 @@ class Smoother:
             self._table,
         )
         confidence = np.array([sign_probability(h) for h in odds[told].tolist()])
-        confidence[self._table.sign_memory[extracted.label] == 0.0] = 1.0
+        confidence[self._table["sign_memory"][extracted.label] == 0.0] = 1.0
         covariance[told] += self._lasting(extracted.label, evidence, mean[told, PHI])
         covariance[told, PHI, PHI] += [doubt(p) for p in confidence.tolist()]
         start = 0
@@ -94,21 +94,8 @@ class Smoother:
 
     def _lasting(self, label: Ints, evidence: Floats, yaw: Floats) -> Floats:
         """Return what the calibration adds to the covariances (N, 6, 6) of tracks with these headings (N,)."""
-        table, lasting = self._table, np.zeros((len(label), STATE, STATE))
-        calibrate_rows(
-            label,
-            evidence,
-            yaw,
-            table.knots,
-            table.knot_evidence,
-            table.knot_existence,
-            table.knot_along,
-            table.knot_across,
-            table.score_of_evidence,
-            np.empty(len(label)),
-            np.empty(len(label)),
-            lasting,
-        )
+        lasting, untold = np.zeros((len(label), STATE, STATE)), np.empty((2, len(label)))
+        calibrate_rows(label, evidence, yaw, self._table.classes, untold[0], untold[1], lasting)
         return lasting
 
 
@@ -171,18 +158,8 @@ def _predictions(
     root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
     predicted, spread, cross = np.empty_like(mean), np.empty_like(covariance), np.empty_like(covariance)
     for row, c in enumerate(label.tolist()):
-        predict_state(
-            mean[row],
-            covariance[row],
-            dt[row],
-            table.process_noise[c],
-            table.acceleration_time[c],
-            table.constant_velocity[c],
-            root,
-            points,
-            predicted[row],
-            spread[row],
-        )
+        own = table.classes[c]
+        predict_state(mean[row], covariance[row], dt[row], own, root, points, predicted[row], spread[row])
         # The deviations X - m_k are SPREAD times the columns of the root, once plus and once minus.
         cross[row, ORDER] = root @ (points[0::2] - points[1::2]) * (SPREAD * WEIGHT)
     gain = np.linalg.solve(spread, cross.transpose(0, 2, 1)).transpose(0, 2, 1)

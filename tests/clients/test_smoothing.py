@@ -40,7 +40,7 @@ def test_states_are_smoothed_as_the_article_has_it(*, turned: bool) -> None:
     root = rng.normal(0.0, 0.2, (8, 3, 6, 6)) + 0.3 * np.eye(6)
     covariance = root @ root.transpose(0, 1, 3, 2)
     mean = starts + rng.normal(0.0, 0.1, (8, 3, 6)) + 0.6 * np.arange(8)[:, None, None] * [-1.0, 2.0, 0, 0, 0, 0]
-    noise, tau = np.diag(table.process_noise[0] ** 2), float(table.acceleration_time[0])
+    noise, tau = np.diag(table["process_noise"][0] ** 2), float(table["acceleration_time"][0])
     expected = [plain.smooth(mean[:, k], covariance[:, k], times * 1e-9, noise, tau) for k in range(3)]
     states, spreads = mean.reshape(-1, 6).copy(), covariance.reshape(-1, 6, 6).copy()
     odds = np.ones(24)

@@ -16,7 +16,7 @@ MODULES = {path.stem: ast.parse(path.read_text(encoding="utf-8")) for path in so
 ALLOWED = {
     "__future__", "collections", "contextlib", "dataclasses", "difflib", "functools", "hashlib", "importlib",
     "itertools", "math", "numba", "numpy", "operator", "optipmb", "pathlib", "pydantic", "pydantic_core", "re", "sys",
-    "tomllib", "typing",
+    "tomllib", "types", "typing",
 }  # fmt: skip
 EXCEPTIONS = {
     "compiled": {"logging"},  # to say why a first frame takes a minute

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from class_rows import class_rows
 from scenes import boxes, random_parameters
 
 import optipmb
@@ -39,8 +40,8 @@ def test_confirmation_has_hysteresis(seed: int) -> None:
     rng = np.random.default_rng(seed)
     label, rows, existence = rng.integers(0, 2, 30), np.flatnonzero(rng.random(30) < 0.6), rng.uniform(0, 1, 30)
     before, upper, lower = rng.random(30) < 0.5, np.array([0.5, 0.8]), np.array([0.2, 0.8])
-    found, told = before.copy(), np.empty(rows.size, np.bool_)
-    confirm(rows, label, existence[: rows.size], upper, lower, found, told)
+    found, classes = before.copy(), class_rows(2, confirm_from=upper, confirm_until=lower)
+    told = confirm(rows, label[rows], existence[: rows.size], classes, found)
     wanted = existence[: rows.size] >= np.where(before, lower[label], upper[label])[rows]
     np.testing.assert_array_equal(told, wanted)
     np.testing.assert_array_equal(found[rows], wanted)

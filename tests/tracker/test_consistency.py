@@ -23,21 +23,23 @@ def nees(label: str, missed: float, linearisations: int, seed: int = 0) -> float
     parameters = optipmb.load_profile("nuscenes-paper")
     table, c, dt = ClassTable.of(parameters), parameters.labels.index(label), parameters.nominal_period
     rng = np.random.default_rng(seed)
-    drift = table.process_noise[c]
-    spread = [table.noise_position[c]] * 2 + [table.noise_velocity[c]] * 2 + [table.noise_heading[c]]
+    own: Any = table.classes[c]
+    still, drift = own.copy(), own["process_noise"]
+    still["process_noise"] = 1e-9 * drift
+    spread = [own["noise_position"]] * 2 + [own["noise_velocity"]] * 2 + [own["noise_heading"]]
     sigma = np.array([*spread, 0.0])
-    motion: Any = table.acceleration_time[c], table.constant_velocity[c], np.empty((6, 6)), np.empty((12, 6))
+    buffers = np.empty((6, 6)), np.empty((12, 6))
     found = []
     for _ in range(DRIVES):
         mean = np.array([0.0, 0.0, rng.uniform(0, 1.5 if label == "pedestrian" else 12), rng.uniform(-3, 3), 0, 0])
-        covariance = np.diag(table.birth_known[c] ** 2)
-        x = mean + table.birth_known[c] * rng.normal(size=6)
+        covariance = np.diag(own["birth_known"] ** 2)
+        x = mean + own["birth_known"] * rng.normal(size=6)
         for k in range(FRAMES):
             after, spoiled = np.empty(6), np.empty((6, 6))
-            predict_state(x, 1e-12 * np.eye(6), dt, 1e-9 * drift, *motion, after, spoiled)
+            predict_state(x, 1e-12 * np.eye(6), dt, still, *buffers, after, spoiled)
             x = after + drift * math.sqrt(dt) * rng.normal(size=6)
             m, p = np.empty(6), np.empty((6, 6))
-            predict_state(mean, covariance, dt, drift, *motion, m, p)
+            predict_state(mean, covariance, dt, own, *buffers, m, p)
             mean, covariance = m, p
             if rng.random() >= missed:
                 z = textbook.measure(x, with_velocity=True) + sigma[:5] * rng.normal(size=5)

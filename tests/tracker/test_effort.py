@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from class_rows import class_rows
 
 import optipmb
 from optipmb.effort import count_pairs
@@ -38,9 +39,13 @@ def test_pairs_are_counted_up_to_a_limit(seed: int) -> None:
     distance = np.linalg.norm(center[:, None] - position[None], axis=2)
     pairs = int(((distance <= gate[label][:, None]) & (label[:, None] == measured[None])).sum())
     assert pairs > 20
-    assert count_pairs(center, label, gate[label], position, measured, 2, pairs) == pairs
-    assert count_pairs(center, label, gate[label], position, measured, 2, pairs - 1) == pairs
-    assert count_pairs(center, label, gate[label], position, measured, 2, 7) == 8
+    given = center, label, gate[label], position, measured
+    assert count_pairs(*given, np.zeros(50), 2, pairs) == pairs
+    assert count_pairs(*given, np.zeros(50), 2, pairs - 1) == pairs
+    assert count_pairs(*given, np.zeros(50), 2, 7) == 8
+    widening = rng.choice([0.0, 16.0], 50)
+    within = distance**2 <= gate[label][:, None] ** 2 + widening
+    assert count_pairs(*given, widening, 2, 2000) == (within & (label[:, None] == measured[None])).sum() > pairs
 
 
 def test_a_crowd_beyond_the_bound_is_refused_before_it_costs_anything() -> None:
@@ -67,6 +72,6 @@ def test_suppression_gives_up_at_its_bound() -> None:
     """Long thin boxes across each other overlap too little to suppress one another."""
     angles = np.linspace(0, 3, 30)
     star = np.c_[np.zeros((30, 2)), np.full(30, 20.0), np.full(30, 0.05), angles]
-    label, threshold = np.zeros(30, np.int64), np.array([0.5])
-    assert non_maximum_suppression(star, label, threshold, label[:1], 30 * 29 // 2).all()
-    assert non_maximum_suppression(star, label, threshold, label[:1], 30 * 29 // 2 - 1).shape == (0,)
+    label, classes = np.zeros(30, np.int64), class_rows(1, nms_iou=0.5)
+    assert non_maximum_suppression(star, label, classes, 30 * 29 // 2).all()
+    assert non_maximum_suppression(star, label, classes, 30 * 29 // 2 - 1).shape == (0,)

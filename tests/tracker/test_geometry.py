@@ -7,6 +7,7 @@ import math
 import numpy as np
 import oracle_formulas as textbook
 import pytest
+from class_rows import class_rows
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -107,7 +108,7 @@ def test_suppression_is_the_greedy_one_per_group(seed: int, *, mixed: bool, grou
         rivals = [k for k in wanted if group[label[k]] == group[label[i]]]
         if all(textbook.iou(boxes[i], boxes[k]) <= thresholds[label[i]] for k in rivals):
             wanted.append(i)
-    found = non_maximum_suppression(boxes, label, thresholds, np.array(group))
+    found = non_maximum_suppression(boxes, label, class_rows(3, nms_iou=thresholds, group=group))
     np.testing.assert_array_equal(np.flatnonzero(found), wanted)
     assert 0 < len(wanted) < 60
 
@@ -115,15 +116,15 @@ def test_suppression_is_the_greedy_one_per_group(seed: int, *, mixed: bool, grou
 def test_nothing_to_suppress() -> None:
     """No boxes, no result; one box stays."""
     one = np.array([[0.0, 0, 4, 2, 0]])
-    label, thresholds = np.zeros(1, np.int64), np.array([0.1])
-    assert non_maximum_suppression(one[:0], label[:0], thresholds, label).shape == (0,)
-    np.testing.assert_array_equal(non_maximum_suppression(one, label, thresholds, label), [True])
+    label, classes = np.zeros(1, np.int64), class_rows(1, nms_iou=0.1)
+    assert non_maximum_suppression(one[:0], label[:0], classes).shape == (0,)
+    np.testing.assert_array_equal(non_maximum_suppression(one, label, classes), [True])
 
 
 def test_what_was_suppressed_suppresses_nothing() -> None:
     """A chain of boxes, each overlapping the next: the first and the third stay."""
     boxes = np.array([[0.0, 0, 4, 2, 0], [2.5, 0, 4, 2, 0], [5.0, 0, 4, 2, 0]])
-    keep = non_maximum_suppression(boxes, np.zeros(3, np.int64), np.array([0.1]), np.zeros(1, np.int64))
+    keep = non_maximum_suppression(boxes, np.zeros(3, np.int64), class_rows(1, nms_iou=0.1))
     np.testing.assert_array_equal(keep, [True, False, True])
 
 

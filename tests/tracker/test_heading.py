@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from class_rows import class_row
 from numpy.typing import NDArray
 from scenes import boxes
 
@@ -171,7 +172,8 @@ def test_a_turned_state_describes_the_same_motion(seed: int) -> None:
 
     def predicted(m: Array, p: Array) -> tuple[Array, Array]:
         out, spread = np.empty(6), np.empty((6, 6))
-        predict_state(m, p, 0.5, noise, math.inf, False, np.empty((6, 6)), np.empty((12, 6)), out, spread)
+        own = class_row(process_noise=noise, acceleration_time=math.inf)
+        predict_state(m, p, 0.5, own, np.empty((6, 6)), np.empty((12, 6)), out, spread)
         return out, spread
 
     straight = predicted(mean, covariance)
@@ -186,5 +188,5 @@ def test_a_turned_state_describes_the_same_motion(seed: int) -> None:
 def test_without_parameters_the_sign_stays() -> None:
     """With zeros for lambda, b_d and b_v the log odds stay zero and no state is turned."""
     mean, covariance = np.array([0.0, 0.0, -9.0, 0.0, 0.0, 0.0]), 0.01 * np.eye(6)
-    assert follow_sign(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.9, math.pi, mean, covariance) == 0.0
+    assert follow_sign(0.0, 0.0, class_row(), 0.9, math.pi, mean, covariance) == 0.0
     assert mean[3] == 0.0

@@ -8,14 +8,16 @@ from itertools import permutations
 import numpy as np
 import oracle_formulas as textbook
 import pytest
+from class_rows import class_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from optipmb.association import UNASSIGNED, associate
-from optipmb.gating import FEW, gate, gate_radii, pairs_of_few, pairs_of_many
+from optipmb.association import UNASSIGNED
+from optipmb.association import associate as associate_pairs
+from optipmb.gating import DEVIATIONS_2, FEW, gate, gate_radii, gate_widening, pairs_of_few, pairs_of_many
 from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN, Hypotheses, detection_costs, first_detections
 
 Array = NDArray[np.float64]
@@ -41,26 +43,50 @@ def test_the_gate_holds_every_pair_of_a_class_within_the_distance(seed: int, cou
     position[:3] = position[:1]  # several at one place
     distance, noise = np.array([1.5, 5.0]), np.array([0.2, 0.7])
     radius = distance[label] * rng.uniform(0.5, 1.5, count)
-    found = gate(mean, covariance, label, radius, position, measured, noise)
-    wanted = [
-        (n, m)
-        for n in range(count)
-        for m in range(measurements)
-        if label[n] == measured[m] and math.dist(mean[n, :2], position[m]) <= radius[n]
-    ]
+    radius[::9] = -1.0  # closed
+    classes = class_rows(2, noise_position=noise)
+    found = gate(mean, covariance, label, radius, position, measured, classes)
+
+    def pairs(widening: Array) -> list[tuple[int, int]]:
+        return [
+            (n, m)
+            for n in range(count)
+            for m in range(measurements)
+            if label[n] == measured[m]
+            and radius[n] >= 0.0
+            and math.dist(mean[n, :2], position[m]) <= math.sqrt(radius[n] ** 2 + widening[m])
+        ]
+
+    wanted = pairs(np.zeros(measurements))
     assert list(zip(found[0].tolist(), found[1].tolist(), strict=True)) == wanted
     likelihood = [textbook.log_likelihood(position[m], mean[n], covariance[n], noise[label[n]]) for n, m in wanted]
     np.testing.assert_allclose(found[2], likelihood, rtol=1e-10, atol=1e-10)
     for search in (pairs_of_few, pairs_of_many):
-        row, measurement = search(mean, label, radius, position, measured, 2)
-        assert list(zip(row.tolist(), measurement.tolist(), strict=True)) == wanted
+        for widening in (np.zeros(measurements), rng.choice([0.0, 1.0, 9.0], measurements)):
+            row, measurement = search(mean, label, radius, position, measured, widening, 2)
+            assert list(zip(row.tolist(), measurement.tolist(), strict=True)) == pairs(widening)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_gate_widens_by_what_r_is_above_that_of_the_class(seed: int) -> None:
+    """`chi^2 max(0, lambda_1(R_m) - sigma^2)`, with numpy's eigenvalues; nothing without covariances."""
+    rng = np.random.default_rng(seed)
+    sigma, label, root = np.array([0.2, 0.7]), rng.integers(0, 2, 30), rng.normal(0, 0.5, (30, 2, 2))
+    own = root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(2)
+    rho = own[:, [0, 0, 1], [0, 1, 1]] / sigma[label, None] ** 2
+    classes = class_rows(2, noise_position=sigma)
+    found = gate_widening(np.column_stack([rng.normal(0, 9, (30, 2)), rho]), label, classes)
+    beyond = np.linalg.eigvalsh(own)[:, 1] - sigma[label] ** 2
+    assert 0 < (beyond < 0).sum() < 30
+    np.testing.assert_allclose(found, DEVIATIONS_2 * np.maximum(beyond, 0.0), rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(gate_widening(np.zeros((30, 2)), label, classes), 0.0)
 
 
 def test_the_edge_of_the_gate_is_inside() -> None:
     """A measurement at exactly the gating distance passes, on all sides; one float farther does not."""
     position = np.array([[3.0, 0], [-3, 0], [0, 3], [0, -3], [np.nextafter(3, 4), 0], [-np.nextafter(3, 4), 0]])
     objects = np.zeros((1, 6)), np.eye(6)[None], np.zeros(1, np.int64), np.array([3.0])
-    _, measurement, _ = gate(*objects, position, np.zeros(6, np.int64), np.array([1.0]))
+    _, measurement, _ = gate(*objects, position, np.zeros(6, np.int64), class_rows(1, noise_position=[1.0]))
     np.testing.assert_array_equal(measurement, [0, 1, 2, 3])
 
 
@@ -94,20 +120,14 @@ def test_costs_stay_finite_where_likelihoods_vanish() -> None:
 def test_each_kind_of_first_detection_has_its_formula() -> None:
     """Poisson components in the gate, a low score without, a high score without."""
     log_e = np.log([0.2, 0.3, 0.05])
-    clutter, birth = np.array([np.nan, 0.01]), np.array([np.nan, 0.002])
-    kind, cost, existence = np.full(4, -1), np.empty(4), np.empty(4)
-    table = clutter, birth, np.array([np.nan, 0.5])
-    first_detections(
+    clutter, birth = [np.nan, 0.01], [np.nan, 0.002]
+    kind, cost, existence = first_detections(
         np.array([0, 0, 3]),
         log_e,
         np.array([0.9, 0.1, 0.5, 0.1]),
         np.array([0, 0, 0.25, 1.0]),
         np.ones(4, np.int64),
-        *table,
-        np.zeros(2, np.bool_),
-        kind,
-        cost,
-        existence,
+        class_rows(2, clutter_intensity=clutter, birth_intensity=birth, birth_score=[np.nan, 0.5]),
     )
     np.testing.assert_array_equal(kind, [FROM_POISSON, CLUTTER, NEWBORN, FROM_POISSON])
     wanted = [-math.log(0.5 + 0.01), -math.log(0.01), -math.log(0.002 * 0.75 + 0.01), -math.log(0.05 + 0.01)]
@@ -118,11 +138,11 @@ def test_each_kind_of_first_detection_has_its_formula() -> None:
 @pytest.mark.parametrize("over_clutter", [False, True])
 def test_a_component_worse_than_clutter_takes_no_birth_from_a_high_score(*, over_clutter: bool) -> None:
     """With e below lambda_c a high score is newborn where the profile says so; a low score stays with its component."""
-    kind, cost, existence = np.empty(3, np.int64), np.empty(3), np.empty(3)
     log_e = np.log([0.001, 0.001, 0.1])
     measured = np.array([0.9, 0.1, 0.9]), np.zeros(3), np.zeros(3, np.int64)
-    table = np.array([0.01]), np.array([0.002]), np.array([0.5]), np.array([over_clutter])
-    first_detections(np.arange(3), log_e, *measured, *table, kind, cost, existence)
+    classes = class_rows(1, clutter_intensity=0.01, birth_intensity=0.002, birth_score=0.5)
+    classes["birth_over_clutter"] = over_clutter
+    kind, _, existence = first_detections(np.arange(3), log_e, *measured, classes)
     np.testing.assert_array_equal(kind, [NEWBORN if over_clutter else FROM_POISSON, FROM_POISSON, FROM_POISSON])
     r = 1.0 if over_clutter else 0.001 / 0.011
     np.testing.assert_allclose(existence, [r, 0.001 / 0.011, 0.1 / 0.11])
@@ -134,7 +154,7 @@ def test_gates_widen_with_time_and_with_unknown_speed(dt: float) -> None:
     covariance = np.zeros((4, 6, 6))
     covariance[:, 2, 2] = [0.0, 100.0, np.nan, np.inf]
     label, eta, growth, k = np.array([0, 0, 0, 1]), np.array([4.0, 1.0]), np.array([0.5, 0.0]), np.array([3.0, 0.0])
-    found = gate_radii(covariance, label, dt, 0.1, eta, growth, k)
+    found = gate_radii(covariance, label, dt, 0.1, class_rows(2, gate=eta, gate_growth=growth, gate_deviations=k))
     wanted = eta * (1 + growth * max(0.0, dt / 0.1 - 1))
     np.testing.assert_allclose(found, [wanted[0], max(wanted[0], 30.0 * dt), wanted[0], wanted[1]])
 
@@ -144,9 +164,8 @@ def test_gates_widen_with_time_and_with_unknown_speed(dt: float) -> None:
 def test_first_detections_hold_over_all_magnitudes(log_e: list[float]) -> None:
     """E is summed as logarithms: no overflow, no underflow, r in [0, 1]."""
     arguments = np.zeros(len(log_e), np.int64), np.array(log_e), np.array([0.5]), np.zeros(1)
-    table = np.array([1e-3]), np.array([1e-4]), np.array([0.5]), np.zeros(1, np.bool_)
-    kind, cost, existence = np.empty(1, np.int64), np.empty(1), np.empty(1)
-    first_detections(*arguments, np.zeros(1, np.int64), *table, kind, cost, existence)
+    classes = class_rows(1, clutter_intensity=1e-3, birth_intensity=1e-4, birth_score=0.5)
+    _, cost, existence = first_detections(*arguments, np.zeros(1, np.int64), classes)
     total = np.logaddexp.reduce([*log_e, math.log(1e-3)])
     assert cost[0] == pytest.approx(-total, rel=1e-10, abs=1e-10)
     assert existence[0] == pytest.approx(math.exp(np.logaddexp.reduce(log_e) - total), rel=1e-9, abs=1e-300)
@@ -168,6 +187,11 @@ def hypotheses(cost: Array, first: Array) -> Hypotheses:
         np.zeros(first.size),
         NOTHING,
     )
+
+
+def associate(given: Hypotheses, count: int) -> NDArray[np.int64]:
+    """The best global hypothesis, of the columns that count."""
+    return associate_pairs(given.row, given.measurement, given.detection_cost, given.first_cost, count)
 
 
 def total(cost: Array, first: Array, assigned: NDArray[np.int64]) -> float:

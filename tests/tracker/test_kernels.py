@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import oracle_formulas as textbook
 import pytest
+from class_rows import class_rows
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from optipmb.association import UNASSIGNED
-from optipmb.birth import birth_states, first_states, moment_match
+from optipmb.birth import birth_states, first_detected_states, moment_match
 from optipmb.calibration import SURE, calibrate_rows
-from optipmb.density import whole_periods
-from optipmb.extract import read_tracks, select_tracks
+from optipmb.density import BernoulliArrays, Bernoullis, PoissonArrays, Poissons, columns_of_rows, whole_periods
+from optipmb.extract import extract_tracks, select_tracks
 from optipmb.geometry import box_iou, iou_exceeds
-from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN
-from optipmb.lightweight import update_light_weight
+from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN, Hypotheses
+from optipmb.lightweight import light_weight_filter
 from optipmb.motion import predict_state
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
 from optipmb.predict import predict_components
-from optipmb.preprocess import select, sort_canonically
-from optipmb.prune import NEW, select_objects
-from optipmb.undetected import fill_components, select_births, select_components, select_undetected
+from optipmb.preprocess import Measurements, gather, select, sort_canonically
+from optipmb.prune import NEW, Survivors, surviving_objects
+from optipmb.undetected import update_undetected, with_births
 from optipmb.update import ukf_updates
 
 Array = NDArray[np.float64]
@@ -42,6 +44,37 @@ def stamps(rng: np.random.Generator, count: int) -> NDArray[np.int64]:
 def periods(since: NDArray[np.int64]) -> NDArray[np.int64]:
     """Whole periods to now, with numpy."""
     return np.floor((NOW - since) * 1e-9 / PERIOD + 0.5).astype(np.int64)
+
+
+def objects_of(**columns: Any) -> Any:
+    """Objects as kernels know them, of the columns that count."""
+    return BernoulliArrays(**dict(Bernoullis.empty().columns()) | columns)
+
+
+def components_of(**columns: Any) -> Any:
+    """Poisson components, likewise."""
+    return PoissonArrays(**dict(Poissons.empty().columns()) | columns)
+
+
+def hypotheses_of(**columns: Any) -> Hypotheses:
+    """Hypotheses, likewise."""
+    index, number = np.zeros(0, np.int64), np.zeros(0)
+    return Hypotheses(index, index, number, index, index, number, index, number, number, number)._replace(**columns)
+
+
+def random_measurements(rng: np.random.Generator, count: int) -> Measurements:
+    """Measurements of two classes, every third without a velocity."""
+    velocity = rng.normal(0, 3, (count, 2))
+    velocity[::3] = np.nan
+    return Measurements(
+        rng.normal(0, 3, (count, 2)),
+        rng.uniform(-3, 3, count),
+        velocity,
+        rng.uniform(1, 5, (count, 4)),
+        rng.uniform(0.1, 1, count),
+        rng.integers(0, 2, count),
+        np.arange(count),
+    )
 
 
 def test_periods_are_counted_to_the_nearest() -> None:
@@ -70,23 +103,15 @@ def test_only_scores_from_the_filter_on_are_chosen(seed: int) -> None:
     rng = np.random.default_rng(seed)
     score, label = rng.choice([0.2, 0.3, 0.5], 40), rng.integers(0, 2, 40)
     center = np.column_stack([np.arange(40) * 100.0, np.zeros((40, 2))])
-    chosen = np.full(40, -1)
     thresholds = np.array([0.3, 0.5])
-    above, kept = select(
-        center,
-        np.ones((40, 3)),
-        np.zeros(40),
-        score,
-        label,
-        np.arange(40),
-        thresholds,
-        np.array([0.1, 0.1]),
-        np.arange(2),
-        chosen,
-    )
+    classes = class_rows(2, score_filter=thresholds, nms_iou=0.1, group=[0, 1])
+    given = center, np.ones((40, 3)), np.zeros(40), np.zeros((40, 2)), score, label, np.arange(40)
+    above, chosen, columns = select(*given, 2, classes, 10**6)
     wanted = np.flatnonzero(score >= thresholds[label])
-    assert above == kept == wanted.size
-    np.testing.assert_array_equal(chosen[:kept], wanted[np.argsort(-score[wanted], kind="stable")])
+    assert above == wanted.size
+    np.testing.assert_array_equal(chosen, wanted[np.argsort(-score[wanted], kind="stable")])
+    for found, gathered in zip(columns, gather(chosen, *given, 2), strict=True):
+        np.testing.assert_array_equal(found, gathered)
 
 
 @COMPILING
@@ -139,29 +164,28 @@ def test_cheap_rejections_change_no_decision(a: Array, b: Array, threshold: floa
     assert overlap == 0.0 or iou_exceeds(a, b, np.nextafter(overlap, 0.0))
 
 
+@pytest.mark.parametrize("undetected", [True, False])
 @SEEDS
-def test_components_within_their_limit_are_predicted(seed: int) -> None:
+def test_components_within_their_limit_are_predicted(seed: int, *, undetected: bool) -> None:
     """The rows that numpy keeps, each predicted on its own, with p_s of its class."""
     rng = np.random.default_rng(seed)
     root = rng.normal(0, 0.5, (30, 6, 6))
     mean, covariance = rng.normal(0, 3, (30, 6)), root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6)
     label, weight, since = rng.integers(0, 2, 30), rng.uniform(0, 1, 30), stamps(rng, 30)
     limit, survival, noise = np.array([3, 6]), np.array([0.9, 0.99]), rng.uniform(0.1, 1, (2, 6))
-    tau, straight, before = np.array([np.inf, 0.5]), np.array([False, seed > 2]), NOW - 700_000_000
-    kept, out, spread, carried = np.empty(30, np.int64), np.empty((30, 6)), np.empty((30, 6, 6)), np.empty(30)
-    count, repaired = predict_components(
-        *(mean, covariance, label, weight, since, limit, survival, 0.2, before, NOW, PERIOD, noise, tau, straight),
-        *(kept, out, spread, carried),
-    )
+    before = NOW - 700_000_000
+    classes = class_rows(2, acceleration_time=[np.inf, 0.5], constant_velocity=[False, seed > 2], process_noise=noise)
+    classes["poisson_steps" if undetected else "max_misses"] = limit
+    given = mean, covariance, label, weight, since, before, undetected, survival, 0.2, NOW, PERIOD
+    kept, out, spread, carried, repaired = predict_components(*given, classes)
     wanted = np.flatnonzero((periods(since) - 1 <= limit[label]) | (since >= before))
     assert repaired == 0
-    np.testing.assert_array_equal(kept[:count], wanted)
-    np.testing.assert_array_equal(carried[:count], weight[wanted] * survival[label[wanted]])
+    np.testing.assert_array_equal(kept, wanted)
+    np.testing.assert_array_equal(carried, weight[wanted] * survival[label[wanted]])
     alone, alone_spread = np.empty(6), np.empty((6, 6))
     for k, n in enumerate(wanted):
         buffers = np.empty((6, 6)), np.empty((12, 6))
-        c = label[n]
-        predict_state(mean[n], covariance[n], 0.2, noise[c], tau[c], straight[c], *buffers, alone, alone_spread)
+        predict_state(mean[n], covariance[n], 0.2, classes[label[n]], *buffers, alone, alone_spread)
         np.testing.assert_array_equal(out[k], alone)
         np.testing.assert_array_equal(spread[k], alone_spread)
 
@@ -177,45 +201,20 @@ def test_objects_survive_by_existence_and_misses(seed: int) -> None:
     assigned[rng.permutation(n)[:10]] = rng.permutation(m)[:10]
     kind, first = rng.choice([FROM_POISSON, CLUTTER, NEWBORN], m), rng.uniform(0, 0.2, m)
     max_misses, floor = np.array([4, 12]), np.array([0.05, 0.1])
-    row, measurement, existence = np.empty(n + m, np.int64), np.empty(n + m, np.int64), np.empty(n + m)
-    count, known, hits = select_objects(
-        r,
-        seen,
-        label,
-        p_d,
-        assigned,
-        kind,
-        first,
-        measured,
-        NOW,
-        PERIOD,
-        max_misses,
-        floor,
-        row,
-        measurement,
-        existence,
+    objects = objects_of(existence=r, label=label)
+    hypotheses = hypotheses_of(first_kind=kind, first_existence=first)
+    classes = class_rows(2, max_misses=max_misses, min_existence=floor)
+    row, measurement, existence, known, hits = surviving_objects(
+        objects, p_d, assigned, hypotheses, measured, seen, NOW, PERIOD, classes
     )
     detected = assigned != UNASSIGNED
     posterior = np.where(detected, 1.0, r * (1 - p_d) / (1 - r + r * (1 - p_d)))
     alive = detected | ((posterior >= floor[label]) & (periods(seen) <= max_misses[label]))
     free = ~np.isin(np.arange(m), assigned) & (kind != CLUTTER) & (first >= floor[measured])
-    np.testing.assert_array_equal(row[:count], [*np.flatnonzero(alive), *[NEW] * free.sum()])
-    np.testing.assert_array_equal(measurement[:count], [*assigned[alive], *np.flatnonzero(free)])
-    np.testing.assert_array_equal(existence[:count], [*posterior[alive], *first[free]])
+    np.testing.assert_array_equal(row, [*np.flatnonzero(alive), *[NEW] * free.sum()])
+    np.testing.assert_array_equal(measurement, [*assigned[alive], *np.flatnonzero(free)])
+    np.testing.assert_array_equal(existence, [*posterior[alive], *first[free]])
     assert (known, hits) == (alive.sum(), detected.sum())
-
-
-@SEEDS
-def test_components_survive_unless_marked_or_old(seed: int) -> None:
-    """Those in no J^m (components of this very frame aside) and young enough, with weight mu (1 - p_d)."""
-    rng = np.random.default_rng(seed)
-    weight, p_d, label = rng.uniform(0, 2, 25), rng.uniform(0, 1, 25), rng.integers(0, 2, 25)
-    born, marked = stamps(rng, 25), rng.integers(0, 25, 8)
-    steps, kept, left = np.array([2, 9]), np.empty(25, np.int64), np.empty(25)
-    count = select_components(weight, p_d, label, born, 15, marked, NOW, PERIOD, steps, kept, left)
-    stays = (periods(born) <= steps[label]) & ~np.isin(np.arange(25), marked[marked < 15])
-    np.testing.assert_array_equal(kept[:count], np.flatnonzero(stays))
-    np.testing.assert_array_equal(left[:count], (weight * (1 - p_d))[stays])
 
 
 @SEEDS
@@ -233,13 +232,25 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     mean, root = rng.normal(0, 3, (6, 6)), rng.normal(0, 0.5, (6, 6, 6))
     covariance = root @ root.transpose(0, 2, 1)
     states, spreads = mean.copy(), covariance.copy()
-    out = [np.empty(6, np.int64), np.empty((6, 4)), *(np.empty(6, np.int64) for _ in range(3)), np.empty(6)]
-    weighed, facing, flags, shown = np.empty(6), np.empty(6), np.empty(6, np.bool_), np.empty(6, np.bool_)
     confirmed = rng.random(6) < 0.5
-    known = label, auxiliary, identity, born, seen, evidence, odds, extracted, confirmed
-    times = NOW, NOW - 150_000_000, PERIOD, memory, missed
-    given = (row, measurement, *known, 77, measured, boxes, score, yaw, *times, *sign.T.copy(), states, spreads)
-    update_light_weight(*given, *out, weighed, facing, flags, shown)
+    objects = objects_of(
+        label=label,
+        auxiliary=auxiliary,
+        id=identity,
+        born_ns=born,
+        seen_ns=seen,
+        evidence=evidence,
+        heading_odds=odds,
+        extracted=extracted,
+        confirmed=confirmed,
+    )
+    measurements = random_measurements(rng, 5)._replace(label=measured, auxiliary=boxes, score=score, yaw=yaw)
+    classes = class_rows(3, memory=memory, missed_evidence=missed)
+    for column, name in zip(sign.T, ("memory", "detection", "motion", "speed"), strict=True):
+        classes[f"sign_{name}"] = column
+    survivors = Survivors(row, measurement, np.ones(6), 4, 2)
+    given = survivors, states, spreads, objects, 77, measurements, NOW, NOW - 150_000_000, PERIOD, classes
+    *out, weighed, facing, flags, shown = light_weight_filter(*given)[3:]
     old, new = row >= 0, row == NEW
     m, hit = measurement, measurement >= 0
     np.testing.assert_array_equal(out[0], [*label[row[old]], *measured[m[new]]])
@@ -278,11 +289,12 @@ def test_tracks_are_selected_by_two_thresholds(seed: int, *, both: bool) -> None
     rng = np.random.default_rng(seed)
     r, seen, label, known = rng.uniform(0, 1, 50), stamps(rng, 50), rng.integers(0, 2, 50), rng.random(50) < 0.5
     first, second, misses = np.array([0.2, 0.4]), np.array([0.5, 0.8]), np.array([3, 8])
-    flags, rows = known.copy(), np.empty(50, np.int64)
-    count = select_tracks(r, seen, label, NOW, PERIOD, first, second, misses, both, flags, rows)
+    flags = known.copy()
+    classes = class_rows(2, extract_new=first, extract_known=second, extract_misses=misses)
+    rows = select_tracks(objects_of(existence=r, label=label, extracted=flags), seen, NOW, both, PERIOD, classes)
     again = (r >= second[label]) & (periods(seen) < misses[label])
     wanted = np.where(known & both, again, r >= first[label])
-    np.testing.assert_array_equal(rows[:count], np.flatnonzero(wanted))
+    np.testing.assert_array_equal(rows, np.flatnonzero(wanted))
     np.testing.assert_array_equal(flags, known | wanted)
 
 
@@ -292,28 +304,34 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
     rng = np.random.default_rng(0)
     mean, auxiliary, born, seen = rng.normal(0, 3, (9, 6)), rng.uniform(1, 5, (9, 4)), stamps(rng, 9), stamps(rng, 9)
     mean[:, 3] = [textbook.wrap(angle) for angle in mean[:, 3]]
-    rows, measurement, source = np.array([1, 4, 8]), np.arange(9) % 3 - 1, np.array([50, 60])
-    position, yaw = rng.normal(0, 3, (2, 2)), rng.uniform(-3, 3, 2)
+    rows, measurement = np.array([1, 4, 8]), np.arange(9) % 3 - 1
+    measured = random_measurements(rng, 2)._replace(source=np.array([50, 60]))
+    position, yaw, source = measured.position, measured.yaw, measured.source
     less = SimpleNamespace(position=0.1, heading=0.2)
     noise = SimpleNamespace(position=0.3, heading=0.3)
     left = [np.array([1 / (r**-2 - 0.3**-2), 0.0, 0.0, 1 / (r**-2 - 0.3**-2)]) for r in (0.1, 0.2)]
-    shapes = [(3, 3), (3, 3), (3,), (3,), (3, 2), (3,), (3,), (3,), (3,)]
-    out = [np.empty(shape) for shape in shapes]
-    detection = np.empty(3, np.int64)
     identity, label, r, score = np.arange(9) * 3, rng.integers(0, 4, 9), rng.uniform(0, 1, 9), rng.uniform(0, 1, 9)
     root = rng.normal(0, 1, (9, 6, 6))
     covariance = root @ root.transpose(0, 2, 1)
-    ids, labels, told = np.empty(3, np.int64), np.empty(3, np.int64), [np.empty(3), np.empty(3), np.empty((3, 6, 6))]
     evidence, odds, followed = rng.normal(0, 3, 9), rng.uniform(0, 3, 9), np.array([True, False, True, False])
-    known = identity, label, mean, covariance, r, score, auxiliary, born, seen, evidence, odds
-    bends = np.sort(rng.normal(0, 2, (4, 3)), axis=1)
-    curves = bends, rng.uniform(0, 1, (4, 3)), rng.uniform(0, 1, (4, 3)), rng.uniform(0, 1, (4, 3)), np.full(4, True)
-    knots = np.full(4, 3 if calibrated else 0)
-    given = *known, measurement, source, position, yaw, NOW, *left, followed, knots, *curves
     high, low = np.array([0.6, 0.7, 0.8, 0.9]), np.array([0.1, 0.2, 0.3, 0.4])
-    before, now = np.arange(9) % 2 == 0, np.empty(3, np.bool_)
+    classes = class_rows(4, sign_known=followed, score_of_evidence=1.0, confirm_from=high, confirm_until=low)
+    classes["reported_position"], classes["reported_heading"] = left
+    classes["knots"] = 3 if calibrated else 0
+    classes["knot_evidence"][:, :3] = np.sort(rng.normal(0, 2, (4, 3)), axis=1)
+    for name in ("existence", "along", "across"):
+        classes[f"knot_{name}"][:, :3] = rng.uniform(0, 1, (4, 3))
+    classes["extract_new"] = 2.0  # what was extracted before is again, and nothing else
+    classes["extract_misses"] = 1000
+    before, extracted = np.arange(9) % 2 == 0, np.isin(np.arange(9), rows)
     after = before.copy()
-    read_tracks(rows, *given, high, low, after, ids, labels, *out[:7], *told, *out[7:], detection, now)
+    objects = Bernoullis(
+        mean, covariance, r, label, auxiliary, identity, born, seen, score, evidence, odds, extracted, after
+    )
+    (ids, labels, center, size, heading_, facing_, velocity, rate, acceleration, *told, age, since, detection, now) = (
+        extract_tracks(columns_of_rows(objects), seen, measurement, tuple(measured), NOW, True, PERIOD, classes)
+    )
+    out = center, size, heading_, facing_, velocity, rate, acceleration, age, since
     wanted_now = told[0] >= np.where(before[rows], low[label[rows]], high[label[rows]])
     np.testing.assert_array_equal(now, wanted_now)
     np.testing.assert_array_equal(after, np.where(np.isin(np.arange(9), rows), after, before))
@@ -326,7 +344,7 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
         x[k], spread[k] = textbook.report(c, z, mean[n], covariance[n])
     x[:, 3] = [textbook.wrap(angle) for angle in x[:, 3]]
     wanted_told = [r[rows], score[rows], spread]
-    calibrate_rows(label[rows], evidence[rows], x[:, 3].copy(), knots, *curves, *wanted_told)
+    calibrate_rows(label[rows], evidence[rows], x[:, 3].copy(), classes, *wanted_told)
     facing = np.where(followed[label[rows]], 1 / (1 + np.exp(-odds[rows])), 1.0)
     wanted_told[2][:, 3, 3] += np.maximum(facing * (1 - facing) - 0.025 * 0.975, 0) * np.pi**2
     assert np.array_equal(wanted_told[0], r[rows]) != calibrated
@@ -359,21 +377,22 @@ def test_announced_objects_are_matched_mixtures(seed: int) -> None:
     log_e = rng.normal(-500, 2, pairs)
     root = rng.normal(0, 0.5, (count, 6, 6))
     mean, covariance = rng.normal(0, 3, (count, 6)), root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6)
-    measured = rng.normal(0, 3, (5, 2)), rng.normal(0, 3, (5, 2)), rng.normal(0, 1, 5), np.array([0, 0, 0, 1, 0])
-    noise = rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2), rng.uniform(0.1, 1, 2), np.array([0, 2])
+    measured = random_measurements(rng, 5)._replace(label=np.array([0, 0, 0, 1, 0]))
+    classes = class_rows(2, linearisations=[0, 2], birth_heading_speed=rng.uniform(0, 2, 2))
+    for name in ("noise_position", "noise_velocity", "noise_heading", "birth_known", "birth_unknown"):
+        classes[name] = rng.uniform(0.1, 1, classes[name].shape)
     out, spread = np.full((3, 6), np.nan), np.full((3, 6, 6), np.nan)
-    given = rows, kind, component, announced, log_e, mean, covariance
-    births = rng.uniform(0, 2, 2), rng.uniform(0.1, 1, (2, 6)), rng.uniform(0.1, 1, (2, 6))
-    assert first_states(*given, *measured, *births, *noise, out, spread) == 0
+    hypotheses = hypotheses_of(first_kind=kind, component=component, announced=announced, log_e=log_e)
+    components = components_of(mean=mean, covariance=covariance)
+    assert first_detected_states(rows, hypotheses, components, measured, classes, out, spread) == 0
     born, born_spread = np.empty((1, 6)), np.empty((1, 6, 6))
-    position, velocity, yaw, label = measured
-    birth_states(rows[1:2], position, yaw, velocity, label, *births, born, born_spread)
+    birth_states(rows[1:2], measured, classes, born, born_spread)
     np.testing.assert_array_equal(out[1], born[0])
     np.testing.assert_array_equal(spread[1], born_spread[0])
     for k, m in ((0, 0), (2, 3)):
         members = np.flatnonzero(announced == m)
         parts, spreads = np.empty((members.size, 6)), np.empty((members.size, 6, 6))
-        ukf_updates(component[members], announced[members], mean, covariance, *measured, *noise, parts, spreads)
+        ukf_updates(component[members], announced[members], mean, covariance, measured, classes, parts, spreads)
         weight = np.exp(log_e[members] - log_e[members].max())
         one, one_spread = np.empty((1, 6)), np.empty((1, 6, 6))
         moment_match(np.array([0, members.size]), weight / weight.sum(), parts, spreads, one, one_spread)
@@ -381,55 +400,59 @@ def test_announced_objects_are_matched_mixtures(seed: int) -> None:
         np.testing.assert_allclose(spread[k], one_spread[0], rtol=1e-12, atol=1e-12)
 
 
-@SEEDS
-def test_low_scores_are_born_with_what_association_leaves(seed: int) -> None:
-    """Clutter makes components of weight mu_ab (1 - p_a), unless that is zero."""
-    rng = np.random.default_rng(seed)
-    kind, association = rng.choice([FROM_POISSON, CLUTTER, NEWBORN], 20), rng.choice([0.0, 0.3, 1.0], 20)
-    label, rate = rng.integers(0, 2, 20), np.array([0.5, 2.0])
-    rows, weight = np.empty(20, np.int64), np.empty(20)
-    count = select_births(kind, association, label, rate, rows, weight)
-    wanted = np.flatnonzero((kind == CLUTTER) & (association < 1))
-    np.testing.assert_array_equal(rows[:count], wanted)
-    np.testing.assert_array_equal(weight[:count], rate[label[wanted]] * (1 - association[wanted]))
-
-
 @pytest.mark.parametrize("adaptive", [True, False])
 @SEEDS
 def test_what_is_undetected_stays_or_is_born(seed: int, *, adaptive: bool) -> None:
-    """The components that stay and behind them, under HABM, the births, each as the kernel of its own selects them."""
+    """Components in no J^m and young enough, weight mu (1 - p_d); with HABM clutter too, weight mu_ab (1 - p_a)."""
     rng = np.random.default_rng(seed)
-    weight, p_d, label, born = rng.uniform(0, 2, 9), rng.uniform(0, 1, 9), rng.integers(0, 2, 9), stamps(rng, 9)
-    old = weight, p_d, label, born, 6, rng.integers(0, 9, 4), NOW, PERIOD, np.array([2, 9])
-    kind, association = rng.choice([FROM_POISSON, CLUTTER, NEWBORN], 7), rng.choice([0.0, 0.3, 1.0], 7)
-    new = kind, association, rng.integers(0, 2, 7), np.array([0.5, 2.0])
-    chosen, carried = np.empty(16, np.int64), np.empty(16)
-    stay, count = select_undetected(*old, adaptive, *new, chosen, carried)
-    kept, left, rows, fresh = np.empty(9, np.int64), np.empty(9), np.empty(7, np.int64), np.empty(7)
-    assert stay == select_components(*old, kept, left)
-    assert count - stay == (select_births(*new, rows, fresh) if adaptive else 0)
-    np.testing.assert_array_equal(chosen[:count], [*kept[:stay], *rows[: count - stay]])
-    np.testing.assert_array_equal(carried[:count], [*left[:stay], *fresh[: count - stay]])
+    weight, p_d, label, born = rng.uniform(0, 2, 25), rng.uniform(0, 1, 25), rng.integers(0, 2, 25), stamps(rng, 25)
+    components = components_of(
+        mean=rng.normal(0, 1, (25, 6)),
+        covariance=rng.normal(0, 1, (25, 6, 6)),
+        weight=weight,
+        label=label,
+        auxiliary=rng.normal(0, 1, (25, 4)),
+        born_ns=born,
+    )
+    marked, kind = rng.integers(0, 25, 8), rng.choice([FROM_POISSON, CLUTTER, NEWBORN], 20)
+    association, measured = rng.choice([0.0, 0.3, 1.0], 20), random_measurements(rng, 20)
+    hypotheses = hypotheses_of(component=marked, first_kind=kind, association=association)
+    steps, rate = np.array([2, 9]), np.array([0.5, 2.0])
+    births = rng.uniform(0, 2, 2), rng.uniform(0.1, 1, (2, 6)), rng.uniform(0.1, 1, (2, 6))
+    classes = class_rows(2, poisson_steps=steps, adaptive_birth_rate=rate)
+    classes["birth_heading_speed"], classes["birth_known"], classes["birth_unknown"] = births
+    found = update_undetected(components, p_d, 15, hypotheses, measured, NOW, PERIOD, classes, adaptive)
+    stays = np.flatnonzero((periods(born) <= steps[label]) & ~np.isin(np.arange(25), marked[marked < 15]))
+    new = np.flatnonzero((kind == CLUTTER) & (association < 1) & adaptive)
+    carried = [*(weight * (1 - p_d))[stays], *rate[measured.label[new]] * (1 - association[new])]
+    for column, wanted in zip(
+        found, with_births(components, stays, new, np.array(carried), measured, NOW, classes), strict=True
+    ):
+        np.testing.assert_array_equal(column, wanted)
 
 
 @SEEDS
 def test_components_that_stay_and_those_that_are_born_stand_in_order(seed: int) -> None:
     """First the columns of the rows that stay, then birth, box, class and stamp of the measurements."""
     rng = np.random.default_rng(seed)
-    mean, covariance, label = rng.normal(0, 1, (8, 6)), rng.normal(0, 1, (8, 6, 6)), rng.integers(0, 3, 8)
-    auxiliary, born, kept, rows = rng.normal(0, 1, (8, 4)), stamps(rng, 8), np.array([1, 5]), np.array([2, 0, 3])
-    measured, boxes = rng.integers(0, 3, 4), rng.normal(0, 1, (4, 4))
-    out = np.zeros((5, 6)), np.zeros((5, 6, 6)), np.empty(5, np.int64), np.empty((5, 4)), np.empty(5, np.int64)
-    position, yaw, velocity = rng.normal(0, 9, (4, 2)), rng.normal(0, 1, 4), rng.normal(0, 2, (4, 2))
-    births = rng.uniform(0, 2, 3), rng.uniform(0.1, 1, (3, 6)), rng.uniform(0.1, 1, (3, 6))
-    old = np.concatenate([kept, rows]), kept.size, mean, covariance, label, auxiliary, born
-    fill_components(*old, position, yaw, velocity, measured, boxes, NOW, *births, *out)
-    np.testing.assert_array_equal(out[0][:2], mean[kept])
-    np.testing.assert_array_equal(out[1][:2], covariance[kept])
+    components = components_of(
+        mean=rng.normal(0, 1, (8, 6)),
+        covariance=rng.normal(0, 1, (8, 6, 6)),
+        label=rng.integers(0, 2, 8),
+        auxiliary=rng.normal(0, 1, (8, 4)),
+        born_ns=stamps(rng, 8),
+    )
+    kept, rows, weight = np.array([1, 5]), np.array([2, 0, 3]), rng.uniform(0, 1, 5)
+    measured = random_measurements(rng, 4)
+    classes = class_rows(2, birth_heading_speed=[0.5, 1.5], birth_known=[[0.5], [0.6]], birth_unknown=[[0.7], [0.8]])
+    out = with_births(components, kept, rows, weight, measured, NOW, classes)
+    np.testing.assert_array_equal(out[0][:2], components.mean[kept])
+    np.testing.assert_array_equal(out[1][:2], components.covariance[kept])
     state, spread = np.empty((3, 6)), np.empty((3, 6, 6))
-    birth_states(rows, position, yaw, velocity, measured, *births, state, spread)
+    birth_states(rows, measured, classes, state, spread)
     np.testing.assert_array_equal(out[0][2:], state)
     np.testing.assert_array_equal(out[1][2:], spread)
-    np.testing.assert_array_equal(out[2], [*label[kept], *measured[rows]])
-    np.testing.assert_array_equal(out[3], [*auxiliary[kept], *boxes[rows]])
-    np.testing.assert_array_equal(out[4], [*born[kept], NOW, NOW, NOW])
+    np.testing.assert_array_equal(out[2], weight)
+    np.testing.assert_array_equal(out[3], [*components.label[kept], *measured.label[rows]])
+    np.testing.assert_array_equal(out[4], [*components.auxiliary[kept], *measured.auxiliary[rows]])
+    np.testing.assert_array_equal(out[5], [*components.born_ns[kept], NOW, NOW, NOW])

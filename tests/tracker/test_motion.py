@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import oracle_formulas as textbook
 import pytest
+from class_rows import class_row
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -114,7 +115,8 @@ def predicted(
     """One state through the kernel, with buffers that hold rubbish."""
     root, points = np.full((6, 6), np.nan), np.full((12, 6), np.nan)
     out, spread = np.full(6, np.nan), np.full((6, 6), np.nan)
-    assert predict_state(mean, covariance, dt, noise, tau, straight, root, points, out, spread) == 0
+    own = class_row(process_noise=noise, acceleration_time=tau, constant_velocity=straight)
+    assert predict_state(mean, covariance, dt, own, root, points, out, spread) == 0
     return out, spread
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import oracle_formulas as textbook
 import pytest
+from class_rows import class_rows
 
 import optipmb
 from optipmb.paths import MAX_HORIZONS, predict_paths
@@ -70,8 +71,8 @@ def test_states_are_predicted_as_numpy_does_step_by_step(tau: float) -> None:
     label, noise = np.arange(6) % 2, rng.uniform(0.1, 1.0, (2, 6))
     horizons, straight = np.array([0.1, 0.25, 1.0, 1.001]), np.array([False, True])
     means, covariances = np.empty((6, 4, 6)), np.empty((6, 4, 6, 6))
-    given = mean, covariance, label, horizons, 0.1, noise, np.full(2, tau), straight
-    predict_paths(*given, means, covariances)
+    classes = class_rows(2, process_noise=noise, acceleration_time=tau, constant_velocity=straight)
+    predict_paths(mean, covariance, label, horizons, 0.1, classes, means, covariances)
     for n in range(6):
         c, m, spread = label[n], mean[n], covariance[n]
         for h, (ahead, steps) in enumerate(((0.1, 1), (0.15, 2), (0.75, 8), (0.001, 1))):

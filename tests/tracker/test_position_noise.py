@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from class_rows import class_rows
 
 import optipmb
 from optipmb.birth import birth_states
 from optipmb.gating import gate
+from optipmb.preprocess import Measurements
 from optipmb.table import ClassTable
 from optipmb.update import ukf_updates
 
@@ -116,9 +118,9 @@ def updated(mean: Any, covariance: Any, z: Any, spread: Any, velocity: Any, iter
     position = np.array([[z[0], z[1], *(spread[[0, 0, 1], [0, 1, 1]] / 0.25)]])
     out, out_spread = np.empty((1, 6)), np.empty((1, 6, 6))
     zero = np.zeros(1, np.int64)
-    noise = np.array([0.5]), np.array([0.7]), np.array([0.2]), np.array([iterations])
-    measured = position, np.array([velocity]), np.array([z[2]]), zero
-    assert ukf_updates(zero, zero, mean[None], covariance[None], *measured, *noise, out, out_spread) == 0
+    classes = class_rows(1, noise_position=0.5, noise_velocity=0.7, noise_heading=0.2, linearisations=iterations)
+    measured = Measurements(position, np.array([z[2]]), np.array([velocity]), np.empty((1, 4)), np.empty(1), zero, zero)
+    assert ukf_updates(zero, zero, mean[None], covariance[None], measured, classes, out, out_spread) == 0
     return out[0], out_spread[0]
 
 
@@ -185,7 +187,7 @@ def test_the_likelihood_of_a_pair_has_the_covariance_of_its_detection() -> None:
     columns = np.column_stack((position, spreads[:, [0, 0, 1], [0, 1, 1]] / 0.25))
     zeros = np.zeros(5, np.int64)
     _, measurement, found = gate(
-        mean[None], covariance[None], zeros[:1], np.array([50.0]), columns, zeros, np.array([0.5])
+        mean[None], covariance[None], zeros[:1], np.array([50.0]), columns, zeros, class_rows(1, noise_position=0.5)
     )
     assert measurement.tolist() == list(range(5))
     for m in range(5):
@@ -195,6 +197,24 @@ def test_the_likelihood_of_a_pair_has_the_covariance_of_its_detection() -> None:
         assert found[m] == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize(("deviation", "same"), [(None, False), (0.1, False), (2.0, True), (4.0, True)])
+def test_a_detection_outside_the_gate_keeps_its_id_where_its_covariance_allows(
+    deviation: float | None, *, same: bool
+) -> None:
+    """Half a metre beyond the gate is a new track, unless the covariance of the detection is large enough."""
+    parameters = parameters_of("kitti-paper")
+    tracker, ids = optipmb.OnlineTracker(parameters), []
+    for k in range(6):
+        away = parameters.classes["Car"].gate + 0.5 if k == 5 else 0.0
+        boxes: Any = {"center": [[10.0 + away, 0.0, 0.0]], "size": [[4.0, 1.8, 1.5]], "yaw": [0.0], "score": [0.9]}
+        if deviation is not None and k == 5:
+            boxes["position_covariance"] = deviation**2 * np.eye(3)[None]
+        tracks = tracker.update({**boxes, "label": [0]}, t=0.1 * k)
+        ids.append({int(one) for one, row in zip(tracks.id, tracks.detection, strict=True) if row >= 0})
+    assert ids[4] == ids[0]
+    assert (ids[5] == ids[0]) == same
+
+
 def test_a_birth_is_as_uncertain_as_its_detection() -> None:
     """P^0 of x and y is that of the class times the covariance in units of R; the rest stays."""
     _, _, spread = pair(np.random.default_rng(5))
@@ -202,8 +222,9 @@ def test_a_birth_is_as_uncertain_as_its_detection() -> None:
     known = np.array([[0.9, 0.9, 3.0, 0.3, 0.2, 1.0]])
     mean, covariance = np.empty((1, 6)), np.empty((1, 6, 6))
     zero = np.zeros(1, np.int64)
-    velocity, limits = np.full((1, 2), np.nan), (np.zeros(1), known, known)
-    birth_states(zero, position, np.zeros(1), velocity, zero, *limits, mean, covariance)
+    velocity = np.full((1, 2), np.nan)
+    measured = Measurements(position, np.zeros(1), velocity, np.empty((1, 4)), np.empty(1), zero, zero)
+    birth_states(zero, measured, class_rows(1, birth_known=known, birth_unknown=known), mean, covariance)
     expected = np.diag(known[0] ** 2)
     expected[:2, :2] = 0.9**2 * spread / 0.25
     np.testing.assert_allclose(covariance[0], expected, rtol=1e-12)

@@ -14,7 +14,8 @@ import pytest
 from scenes import boxes
 
 import optipmb
-from optipmb.columns import fitting, rows_fit
+from optipmb.columns import columns_fit, fitting
+from optipmb.density import columns_of_rows
 
 KITTI, NUSCENES = optipmb.load_profile("kitti"), optipmb.load_profile("nuscenes")
 HERE = Path(__file__).parent
@@ -59,22 +60,22 @@ def test_a_density_whose_columns_do_not_fit_is_refused(part: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_rows_fit_as_numpy_says(seed: int) -> None:
-    """Shapes of one length, and classes that exist."""
+def test_columns_fit_as_numpy_says(seed: int) -> None:
+    """Shapes of one length in every column, and classes that exist."""
     rng = np.random.default_rng(seed)
-    shapes = [(3, 6), (3, 6, 6), (3,), (3, 4)]
-    place = int(rng.integers(0, 4))
-    for change in ((0, 0), (1, 0), (0, 1) if place != 2 else (1, 0)):
-        changed = list(shapes)
-        head, *tail = changed[place]
-        changed[place] = (head + change[0], *(one + change[1] for one in tail))
-        mean, covariance, boxes_ = np.zeros(changed[0]), np.zeros(changed[1]), np.zeros(changed[3])
-        label = rng.integers(0, 2, changed[2])
-        assert rows_fit(mean, covariance, label, boxes_, 2) == (changed == shapes)
-    label = np.array([0, 1, 2])
-    assert rows_fit(np.zeros((3, 6)), np.zeros((3, 6, 6)), label, np.zeros((3, 4)), 3)
-    assert not rows_fit(np.zeros((3, 6)), np.zeros((3, 6, 6)), label, np.zeros((3, 4)), 2)
-    assert not rows_fit(np.zeros((3, 6)), np.zeros((3, 6, 6)), -label, np.zeros((3, 4)), 3)
+    density = settled()
+    objects, components = (columns_of_rows(one) for one in (density.bernoulli, density.poisson))
+    assert columns_fit(objects, components, 3)
+    for columns in (objects, components):
+        place = int(rng.integers(0, len(columns)))
+        head, *tail = columns[place].shape
+        for shape in ((head + 1, *tail), (head, *(one + 1 for one in tail))):
+            if shape != columns[place].shape:
+                changed = (*columns[:place], np.zeros(shape, columns[place].dtype), *columns[place + 1 :])
+                assert not columns_fit(*((changed, components) if columns is objects else (objects, changed)), 3)
+    assert not columns_fit(objects, components, int(density.bernoulli.label[0]))
+    density.bernoulli.label[0] = -1
+    assert not columns_fit(objects, components, 3)
 
 
 def test_what_the_tracker_makes_fits() -> None:

@@ -7,32 +7,34 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from class_rows import class_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from optipmb.calibration import SURE, calibrate_rows, log_odds
+from optipmb.density import BernoulliArrays, Bernoullis, PoissonArrays, Poissons
 from optipmb.errors import FrameError
 from optipmb.frame import MAX_COORDINATE, MAX_SPEED, _refuse, allowed
 from optipmb.gating import gate, gate_radii
 from optipmb.hypotheses import detection_costs, first_detections, local_hypotheses
-from optipmb.preprocess import gather
+from optipmb.preprocess import Measurements, gather
 from optipmb.warm import kernels
 
 COMPILING = settings(deadline=None)  # the first call compiles
 HERE = Path(__file__).parent
 
 TWINS = {
-    "association.assign": "test_hypotheses.test_the_total_is_that_of_the_hungarian_algorithm",
+    "association.associate": "test_hypotheses.test_the_total_is_that_of_the_hungarian_algorithm",
     "birth.birth_states": "test_update.test_a_birth_is_the_textbook_birth",
-    "birth.first_states": "test_kernels.test_announced_objects_are_matched_mixtures",
+    "birth.first_detected_states": "test_kernels.test_announced_objects_are_matched_mixtures",
     "calibration.calibrate_rows": "test_twins.test_rows_are_calibrated_as_numpy_interpolates",
     "calibration.log_odds": "test_twins.test_log_odds_are_bounded",
-    "columns.rows_fit": "test_safety.test_rows_fit_as_numpy_says",
+    "columns.columns_fit": "test_safety.test_columns_fit_as_numpy_says",
     "density.copy_state": "test_update.test_states_without_a_measurement_stay_as_predicted",
     "density.whole_periods": "test_kernels.test_periods_are_counted_to_the_nearest",
     "extract.confirm": "test_confirmed.test_confirmation_has_hysteresis",
-    "extract.read_tracks": "test_kernels.test_tracks_are_read_off_the_states",
+    "extract.extract_tracks": "test_kernels.test_tracks_are_read_off_the_states",
     "extract.select_tracks": "test_kernels.test_tracks_are_selected_by_two_thresholds",
     "frame.allowed": "test_twins.test_values_are_allowed_as_numpy_says",
     "geometry.overlaps": "test_geometry.test_iou_is_that_of_clipped_polygons",
@@ -53,11 +55,12 @@ TWINS = {
     "hypotheses.detection_costs": "test_hypotheses.test_costs_and_association_probabilities_are_the_formulas",
     "hypotheses.first_detections": "test_hypotheses.test_each_kind_of_first_detection_has_its_formula",
     "gating.gate": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
+    "gating.gate_widening": "test_hypotheses.test_a_gate_widens_by_what_r_is_above_that_of_the_class",
     "gating.gate_radii": "test_hypotheses.test_gates_widen_with_time_and_with_unknown_speed",
     "gating.pairs_of_few": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "gating.pairs_of_many": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.local_hypotheses": "test_twins.test_hypotheses_are_those_of_their_parts",
-    "lightweight.update_light_weight": "test_kernels.test_the_light_weight_filter_is_its_formulas",
+    "lightweight.light_weight_filter": "test_kernels.test_the_light_weight_filter_is_its_formulas",
     "motion.centred": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
     "motion.ctra_displacement": "test_motion.test_the_displacement_is_the_integral_of_the_velocity",
     "motion.predict_state": "test_motion.test_the_prediction_is_the_textbook_unscented_transform",
@@ -76,17 +79,17 @@ TWINS = {
     "points.column": "test_geometry.test_points_that_are_not_finite_are_in_no_box",
     "points.count_points": "test_geometry.test_points_in_boxes_counts_every_point",
     "predict.predict_components": "test_kernels.test_components_within_their_limit_are_predicted",
+    "predict.predict_density": "test_kernels.test_components_within_their_limit_are_predicted",
     "preprocess.gather": "test_twins.test_measurements_are_the_chosen_rows",
     "preprocess.non_maximum_suppression": "test_geometry.test_suppression_is_the_greedy_one_per_group",
     "preprocess.precedes": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
     "preprocess.select": "test_kernels.test_only_scores_from_the_filter_on_are_chosen",
     "preprocess.sort_canonically": "test_kernels.test_the_canonical_order_is_a_lexicographic_one",
-    "prune.select_objects": "test_kernels.test_objects_survive_by_existence_and_misses",
+    "prune.surviving_objects": "test_kernels.test_objects_survive_by_existence_and_misses",
     "soundness.all_within": "test_soundness.test_bounds_are_kept_in_every_column",
-    "undetected.fill_components": "test_kernels.test_components_that_stay_and_those_that_are_born_stand_in_order",
-    "undetected.select_births": "test_kernels.test_low_scores_are_born_with_what_association_leaves",
-    "undetected.select_components": "test_kernels.test_components_survive_unless_marked_or_old",
-    "undetected.select_undetected": "test_kernels.test_what_is_undetected_stays_or_is_born",
+    "tracker.update": "test_oracle.test_every_combination_of_modules_equals_algorithm_1",
+    "undetected.with_births": "test_kernels.test_components_that_stay_and_those_that_are_born_stand_in_order",
+    "undetected.update_undetected": "test_kernels.test_what_is_undetected_stays_or_is_born",
     "birth.moment_match": "test_update.test_a_mixture_keeps_its_mean_and_covariance",
     "update.linearised_update": "test_update.test_the_linearised_update_is_the_textbook_one",
     "update.ukf_update": "test_update.test_the_update_is_the_textbook_ukf",
@@ -153,8 +156,10 @@ def test_rows_are_calibrated_as_numpy_interpolates(seed: int) -> None:
     existence, score, covariance = (rng.normal(0, 1, (rows.size, *shape)) for shape in ((), (), (6, 6)))
     told, ranked, widened = existence.copy(), score.copy(), covariance.copy()
     weight = np.array([0.3, 1.0, 0.0])
-    curves = knots, bends, existence_at, along_at, across_at, weight
-    calibrate_rows(label, evidence, yaw, *curves, told, ranked, widened)
+    classes = class_rows(3, knots=knots, score_of_evidence=weight)
+    for name, curve in (("evidence", bends), ("existence", existence_at), ("along", along_at), ("across", across_at)):
+        classes[f"knot_{name}"][:, :4] = curve
+    calibrate_rows(label, evidence, yaw, classes, told, ranked, widened)
     for k, n in enumerate(rows):
         c = label[n]
         used = slice(0, knots[c])
@@ -193,9 +198,7 @@ def test_measurements_are_the_chosen_rows(seed: int) -> None:
         rng.permutation(40)[:20],
     )
     chosen = rng.permutation(20)[:12]
-    shapes = (12, 2), (12,), (12, 2), (12, 4), (12,)
-    out = [*(np.empty(shape) for shape in shapes), np.empty(12, np.int64), np.empty(12, np.int64)]
-    gather(chosen, center, size, yaw, velocity, score, label, source, *out)
+    out = gather(chosen, center, size, yaw, velocity, score, label, source, 2)
     wanted = center[:, :2], yaw, velocity, np.column_stack([size, center[:, 2]]), score, label, source
     for found, column in zip(out, wanted, strict=True):
         np.testing.assert_array_equal(found, column[chosen])
@@ -212,23 +215,22 @@ def test_hypotheses_are_those_of_their_parts(seed: int) -> None:
     distance, noise = np.array([2.0, 4.0]), np.array([0.2, 0.7])
     clutter, birth, threshold = np.array([1e-3, 1e-2]), np.array([1e-4, 1e-3]), np.array([0.3, 0.6])
     old, new = slice(0, 12), slice(12, 20)
-    objects = mean[old], covariance[old], label[old]
-    components = mean[new], covariance[new], label[new]
-    given = *objects, weight[old], p_d[old], *components, weight[new], p_d[new]
-    firsts = np.empty(15, np.int64), np.empty(15), np.empty(15)
-    told = np.empty(15)
-    table = noise, clutter, birth, threshold, np.array([True, False])
-    growth, deviations = np.array([0.5, 0.0]), np.array([0.0, 3.0])
-    gates = 0.15, 0.1, distance, growth, deviations
-    radius = gate_radii(covariance, label, *gates)
-    found = local_hypotheses(*given, *gates, position, measured, score, *table, *firsts, told)
-    row, measurement, likelihood = gate(*objects, radius[old], position, measured, noise)
-    association, kind, first_cost, existence = np.empty(15), np.empty(15, np.int64), np.empty(15), np.empty(15)
+    classes = class_rows(2, noise_position=noise, clutter_intensity=clutter, birth_intensity=birth)
+    classes["birth_score"], classes["birth_over_clutter"] = threshold, [True, False]
+    classes["gate"], classes["gate_growth"], classes["gate_deviations"] = distance, [0.5, 0.0], [0.0, 3.0]
+    parts = [{"mean": mean[rows], "covariance": covariance[rows], "label": label[rows]} for rows in (old, new)]
+    objects = BernoulliArrays(**dict(Bernoullis.empty().columns()) | parts[0] | {"existence": weight[old]})
+    components = PoissonArrays(**dict(Poissons.empty().columns()) | parts[1] | {"weight": weight[new]})
+    empty = np.empty(15)
+    measurements = Measurements(position, empty, np.empty((15, 2)), np.empty((15, 4)), score, measured, measured)
+    found = local_hypotheses(objects, p_d[old], components, p_d[new], measurements, 0.15, 0.1, classes)
+    radius = gate_radii(covariance, label, 0.15, 0.1, classes)
+    row, measurement, likelihood = gate(*parts[0].values(), radius[old], position, measured, classes)
+    association = np.empty(15)
     cost = detection_costs(row, measurement, likelihood, weight[old], p_d[old], association)
-    component, announced, log_e = gate(*components, radius[new], position, measured, noise)
+    component, announced, log_e = gate(*parts[1].values(), radius[new], position, measured, classes)
     log_e = np.log((weight * p_d)[new][component]) + log_e
-    first = kind, first_cost, existence
-    first_detections(announced, log_e, score, association, measured, *table[1:], *first)
+    first = first_detections(announced, log_e, score, association, measured, classes)
     wanted = row, measurement, cost, component, announced, log_e, *first, association
-    for column, expected in zip((*found, *firsts, told), wanted, strict=True):
+    for column, expected in zip(found, wanted, strict=True):
         np.testing.assert_allclose(column, expected, rtol=1e-12)

@@ -8,11 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import oracle_formulas as textbook
 import pytest
+from class_rows import class_rows
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from optipmb.birth import birth_states, moment_match
+from optipmb.preprocess import Measurements
 from optipmb.prune import NEW
 from optipmb.update import linearised_update, ukf_update, ukf_updates, workspace
 
@@ -159,14 +161,22 @@ def test_states_without_a_measurement_stay_as_predicted() -> None:
         chosen,
         mean,
         covariance,
-        np.stack([z.xy for z in zs]),
-        np.stack([z.velocity if z.velocity is not None else [np.nan, np.nan] for z in zs]),
-        np.array([z.yaw for z in zs]),
-        label,
-        np.array([c.measurement_noise.position for c in classes]),
-        np.array([c.measurement_noise.velocity for c in classes]),
-        np.array([c.measurement_noise.heading for c in classes]),
-        np.array([c.linearisations for c in classes]),
+        Measurements(
+            np.stack([z.xy for z in zs]),
+            np.array([z.yaw for z in zs]),
+            np.stack([z.velocity if z.velocity is not None else [np.nan, np.nan] for z in zs]),
+            np.empty((2, 4)),
+            np.empty(2),
+            label,
+            label,
+        ),
+        class_rows(
+            2,
+            noise_position=[c.measurement_noise.position for c in classes],
+            noise_velocity=[c.measurement_noise.velocity for c in classes],
+            noise_heading=[c.measurement_noise.heading for c in classes],
+            linearisations=[c.linearisations for c in classes],
+        ),
         out,
         spread,
     )
@@ -228,13 +238,21 @@ def test_a_birth_is_the_textbook_birth(velocity: tuple[float, float] | None, yaw
     mean, covariance = np.full((1, 6), np.nan), np.full((1, 6, 6), np.nan)
     birth_states(
         np.array([1]),
-        np.array([[np.nan, np.nan], [3.0, 4.0]]),
-        np.array([np.nan, yaw]),
-        np.array([(9.0, 9.0), velocity if velocity is not None else (np.nan, np.nan)]),
-        np.array([0, 1]),
-        np.array([99.0, threshold]),
-        np.stack([np.zeros(6), known]),
-        np.stack([np.zeros(6), unknown]),
+        Measurements(
+            np.array([[np.nan, np.nan], [3.0, 4.0]]),
+            np.array([np.nan, yaw]),
+            np.array([(9.0, 9.0), velocity if velocity is not None else (np.nan, np.nan)]),
+            np.empty((2, 4)),
+            np.empty(2),
+            np.array([0, 1]),
+            np.array([0, 1]),
+        ),
+        class_rows(
+            2,
+            birth_heading_speed=[99.0, threshold],
+            birth_known=[np.zeros(6), known],
+            birth_unknown=[np.zeros(6), unknown],
+        ),
         mean,
         covariance,
     )
