@@ -32,12 +32,12 @@ class SessionParameters(Message):
     )
     horizons: Horizons | None = Field(
         default=None,
-        description="Times ahead in seconds, ascending, at which `Tracks` carry predicted paths; none: no paths. They "
-        "may change at any time; a profile that is set brings its own.",
+        description="Times ahead of predicted paths, s, ascending; none: no paths. They may change at any time; a "
+        "profile that is set brings its own.",
     )
     restart: Flag = Field(
         default=False,
-        description="Start the session anew when the parameters change; without it a running session refuses a change.",
+        description="Restart the session when the parameters change; without it a running session refuses a change.",
     )
     values: Plain | None = Field(default=None, description="In replies: all parameters in force. Ignored in queries.")
 
@@ -88,8 +88,8 @@ class SessionState(Message):
     stream: Stream = Field(description="Name of the stream.")
     session: SessionId = Field(description="32 hexadecimal digits, as in the tracks.")
     state: Literal["new", "running", "recovering", "quarantined", "closed"] = Field(
-        description="New: no frame yet. Recovering: taken up again after a restart, frames that were missed may still "
-        "come. Quarantined: tracking failed, frames are refused until a reset or another start of the publisher."
+        description="New: no frame yet. Recovering: after a restart, missed frames may still come. Quarantined: "
+        "tracking failed, frames are refused until a reset or another start of the publisher."
     )
     profile: Name = Field(description="Name of the parameters in force.")
     epoch: Epoch | None = Field(default=None, description="Epoch of the newest frame.")
@@ -120,8 +120,7 @@ class SessionState(Message):
     queue: Count = Field(default=0, description="Frames waiting now.")
     digest: Text = Field(
         default="",
-        description="32 hexadecimal digits over everything that later tracks depend on: two runs with equal digests "
-        "give equal tracks from equal messages. Empty: without a session.",
+        description="32 hexadecimal digits over everything that later tracks depend on. Empty: without a session.",
     )
 
 
@@ -213,12 +212,12 @@ class ServiceStatus(Message):
         default=(),
         max_length=4096,
         fail_fast=True,
-        description="The living members that share streams with this instance, itself among them, as it knows them.",
+        description="The living members that share streams with this instance, itself among them.",
     )
     received: Count = Field(
         default=0,
-        description="Detections messages that arrived since the start: the sum of `frames`, `duplicates`, `late`, "
-        "`refused` and `shed`, but for those that wait or are being tracked.",
+        description="Detections messages since the start: the sum of `frames`, `duplicates`, `late`, `refused`, "
+        "`shed`, and those that wait.",
     )
     frames: Count = Field(default=0, description="Frames tracked since the start.")
     duplicates: Count = Field(default=0, description="Frames dropped since the start because they had been tracked.")

@@ -46,8 +46,8 @@ class FieldOfView(Message):
     """Where the sensor detects objects, in its own axes (x forward, y left, z up); each field is an interval."""
 
     azimuth: Annotated[Reals, Array("f8", (2,), -TURN, TURN)] = Field(
-        description="The sector counter-clockwise from the first angle to the second, radians from x; [-pi, pi] is the "
-        "full circle, [2.5, -2.5] looks backwards."
+        description="The sector counter-clockwise from the first angle to the second, radians from x; [-pi, pi]: the "
+        "full circle."
     )
     elevation: Annotated[Reals, Array("f8", (2,), -QUARTER, QUARTER)] = Field(
         description="Radians above the xy plane; [-pi/2, pi/2]: no limit."
@@ -73,21 +73,18 @@ class Header(Message):
         description="16 bytes (JSON: 32 hexadecimal digits), random, new at every start of the publisher."
     )
     seq: Count = Field(
-        description="Counts the messages of this type and stream within the epoch: 0, 1, 2, without gaps. "
-        "A message that is sent again keeps its number."
+        description="Counts the messages of this type and stream within the epoch: 0, 1, 2, without gaps."
     )
-    stamp_ns: Stamp = Field(description="Sensor time in nanoseconds. Only differences and the order matter.")
+    stamp_ns: Stamp = Field(description="Sensor time in nanoseconds, of any origin.")
 
 
 class SensorMessage(Header):
     """Header of what a publisher sends: also says in which frame its coordinates are."""
 
-    frame: Literal["world", "sensor"] = Field(
-        description="Frame of all coordinates here: the fixed world frame, or the sensor frame at `stamp_ns`."
-    )
+    frame: Literal["world", "sensor"] = Field(description="Frame of all coordinates here.")
     pose: Pose | None = Field(
         default=None,
-        description="World from sensor at `stamp_ns`. Required when `frame` is `sensor`, optional otherwise.",
+        description="World from sensor at `stamp_ns`. Required when `frame` is `sensor`.",
     )
 
     def check(self) -> None:
@@ -99,7 +96,7 @@ class SensorMessage(Header):
 class Detections(SensorMessage):
     """The detected objects of one frame, M of them (M may be 0). One row of every array is one object."""
 
-    labels: Labels = Field(description="Names of the classes that `label` counts, for example `car`. All different.")
+    labels: Labels = Field(description="Names of the classes, for example `car`. All different.")
     label: Annotated[Integers, Array("i8", ("M",), 0, 255)] = Field(
         description="Class of each object as an index into `labels`, from 0."
     )
@@ -113,23 +110,23 @@ class Detections(SensorMessage):
         description="Heading in radians, counter-clockwise about z from the x axis of `frame`."
     )
     score: Annotated[Reals, Array("f8", ("M",), 0, 1)] = Field(
-        description="Confidence of the detector. Logits must be passed through a sigmoid first. An object of score 0 "
-        "is left out and counted in `Tracks.ignored`."
+        description="Confidence of the detector; not a logit. An object of score 0 is left out and counted in "
+        "`Tracks.ignored`."
     )
     velocity: Annotated[Reals, Array("f8", ("M", 2), -1e3, 1e3, unknown=True)] | None = Field(
         default=None,
-        description="Velocity over ground in m/s along the x and y axes of `frame` (not relative to a moving sensor). "
-        "A row of two NaN (JSON: null) is an object of unknown velocity. Absent: unknown for all.",
+        description="Velocity over ground in m/s along the x and y axes of `frame`. A row of two NaN (JSON: null): "
+        "unknown for this object. Absent: for all.",
     )
     has_points: Flag | None = Field(
         default=None,
-        description="True: a `Points` message of the same stamp was or will be published. False: none comes. "
-        "Absent: the service judges from what the stream has sent so far.",
+        description="Whether a `Points` message of the same stamp was or will be published. Absent: the service judges "
+        "from what the stream has sent so far.",
     )
     field_of_view: FieldOfView | None = Field(
         default=None,
         description="Where the sensor detects objects, in the axes of `pose` (without a pose those of the world). "
-        "Objects outside are neither detected nor missed. Absent: the sensor sees everything.",
+        "Absent: everywhere.",
     )
 
     position_covariance: Annotated[Reals, Array("f8", ("M", 3, 3), -1e8, 1e8, unknown=True)] | None = Field(
@@ -151,8 +148,8 @@ class Points(SensorMessage):
     """One point cloud of the sensor. Its `seq` counts clouds, apart from the detections."""
 
     xyz: Annotated[Singles, Array("f4", ("P", 3), -FAR, FAR, wider=True)] = Field(
-        description="Points x, y, z in metres, in `frame`. Further columns (up to 64) are dropped. "
-        "All must be finite: leave out the points without a return."
+        description="Points x, y, z in metres, in `frame`, without those that have no return. Further columns (up to "
+        "64) are dropped."
     )
 
 
@@ -177,16 +174,13 @@ class Tracks(Header):
 
     sensor: Stream | None = Field(
         default=None,
-        description="Stream of the detections, where several sensors feed one session: `epoch` and `seq` are of this "
-        "stream. Absent: it is `stream`.",
+        description="Stream of the detections, and of `epoch` and `seq`. Absent: it is `stream`.",
     )
-    session: SessionId = Field(
-        description="32 hexadecimal digits. New when the session starts anew: earlier tracks have ended."
-    )
+    session: SessionId = Field(description="32 hexadecimal digits. When it changes, earlier tracks have ended.")
     revision: Count = Field(
         default=0,
-        description="0 at first. Higher: corrects what was published for the same `session`, `epoch` and `seq`, "
-        "because a late frame came in.",
+        description="Higher than 0: corrects, after a late frame, what was published for the same `session`, `epoch` "
+        "and `seq`.",
     )
     profile: Name = Field(description="Name of the parameters in force.")
     cloud_used: Flag = Field(description="Whether a point cloud took part in this frame.")
@@ -211,7 +205,7 @@ class Tracks(Header):
     heading_confidence: Annotated[Reals, Array("f8", ("N",), 0, 1)] | None = Field(
         default=None,
         description="Probability that the object faces along `yaw` and not the other way; 1 where the profile does not "
-        "follow it. Absent: from a service that did not tell.",
+        "follow it.",
     )
     velocity: Annotated[Reals, Array("f8", ("N", 2), -1e5, 1e5)] = Field(
         description="Velocity in m/s along x and y of the world frame."
@@ -236,13 +230,13 @@ class Tracks(Header):
     )
     confirmed: Annotated[Integers, Array("i8", ("N",), 0, 1)] | None = Field(
         default=None,
-        description="1: the track is confirmed, its existence reached a threshold of the profile and has not fallen "
-        "below a lower one since; 0: it may be of nothing. Absent: from a service that did not tell.",
+        description="1: the existence reached a threshold of the profile and has not fallen below a lower one since; "
+        "0: the track may be of nothing.",
     )
     horizons: Horizons | None = Field(
         default=None,
-        description="Times after `stamp_ns` in seconds, ascending, at which the predicted paths are given. Absent, as "
-        "are the next three: the session has no horizons.",
+        description="Times of the predicted paths after `stamp_ns`, s, ascending. Absent, as are the next three: the "
+        "session has none.",
     )
     path_position: Annotated[Reals, Array("f8", ("N", "H", 2), -FAR * 1e4, FAR * 1e4)] | None = Field(
         default=None, description="Predicted x and y of the centres at each horizon: metres, world frame."

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from structlog.typing import EventDict, Processor, WrappedLogger
 
 EVENTS: Final = {
-    "starting": "The service compiles or loads its kernels; the first start after an installation takes a minute.",
+    "starting": "The service compiles or loads its kernels.",
     "connecting": "The service is a client and waits for a router. If this lasts, check `connect`.",
     "http": "Health, metrics and the live page are served at `address`.",
-    "ready": "Streams and queries are served; the ready line was printed to stdout.",
+    "ready": "Streams and queries are served.",
     "grpc": "gRPC is served at `address`.",
     "grpc_call": "A call over gRPC has ended (level debug).",
     "grpc_connections": "Fewer gRPC connections than the setting are allowed, by the limit of open files.",
@@ -28,15 +28,14 @@ EVENTS: Final = {
     "grpc_certificates": "Renewed gRPC certificates cannot be read; the previous ones stay in use.",
     "unknown_environment": "Variables that start with `OPTIPMB_` but are not settings, usually misspelt.",
     "peer_connected": "A node, router or service has connected to this process.",
-    "tracker_message": "A `text` of the tracker: that it compiles, once after an installation, for up to a minute.",
+    "tracker_message": "A `text` of the tracker: that it compiles, for up to a minute.",
     "peer_lost": "That connection is lost. A client reconnects and recovers what the caches still hold.",
     "session_opened": "A stream sent its first valid message, or parameters were set for it.",
     "session_restored": "A session continues from its checkpoint; missed frames are requested from publishers.",
     "session_begun": "A density began: `first` frame, `publisher` restarted with a jump, a `jump` of stamps, `reset`, "
     "`parameters`, an implausible `pose`, too much `effort`, the end of a `quarantine`. Repeated jumps: check"
     " the sensor's clock.",
-    "session_quarantined": "Tracking a stream raised `error`: its frames are refused until a reset or a restart of "
-    "the publisher. Its last frames are saved; report them.",
+    "session_quarantined": "Tracking a stream raised `error`. Its last frames are saved; see the problem `internal`.",
     "stream_degraded": "A message took `took_s` of processor time; the stream's messages are refused for `refused_s`.",
     "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` elsewhere, lacking `memory`,"
     " `evicted` for a stream of another site, or `superseded` by another instance.",
@@ -47,9 +46,8 @@ EVENTS: Final = {
     " The stream continues, other checkpoints are written; the state is `degraded`.",
     "store_failed": "Checkpoints cannot be written (disk full, read-only): tracking goes on, the state is `degraded`.",
     "store_back": "Checkpoints are written again.",
-    "partitions_held": "How many of 64 partitions, parts of all streams, this member holds, and who the `members` are.",
-    "leases_damaged": "The `file` of the leases, which is not synced, was damaged, as by a power cut, and was made"
-    " anew: nobody used it.",
+    "partitions_held": "How many of 64 partitions this member holds, and who the `members` are.",
+    "leases_damaged": "The `file` of the leases was damaged, as by a power cut, and was made anew: nobody used it.",
     "lease_lost": "This member was frozen, starved or cut off for `lease_s`, and others continue its streams. It joins"
     " again at once.",
     "leases_failed": "The servers of `cluster`, or the folder `store`, cannot be used, for `error`: after half of"
@@ -62,16 +60,15 @@ EVENTS: Final = {
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames arrive again.",
     "problem": "A message was refused or lost; `count` of this kind since the last line. See the table of problems.",
-    "ros2_mismatch": "An endpoint of ROS 2 does not match: another type or definition, or a quality of service that"
-    " DDS would refuse. `message` names the node and what is expected.",
+    "ros2_mismatch": "An endpoint of ROS 2 has another type, definition or quality of service; `message` says which.",
     "claim_failed": "The tracks of a stream cannot be published; the network is closing.",
     "publish_failed": "Tracks could not be passed to Zenoh; the network is closing.",
     "reply_failed": "The client of a query had left before the reply.",
     "query": "A query was answered (level debug).",
     "internal_error": "A bug, with its traceback: report it. The stream continues.",
     "worker_started": "The parent has started a worker process.",
-    "worker_ended": "A worker process has ended by itself, with this status (below 0: killed by this signal). It is"
-    " restarted after `again_s` and continues its streams; until then the state is `degraded`.",
+    "worker_ended": "A worker process has ended by itself, with this status (below 0: by this signal). It is restarted"
+    " after `again_s`; until then the state is `degraded`.",
     "worker_stuck": "A worker has not responded for `silent_s`; it is killed and restarted.",
     "worker_killed": "A worker process did not end or respond in time and was killed.",
     "metrics_unreadable": "The metrics of a worker cannot be read; those of the others are shown.",

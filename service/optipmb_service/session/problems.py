@@ -28,7 +28,7 @@ CODES: Final = {
         "Raise `max_sessions` or quotas; see `path`.",
     ),
     "quota": (
-        "The node, or its site, sends more than its quota of messages or bytes; the message is refused.",
+        "The node, or its site, sends more than its quota.",
         "Send less, or raise `node_rate`, `node_mb_s`, `site_rate`, `site_mb_s`.",
     ),
     "astray": (
@@ -52,15 +52,15 @@ CODES: Final = {
         "Nothing. If it happens often, raise `lease_s`, or look for what stops the process.",
     ),
     "contested": (
-        "Another instance on the network tracks the stream too, for the two have no `store` in common.",
-        "Give them one folder `store`, or servers of `cluster`; or let each have routers of its own.",
+        "Another instance, without the same `store`, tracks the stream too.",
+        "Give them one `store` or `cluster`, or routers of their own.",
     ),
     "cut": (
         "In answers to `q/tracks`: there are more tracks than one answer takes.",
         "Ask again from `stamp_ns` on, as `optipmb_client.kept_tracks` does.",
     ),
     "unlogged": (
-        "A message is not in the log: NATS was away for longer than the bridge can hold messages, or does not take it.",
+        "A message is not in the log: NATS was away for too long, or does not take it.",
         "Nothing for the tracks. See the NATS servers; a successor has to get the frame from the publisher's cache.",
     ),
     "internal": (
