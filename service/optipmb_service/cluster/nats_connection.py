@@ -146,10 +146,11 @@ class NatsConnection:
         async def end() -> None:
             self._connecting.cancel()
             await self._client.close()
-            tasks = asyncio.all_tasks() - {asyncio.current_task()}
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            # Connecting may have begun something before it was cancelled.
+            while tasks := asyncio.all_tasks() - {asyncio.current_task()}:
+                for task in tasks:
+                    task.cancel()
+                await asyncio.wait(tasks)
 
         try:
             self.start(end()).result(timeout)
