@@ -358,7 +358,8 @@ class Settings(BaseSettings):
         ge=0,
         le=600,
         description="time for which what is received of streams that others track is kept for a takeover;"
-        " longer than `lease_s` and `checkpoint_s` together",
+        " longer than `lease_s` and `checkpoint_s` together; with `cluster` also how far back the log is read for a"
+        " stream without a checkpoint",
     )
     standby_mb: int = Field(
         default=256,
