@@ -71,7 +71,7 @@ class TrackQuery:
         return asked
 
     def _refuse(self, request: Request, stream: str, error: schemas.MessageError) -> None:
-        self._finish(request, self._problem(stream, error.code, error.path, error.expected, error.received))
+        self._finish(request, self._problem(error.code, stream, error.path, error.expected, error.received))
 
     def _reply(self, request: Request, stream: str, wanted: TracksRange, failure: str) -> None:
         self._room.release()
@@ -82,10 +82,10 @@ class TrackQuery:
         except TransportError as error:
             log.warning("reply_failed", key=request.key, error=str(error))
         if failure:
-            last = self._problem(stream, "unlogged", "", "a log that can be read", failure)
+            last = self._problem("unlogged", stream, "", "a log that can be read", failure)
         elif wanted.cut_ns is not None:
             received = f"more, from the stamp {wanted.cut_ns} on"
-            last = self._problem(stream, "cut", "", "as many tracks as one answer takes", received, wanted.cut_ns)
+            last = self._problem("cut", stream, "", "as many tracks as one answer takes", received, wanted.cut_ns)
         self._finish(request, last)
 
     def _finish(self, request: Request, problem: schemas.Problem | None) -> None:
@@ -98,7 +98,7 @@ class TrackQuery:
             request.finish()
 
     def _problem(
-        self, stream: str, code: str, path: str, expected: str, received: str, stamp_ns: int | None = None
+        self, code: str, stream: str, path: str, expected: str, received: str, stamp_ns: int | None = None
     ) -> schemas.Problem:
         return problem_of(
             code,
