@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
@@ -54,11 +55,11 @@ class Logged:
             time.sleep(0.05)  # the rate of a sensor, not a wait for anything
 
     def in_log(self, frames: int) -> bool:
-        """Whether the log has so many frames of each stream, each once, in order."""
+        """Whether the log has so many frames of each stream, each once."""
         try:
             for sensor in SENSORS:
                 read = self.log.connection.call(self.log.read("detections", sensor.stream, 1), 10.0)
-                if [message.seq for _, message in read] != list(range(frames)):
+                if sorted(message.seq for _, message in read) != list(range(frames)):
                     return False
         except StoreError:  # the server is not there yet
             return False
@@ -129,18 +130,19 @@ def test_a_successor_reads_what_nobody_tracked(logged: Logged) -> None:
 
 @pytest.mark.timeout(600)
 def test_two_bridges_write_once_and_wait_for_the_servers(logged: Logged) -> None:
-    """Each message is in the log once, in order, also those that were published while no server was there."""
+    """Each message is in the log once, also those that were published while no server was there."""
     first = logged.bridge
     with LogProcess(logged.endpoint, logged.nats.url, "second") as second:
         second.wait_receiving(logged.node)
         logged.send(0, 20)
         until(lambda: logged.in_log(20), "both have put 20 frames into the log")
-        until(lambda: first.handled == second.handled > 60, "both have handled all")
-        assert second.figure("written_total") + first.figure("written_total") < second.handled + first.handled
+        repeated = partial(map, lambda bridge: bridge.figure("repeated_total"), (first, second))
+        until(lambda: sum(repeated()) >= 20 * len(SENSORS), "each frame has come from both")
+        assert logged.in_log(20)
 
         logged.nats.kill()
         until(lambda: first.readiness[0] == second.readiness[0] == "degraded", "both say that they cannot write")
-        assert logged.nats.address in first.readiness[1]
+        assert first.readiness[1].startswith("log: ")
         logged.send(20, 40)
         until(lambda: first.figure("waiting_bytes") > 0 < second.figure("waiting_bytes"), "messages wait")
         logged.nats.start()
