@@ -47,7 +47,7 @@ def stages(found: dict[str, Any], path: Path) -> None:
     """Where the time of a step goes: shares of the stages in scenes of several sizes."""
     figure = Figure(figsize=(7.5, 3.6), layout="constrained")
     axes = figure.add_subplot()
-    colours = [BLUE, ORANGE, "#000000", GREEN, RED, SKY, PURPLE, "#F0E442"]
+    colours = [BLUE, ORANGE, "#000000", SKY, "#F0E442"]
     names = list(found["stages"])
     totals = np.array([sum(found["stages"][name].values()) for name in names])
     left = np.zeros(len(names))

@@ -16,7 +16,7 @@ from optipmb.geometry import bev_iou
 from optipmb.parameters import load_profile, parse_parameters
 from optipmb.paths import predict_tracks
 from optipmb.soundness import sound
-from optipmb.tracker import Tracker
+from optipmb.tracker import Modules, Tracker
 
 
 def kernels() -> dict[str, Any]:
@@ -86,3 +86,4 @@ def _run() -> None:
     predict_tracks(result.tracks, [0.5], parameters)
     with suppress(EffortError):
         Tracker(parameters, max_pairs=8).step(posterior, given)
+    Tracker(parameters, Modules(habm=False)).step(posterior, given)
