@@ -33,6 +33,8 @@ class Proxy:
         self._whole.set()
         self._sockets: list[socket.socket] = []
         self._threads: list[threading.Thread] = []
+        self.delivered = 0
+        """Bytes passed on to those that connected here."""
         self.endpoint = free_endpoint()
         self.address = self.endpoint.removeprefix("tcp/")
 
@@ -86,7 +88,7 @@ class Proxy:
                     source.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                     way: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
                     self._start(self._take, source, way)
-                    self._start(self._give, sink, way)
+                    self._start(self._give, sink, way, sink is near)
 
     def _take(self, source: socket.socket, way: queue.SimpleQueue[tuple[float, bytes]]) -> None:
         data = b"-"
@@ -97,7 +99,7 @@ class Proxy:
                 data = b""
             way.put((time.monotonic() + self._delay_s, data))
 
-    def _give(self, sink: socket.socket, way: queue.SimpleQueue[tuple[float, bytes]]) -> None:
+    def _give(self, sink: socket.socket, way: queue.SimpleQueue[tuple[float, bytes]], counts: bool) -> None:  # noqa: FBT001 - of a thread
         with contextlib.suppress(OSError):  # the other side has gone
             while True:
                 due, data = way.get()
@@ -107,3 +109,4 @@ class Proxy:
                     sink.shutdown(socket.SHUT_WR)
                     return
                 sink.sendall(data)
+                self.delivered += len(data) if counts else 0

@@ -70,7 +70,7 @@ class Inputs(Protocol):
         on_frame: Callable[[Packet], None],
         on_cloud: Callable[[Packet], None],
         noticed: Callable[[str, bool], bool],
-        passed_by: Callable[[int], None],
+        passed_by: Callable[[str, int], None],
         answered: Callable[[str], None],
     ) -> None:
         """Say where messages go, who decides which of those discovered do, who counts the rest, who hears of caches."""
@@ -104,7 +104,7 @@ class Intake:
         member: says which partitions are held.
         inputs: the network.
         standby: whether detections that no cache holds are received for a takeover.
-        linger_s: how long streams are received whose partition was left.
+        linger_s: how long streams are received whose partition was left, unless its holder has asked before.
         idle_s: silence after which a stream without a token is announced no longer.
     """
 
@@ -122,6 +122,7 @@ class Intake:
         self._lock = threading.Lock()
         self._came: set[int] = set()
         self._left: dict[int, int] = {}
+        self._received: set[int] = set()
         self._owed: set[str] = set()
         self._handed = threading.Condition()
         self._wake = threading.Event()
@@ -167,24 +168,38 @@ class Intake:
         return sum(not self._member.holds(session_of(stream)) for stream in self._directory.streams())
 
     def hand_over(self, sessions: Iterable[str], give: Callable[[Packet], None]) -> None:
-        """Give what was received lately of sessions that are tracked elsewhere now, the oldest first.
+        """Give what was received lately of sessions that are tracked elsewhere now, the oldest first."""
+        sessions = list(sessions)
+        asked = [session for session in sessions if self._may_have(session)]
+        if asked:
+            self._drain(asked)
+            for packet in self._registry.recent(asked):
+                give(packet)
+            with self._handed:
+                self._owed.difference_update(asked)
+                self._handed.notify_all()
+        # Who asks has subscribed already.
+        still = {partition_of(session) for session in self._owed.copy()}
+        with self._lock:
+            for partition in {partition_of(session) for session in sessions} - still:
+                self._left.pop(partition, None)
+        self._wake.set()
 
-        It waits for what is on its way through this process, for a moment at most.
-        """
-        asked = [session for session in sessions if self._registry.is_foreign(session)]
-        if not asked:
-            return
+    def _may_have(self, session: str) -> bool:
+        """Whether something of a session that is tracked elsewhere may have come, or be on its way through here."""
+        if self._member.holds(session):
+            return False
+        subscribed = DISCOVERY in self._received or partition_of(session) in self._received
+        return subscribed or self._registry.is_foreign(session)
+
+    def _drain(self, sessions: list[str]) -> None:
+        """Wait for what is on its way through this process, for a moment at most."""
         ends = time.monotonic() + DRAIN_S
         passed = threading.Event()
         self._inputs.pass_through(passed.set)
         passed.wait(DRAIN_S)
-        while any(self._registry.waits(session) for session in asked) and time.monotonic() < ends:
+        while any(self._registry.waits(session) for session in sessions) and time.monotonic() < ends:
             time.sleep(DRAIN_POLL_S)
-        for packet in self._registry.recent(asked):
-            give(packet)
-        with self._handed:
-            self._owed.difference_update(asked)
-            self._handed.notify_all()
 
     def handed_over(self, timeout: float) -> bool:
         """Wait until who has the partitions that were left has asked, at most so long (s); False when that was it."""
@@ -243,7 +258,7 @@ class Intake:
         with self._lock:
             came, self._came = self._came, set()
             self._left = {partition: until for partition, until in self._left.items() if until > now_ns}
-            received = held | self._left.keys()
+            received = self._received = held | self._left.keys()
         everything = len(held) == PARTITIONS
         discovering = DISCOVERY in held
         self._directory.expire(now_ns, discovering=discovering)

@@ -273,13 +273,14 @@ class Registry:
 
     # Streams that come here, or have left
 
-    def passed_by(self, size: int) -> None:
-        """Count detections that were received, and are of no use here."""
-        self._metrics.foreign("detections", size)
+    def passed_by(self, key: str, size: int) -> None:
+        """Count detections that were discovered and are of no use here, unless they come by a subscription as well."""
+        if not self._member.holds(self.parsed(key)[1]):
+            self._metrics.foreign("detections", size)
 
     def is_foreign(self, session: str) -> bool:
-        """Whether something may have been kept of a session that is not tracked here."""
-        return session in self._foreign and not self._member.holds(session)
+        """Whether something may have been kept of a session for a takeover."""
+        return session in self._foreign
 
     def foreign(self, partitions: Container[int]) -> set[str]:
         """Return the sessions of partitions of which something is kept for a takeover."""
@@ -380,10 +381,10 @@ class Registry:
             actors = [actor for actor in self._actors.values() if partition_of(actor.stream) == partition]
         now_ns = time.monotonic_ns()
         for actor in actors:
-            actor.tell(told)
-            with self._foreign_lock:
+            with self._foreign_lock:  # before the session ends: what comes from then on is kept for who asks
                 if actor.session is not None and not self._member.holds(actor.stream):
                     self._foreign.setdefault(actor.stream, self._context.buffer()).seen_ns = now_ns
+            actor.tell(told)
 
     def resume(self) -> None:
         """Send workers to all streams: they paused, and need not any longer."""

@@ -85,13 +85,12 @@ class Topic:
         put = self._waiting.put  # all that is done on the thread of the network
         try:
             if passing is None:
-                take: Any = zenoh.handlers.Callback(put, indirect=False)
                 subscriber: Undeclared = zenoh.ext.declare_advanced_subscriber(
-                    self._session, key, take, history=NEWEST, recovery=RECOVERY
+                    self._session, key, _directly(put), history=NEWEST, recovery=RECOVERY
                 )
             else:
-                take = zenoh.handlers.Callback(lambda sample: put(partial(passing, sample)), indirect=False)
-                subscriber = self._session.declare_subscriber(key, take)
+                passed = _directly(lambda sample: put(partial(passing, sample)))
+                subscriber = self._session.declare_subscriber(key, passed)
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
         self._subscribers[name] = subscriber
@@ -130,3 +129,12 @@ class Topic:
             work()
         except Exception:
             log.exception("internal_error", reader=self._name)  # one message must not end the reading
+
+
+def _directly(take: Callable[[zenoh.Sample], None]) -> tuple[Any, None]:
+    """Have samples handed over on the thread of the network.
+
+    A pair with something that could be read: with a callback alone Zenoh lets a subscription run in the background, and
+    what it has declared for recovery beside it is not withdrawn with it.
+    """
+    return zenoh.handlers.Callback(take, indirect=False), None

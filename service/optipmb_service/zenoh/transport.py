@@ -81,7 +81,7 @@ class Transport:
         on_frame: Callable[[Packet], None],
         on_cloud: Callable[[Packet], None],
         noticed: Callable[[str, bool], bool],
-        passed_by: Callable[[int], None],
+        passed_by: Callable[[str, int], None],
         answered: Callable[[str], None],
     ) -> None:
         """Hand over the detections and point clouds that are subscribed to, each on a thread of its own.
@@ -91,15 +91,16 @@ class Transport:
             on_cloud: takes clouds.
             noticed: told of detections that come by a subscription to all, by key and whether they can be recovered;
                 where that is `discovery`, those alone are handed over for which it returns True.
-            passed_by: told the sizes of the others.
+            passed_by: told the keys and sizes of the others.
             answered: told a key when all detections have been handed over that a publisher's cache held.
         """
 
         def discover(sample: zenoh.Sample) -> None:
-            if noticed(str(sample.key_expr), sample.source_info is not None):
+            key = str(sample.key_expr)
+            if noticed(key, sample.source_info is not None):
                 self._receive(sample, on_frame)
             else:
-                passed_by(len(sample.payload))
+                passed_by(key, len(sample.payload))
 
         def detected(sample: zenoh.Sample) -> None:
             if self._all:
