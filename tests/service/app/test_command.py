@@ -191,7 +191,7 @@ def test_a_cluster_without_its_extra_is_one_clear_line(
     monkeypatch.setattr(nats, "program", lambda: None)
     refused(capsys, monkeypatch, "nats", says=line)
     monkeypatch.setitem(sys.modules, "nats.aio.client", None)
-    for module in ("jetstream", "nats_connection"):
+    for module in ("jetstream", "nats_connection", "nats_access"):
         monkeypatch.delitem(sys.modules, f"optipmb_service.cluster.{module}", raising=False)
     refused(capsys, monkeypatch, "--cluster", "nats://127.0.0.1:4222", says=line)
 
