@@ -155,7 +155,7 @@ class LeaseTable:
         position: the highest revision seen.
         held: partitions that it holds, each with its fence; may be read by any thread.
         leaving: of these, those that it is about to leave, since when.
-        draining: whether it is to hold none.
+        draining: whether others are to have what it holds.
         wanting: whether it has fewer partitions than it is to have.
         changed_ns: when something but a renewal was seen last.
     """
@@ -215,11 +215,15 @@ class LeaseTable:
 
     def members(self) -> list[str]:
         """Return the living members with this one, by id."""
-        return sorted([self.member, *(name for name, one in self._members.items() if one.alive)])
+        return sorted([self.member, *(name for name, one in self._all() if one.alive)])
+
+    def _all(self) -> tuple[tuple[str, _Watched], ...]:
+        """Return the other members, in one go: any thread may ask, while the member's own takes in more."""
+        return tuple(self._members.items())
 
     def takers(self) -> list[str]:
         """Return the living members that do not drain, by id."""
-        others = [name for name, one in self._members.items() if one.alive and one.state != DRAINING]
+        others = [name for name, one in self._all() if one.alive and one.state != DRAINING]
         return sorted(others if self.draining else [self.member, *others])
 
     def leases(self, renewed_ns: int, now_ns: int) -> list[MemberLease]:
@@ -228,7 +232,7 @@ class LeaseTable:
         for partition, (fence, holder) in sorted(tuple(self._partitions.items())):  # noqa: C414 - in one go, for the member's thread writes it
             held.setdefault(holder, {})[partition] = fence
         own = DRAINING if self.draining else ALIVE
-        known = [(name, one.state, one.seen_ns) for name, one in tuple(self._members.items()) if one.alive]
+        known = [(name, one.state, one.seen_ns) for name, one in self._all() if one.alive]
         return [
             MemberLease(name, state, max(0, now_ns - seen_ns), held.get(name, {}))
             for name, state, seen_ns in sorted([(self.member, own, renewed_ns), *known])
@@ -301,10 +305,10 @@ class LeaseTable:
             self._set(int(name), revision, write.value)
 
     def _share(self) -> int:
-        """Return how many of all partitions are an equal share of this member."""
-        if self.draining:
+        """Return how many of all partitions are an equal share of this member; who drains has one where all do."""
+        members = self.takers() or self.members()
+        if self.member not in members:
             return 0
-        members = self.takers()
         each, rest = divmod(PARTITIONS, len(members))
         return each + (members.index(self.member) < rest)
 

@@ -328,17 +328,29 @@ def test_who_drains_holds_nothing(make: Make) -> None:
 
 
 def test_the_last_member_drains_in_vain(make: Make) -> None:
-    """Nobody is there to take what it leaves, so nobody waits for that."""
+    """Nobody is there to take what it leaves: nobody waits for that, and it goes on tracking.
+
+    That also holds for members that all drain: each keeps its share.
+    """
     one, other = HandMember("a", make()), HandMember("b", make())
     even(one, other)
     for member in (one, other):
         assert member.member.others
         member.member.drain()
-    for _ in range(3):
-        assert one.turn(TICK_S)
+    # At first the one sees the other stay, and begins to leave.
+    assert one.turn(TICK_S)
+    for _ in range(5):
         assert other.turn(TICK_S)
+        assert one.turn(TICK_S)
     assert not one.member.others
     assert one.member.drained(0.0)
+    assert [len(member.held) for member in (one, other)] == [PARTITIONS // 2] * 2
+    alone = HandMember("c", MemoryLeases(Shared()))
+    even(alone)
+    alone.member.drain()
+    for _ in range(5):
+        assert alone.turn(TICK_S)
+        assert len(alone.held) == PARTITIONS
 
 
 def test_an_orderly_end_waits_for_a_slow_store() -> None:
