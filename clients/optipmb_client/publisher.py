@@ -167,14 +167,16 @@ class Publisher:
                 pose=_pose(pose),
                 labels=names,
                 label=index,
-                center=_array(center, 3),
-                size=_array(size, 3),
-                yaw=_array(yaw),
-                velocity=None if velocity is None else _array(velocity, 2),
-                score=_array(score),
+                center=_array("center", center, 3),
+                size=_array("size", size, 3),
+                yaw=_array("yaw", yaw),
+                velocity=None if velocity is None else _array("velocity", velocity, 2),
+                score=_array("score", score),
                 has_points=has_points,
                 field_of_view=field_of_view,
-                position_covariance=None if position_covariance is None else _array(position_covariance, 3, 3),
+                position_covariance=None
+                if position_covariance is None
+                else _array("position_covariance", position_covariance, 3, 3),
             )
             payload = self._detections.pack(message)
             if cloud is not None:
@@ -212,7 +214,7 @@ class Publisher:
                 stamp_ns=_stamp(stamp_ns),
                 frame=self.frame,
                 pose=_pose(pose),
-                xyz=numeric.finite(_array(points, 3)),
+                xyz=numeric.finite(_array("xyz", points, 3)),
             )
         )
 
@@ -220,7 +222,7 @@ class Publisher:
 def _labelled(label: Any, labels: Sequence[str] | None) -> tuple[tuple[str, ...], Any]:
     """Return class names and indices (M,) into them, from either form that `publish` takes."""
     if labels is not None:
-        return tuple(labels), _array(label)
+        return tuple(labels), _array("label", label)
     if isinstance(label, str) or not isinstance(label, Iterable):
         raise MessageError("invalid_value", "label", "a list of class names", repr(label)[:80])
     names = list(label)
@@ -231,9 +233,16 @@ def _labelled(label: Any, labels: Sequence[str] | None) -> tuple[tuple[str, ...]
     return tuple(index), array.array("q", [index[name] for name in names])
 
 
-def _array(values: Any, *columns: int) -> Any:
-    """Return lists as they are (errors then name the element), all else as arrays; a table without rows as a list."""
-    rows = values if isinstance(values, list | tuple) else numeric.asarray(values)
+def _array(name: str, values: Any, *columns: int) -> Any:
+    """Return lists as they are (errors then name the element), all else as arrays; a table without rows as a list.
+
+    Raises:
+        MessageError: They are a buffer of something else than numbers; names the field.
+    """
+    try:
+        rows = values if isinstance(values, list | tuple) else numeric.asarray(values)
+    except MessageError as error:
+        raise error.under(name) from None
     return [] if columns and getattr(rows, "shape", None) == (0,) else rows
 
 
@@ -252,4 +261,4 @@ def _pose(pose: PoseLike | None) -> Pose | None:
         translation, quaternion = pose
     except (TypeError, ValueError):
         raise MessageError("invalid_value", "pose", "a pair: translation, quaternion", type(pose).__name__) from None
-    return Pose(translation=_array(translation), quaternion=_array(quaternion))
+    return Pose(translation=_array("pose.translation", translation), quaternion=_array("pose.quaternion", quaternion))

@@ -1,5 +1,6 @@
 """The services, streams and members of a network as tables."""
 
+import re
 from collections.abc import Iterable, Sequence
 
 from optipmb_schemas import MemberSummary, Problem, ServiceStatus, SessionSummary
@@ -15,6 +16,9 @@ TEXTS = 3
 """Columns of texts; the others are of numbers."""
 
 SHOWN_PROBLEMS = 5
+
+WORKER = re.compile(r"-w\d+$")
+"""What follows the instance in the name of one of its workers."""
 
 NAME = 32
 """Characters of a member's name in a line."""
@@ -37,7 +41,8 @@ def members_of(services: Iterable[ServiceStatus]) -> list[MemberSummary]:
     members: dict[str, tuple[bool, float, MemberSummary]] = {}
     for service in services:
         for one in service.members:
-            own = one.member.startswith((f"{service.instance}/", f"{service.instance}-w"))
+            name = one.member.rpartition("/")[0]
+            own = service.instance in {name, WORKER.sub("", name)}
             known = (not own, one.age_s, one)
             if one.member not in members or known[:2] < members[one.member][:2]:
                 members[one.member] = known

@@ -31,7 +31,9 @@ from optipmb_schemas.structure import Span, check_json, check_msgpack
 
 try:
     from optipmb_schemas.compact import read_detections
-except ModuleNotFoundError:  # without numpy the models read every form
+except ModuleNotFoundError as missing:  # without numpy the models read every form
+    if missing.name != "numpy":
+        raise
 
     def read_detections(payload: bytes, limits: Limits) -> Detections | None:  # noqa: ARG001, D103  the other one's
         return None

@@ -60,10 +60,10 @@ class TracksRequest(Message):
 
 
 class MoveRequest(Message):
-    """Query `service/<instance>/q/move`: give a stream to another worker process. The reply repeats it when it is done.
+    """Query `service/<instance>/q/move`: move a stream to a worker of this instance, from wherever it is.
 
-    All streams of its partition go with it, and stay until they are moved again. A stream may be moved before its first
-    message.
+    The reply repeats it when it is done. All streams of its partition go with it, and stay until they are moved again.
+    A stream may be moved before its first message.
     """
 
     stream: Stream = Field(description="Name of the stream.")

@@ -6,6 +6,7 @@ described here and nowhere else: the JSON Schemas and the tables of the document
 """
 
 import math
+import sys
 from itertools import chain
 from typing import Annotated, Any, Final, Literal
 
@@ -27,6 +28,8 @@ NARROWEST = 1e-3
 """Least width of a field of view, rad."""
 LEAST_VARIANCE = 1e-8
 """Least variance of a position along any axis, m^2."""
+ROUNDING = 8 * sys.float_info.epsilon
+"""Share of the sum of variances by which one of them may be beyond its limit: errors of computation are smaller."""
 SYMMETRY = 1e-6
 """Share of the largest variance by which opposite entries of a covariance may differ: those of float32 do."""
 
@@ -336,15 +339,17 @@ def _is_covariance(matrix: Any) -> Any:
         gap = abs(one - other) / SYMMETRY
         good = good & ((gap <= xx) | (gap <= yy) | (gap <= zz))
     mixed = (0.5 * (xy + yx), 0.5 * (xz + zx), 0.5 * (yz + zy))
-    good = good & _semidefinite(xx - LEAST_VARIANCE, yy - LEAST_VARIANCE, zz - LEAST_VARIANCE, *mixed)
-    return good & _semidefinite(FAR - xx, FAR - yy, FAR - zz, *(-one for one in mixed))
+    rounding = ROUNDING * (xx + yy + zz)
+    least, most = LEAST_VARIANCE - rounding, FAR + rounding
+    good = good & _semidefinite(xx - least, yy - least, zz - least, *mixed)
+    return good & _semidefinite(most - xx, most - yy, most - zz, *(-one for one in mixed))
 
 
 def _semidefinite(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Any:
-    """Return whether no principal minor, and so no eigenvalue, of a symmetric matrix is negative."""
-    determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    minors = (yy, zz, xx * yy - xy * xy, xx * zz - xz * xz, yy * zz - yz * yz, determinant)
-    good = xx >= 0.0
-    for minor in minors:
-        good = good & (minor >= 0.0)
-    return good
+    """Return whether no eigenvalue of a symmetric matrix is negative.
+
+    Cholesky's steps without the divisions: its errors of rounding are in proportion to the largest eigenvalue. Those of
+    a determinant as one sum are in proportion to its cube, and exceed the smallest eigenvalues of a long ellipsoid.
+    """
+    second, third, mixed = xx * yy - xy * xy, xx * zz - xz * xz, xx * yz - xy * xz
+    return (xx > 0.0) & (second >= 0.0) & (third >= 0.0) & (second * third >= mixed * mixed)

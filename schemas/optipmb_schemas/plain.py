@@ -2,6 +2,8 @@
 
 import array
 import math
+import operator
+import struct
 import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Final
@@ -70,7 +72,12 @@ class Numbers:
         return self.shape[0]
 
     def __getitem__(self, row: int) -> Any:
-        number = range(len(self))[row]
+        try:
+            at = operator.index(row)
+        except TypeError:
+            needs = "slices and several indices need numpy: pip install 'optipmb-node[arrays]'"
+            raise TypeError(needs) from None
+        number = range(len(self))[at]
         if len(self.shape) == 1:
             return self.flat[number]
         width = math.prod(self.shape[1:])
@@ -78,6 +85,9 @@ class Numbers:
 
     def __iter__(self) -> Iterator[Any]:
         return map(self.__getitem__, range(len(self)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuilt, (self.tobytes(), self.flat.format, self.shape)
 
     def __repr__(self) -> str:
         return f"Numbers({self.tolist()})"
@@ -99,9 +109,14 @@ def given(value: object) -> Numbers | None:
     if not isinstance(value, memoryview | array.array):
         return None
     view = memoryview(value)
-    if view.format not in _BUFFERS:
+    code = view.format.lstrip("<=@")
+    if code not in _BUFFERS or view.itemsize != struct.calcsize(code):
         raise MessageError("invalid_value", "", "a buffer of numbers", cut(f"one of format {view.format}"))
-    return Numbers(_flat(view.tobytes(), view.format), tuple(view.shape or ()))
+    return Numbers(_flat(view.tobytes(), code), tuple(view.shape or ()))
+
+
+def _rebuilt(data: bytes, code: str, shape: tuple[int, ...]) -> Numbers:
+    return Numbers(_flat(data, code), shape)
 
 
 def _flat(data: bytes | memoryview, code: str) -> memoryview:
@@ -152,6 +167,8 @@ def canonical(numbers: Numbers, description: "Array") -> Numbers:
 def first_outside(numbers: Numbers, description: "Array") -> int | None:
     """Return which number of a non-empty array is the first out of its range; None: none is."""
     low, high, flat = description.low, description.high, numbers.flat
+    if flat.format == "f":  # as numpy compares them
+        low, high = array.array("f", (low, high))
     if description.above:
         outside = [at for at, value in enumerate(flat) if not low < value <= high]  # a NaN is never within
     else:

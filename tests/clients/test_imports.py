@@ -1,6 +1,7 @@
 """Which way dependencies run: the client knows the messages, and the tracker for offline tracking alone."""
 
 import ast
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -40,3 +41,23 @@ def test_the_tracker_is_imported_for_offline_tracking_alone() -> None:
 def test_zenoh_is_imported_in_one_module() -> None:
     """Only transport.py imports zenoh."""
     assert importers("zenoh") == {"transport.py"}
+
+
+def test_the_node_distribution_has_what_it_imports() -> None:
+    """Every module of the client that a module of `optipmb-node` imports is in that distribution, too."""
+    root = Path(optipmb_client.__file__).parent
+    project = tomllib.loads((root.parents[1] / "node/pyproject.toml").read_text())
+    places = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"].values()
+    given = [root.parent / place for place in places if place.startswith("optipmb_client")]
+    files = {file for place in given for file in (place.rglob("*.py") if place.is_dir() else [place])}
+    assert all(file.exists() or file.name == "LICENSE" for file in files)
+    missing = {
+        name
+        for file in files
+        if file.suffix == ".py"
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("optipmb_client.")
+        for name in [str(node.module)]
+        if not {root.parent / f"{name.replace('.', '/')}{end}" for end in (".py", "/__init__.py")} & files
+    }
+    assert missing == set()

@@ -8,8 +8,8 @@ from fake_service import FakeService
 from optipmb_client import Connection
 from optipmb_client.cli import run
 from optipmb_client.sessions import find_services
-from optipmb_client.status import render
-from optipmb_schemas import Problem, ServiceStatus
+from optipmb_client.status import members_of, render
+from optipmb_schemas import MemberSummary, Problem, ServiceStatus
 from rich.console import Console
 
 
@@ -38,6 +38,22 @@ def test_json_holds_the_messages(endpoint: str, capsys: pytest.CaptureFixture[st
     (service,) = json.loads(capsys.readouterr().out)["services"]
     assert service["instance"] == "fake"
     assert service["sessions"][0]["frames"] == 1234
+
+
+def test_members_are_told_by_their_own_instance() -> None:
+    """Of a member, and of the workers of an instance, what it says itself counts; other names only begin alike."""
+
+    def member(name: str, age_s: float) -> MemberSummary:
+        """A member that was heard of so long ago."""
+        return MemberSummary(member=name, state="alive", age_s=age_s, partitions=(), fences=())
+
+    def service(instance: str, age_s: float) -> ServiceStatus:
+        """The status of an instance that heard of both so long ago."""
+        heard = (member("a-w1/0", age_s), member("a-west/0", age_s))
+        return ServiceStatus(instance=instance, version="1", started_ns=0, uptime_s=1.0, state="ready", members=heard)
+
+    told = {one.member: one.age_s for one in members_of([service("a", 2.0), service("a-west", 3.0), service("b", 1.0)])}
+    assert told == {"a-w1/0": 2.0, "a-west/0": 3.0}
 
 
 def test_every_service_is_found(endpoint: str) -> None:

@@ -11,6 +11,9 @@ from google.protobuf import descriptor_pool
 from google.protobuf.message_factory import GetMessageClass
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoReflectionDescriptorDatabase
+from optipmb_client import ClientError
+from optipmb_client.grpc import GrpcConnection
+from optipmb_schemas import Keys
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from routers import free_endpoint, open_router
 
@@ -84,6 +87,12 @@ def test_without_a_service_the_answer_is_unavailable() -> None:
         assert raised.value.code() == grpc.StatusCode.UNAVAILABLE
         assert "no tracking service" in raised.value.details()
         assert len(stub.ListStreams(pb.ListStreamsRequest()).streams) == 0
+
+
+def test_what_the_gateway_lacks_is_an_error(gateway: GatewayProcess) -> None:
+    """Tracks of the past come over Zenoh alone."""
+    with GrpcConnection([gateway.address]) as connection, pytest.raises(ClientError, match="connect to Zenoh"):
+        connection.query(Keys().query("a/b/c", "tracks"))
 
 
 def test_a_health_probe(gateway: GatewayProcess) -> None:

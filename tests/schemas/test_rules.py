@@ -20,6 +20,8 @@ from optipmb_schemas import (
     decode,
     encode,
     encode_json,
+    messages,
+    numeric,
 )
 
 
@@ -65,6 +67,20 @@ def test_covariances_of_some_objects_survive(detections: Detections) -> None:
     root = np.random.default_rng(0).normal(0, 1, (3, 3, 3))
     single = (root @ root.transpose(0, 2, 1) + 0.01 * np.eye(3)).astype("f4")
     Detections(**(dict(detections.present()) | {"position_covariance": single}))
+
+
+@pytest.mark.parametrize("spread", [(0.99e8, 0.1, 0.1), (1.0, 1.01e-8, 1.01e-8), (1e8, 1e8, 1e8), (1e-8, 1e-8, 1e-8)])
+def test_long_ellipsoids_are_covariances(spread: tuple[float, ...]) -> None:
+    """However a matrix with eigenvalues within the limits is turned, it is one; with a negative one it is none."""
+    turns, _ = np.linalg.qr(np.random.default_rng(2).normal(0, 1, (2000, 3, 3)))
+
+    def accepted(*values: float) -> list[bool]:
+        matrices = turns * np.array(values) @ turns.transpose(0, 2, 1)
+        return numeric.of_each_matrix(messages._is_covariance, matrices)
+
+    assert all(accepted(*spread))
+    assert not any(accepted(spread[0], spread[1], -1e-3 * spread[1] - 1e-14 * spread[0]))
+    assert not any(accepted(spread[0], spread[1], 1.0001e8))
 
 
 def test_paths_of_no_tracks_are_a_message(examples: dict[str, Message]) -> None:

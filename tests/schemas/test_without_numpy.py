@@ -1,14 +1,19 @@
 """Messages where numpy cannot be imported are the same messages: same bytes, same errors."""
 
+import array
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
 import msgpack
 import numpy as np
 from message_rules import NAN, RULES, plain
-from optipmb_schemas import Detections, Message, encode, encode_json
-from without_numpy import Case, outcome, outcomes_without
+from optipmb_schemas import Detections, Message, encode, encode_json, numeric
+from optipmb_schemas import plain as plain_numbers
+from optipmb_schemas.arrays import Array
+from without_numpy import Case, command, outcome, outcomes_without
 
 
 def random_detections(detections: Detections) -> Iterator[Case]:
@@ -80,3 +85,48 @@ def test_the_same_messages_and_errors(examples: dict[str, Message], detections: 
     for case, found in zip(cases, without, strict=True):
         assert found == outcome(*case), case
     assert 100 < sum(isinstance(found, str) for found in without) < len(cases) - 100
+
+
+def test_numbers_without_numpy_are_python_objects_like_others() -> None:
+    """They can be pickled and copied; buffers of other libraries are read; what needs numpy says so."""
+    code = """
+import copy, ctypes, pickle
+from optipmb_schemas import MessageError
+from optipmb_schemas.arrays import numeric
+center = numeric.given(memoryview(bytes(48)).cast("d", (2, 3)))
+for again in (pickle.loads(pickle.dumps(center)), copy.deepcopy(center), copy.copy(center)):
+    assert (again.tolist(), again.shape, again.dtype) == ([[0.0] * 3] * 2, (2, 3), "float64")
+assert pickle.loads(pickle.dumps(numeric.of_leaves([], "f8", (0, 3)))).shape == (0, 3)
+for wrong in (slice(1), (0, 1)):
+    try:
+        center[wrong]
+    except TypeError as error:
+        assert "optipmb-node[arrays]" in str(error)
+    else:
+        raise AssertionError(wrong)
+assert numeric.given(memoryview((ctypes.c_double * 2)(1, 2))).tolist() == [1, 2]
+assert numeric.given(memoryview((ctypes.c_int64 * 2)(1, 2))).tolist() == [1, 2]
+try:
+    numeric.given(memoryview((ctypes.c_bool * 2)()))
+except MessageError:
+    pass
+else:
+    raise AssertionError
+"""
+    subprocess.run(command(code), check=True, timeout=60)
+
+
+def test_a_limit_of_float32_is_the_same_without_numpy() -> None:
+    """What rounds to a limit is within it."""
+    description = Array("f4", ("P",), -0.1, 0.1)
+    limits = array.array("f", (-0.1, 0.1))
+    assert plain_numbers.first_outside(plain_numbers.Numbers(memoryview(limits), (2,)), description) is None
+    assert numeric.first_outside(np.array(limits, "f4"), description) is None
+
+
+def test_only_numpy_may_be_missing() -> None:
+    """A module that is missing besides is an error where the messages are imported."""
+    missing = "optipmb_schemas.compact"
+    code = f"import sys; sys.modules[{missing!r}] = None\nimport optipmb_schemas.codec"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert f"import of {missing} halted" in done.stderr

@@ -20,6 +20,7 @@ from optipmb_schemas import (
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
+from optipmb_client.errors import ClientError
 from optipmb_client.grpc.channels import Channels, from_gateway, lasting
 from optipmb_client.grpc.publishing import GrpcSender, Publishing
 from optipmb_client.grpc.subscribing import GrpcSubscription
@@ -80,9 +81,14 @@ class GrpcConnection:
 
         Returns:
             The answer; an error as a problem; nothing when no service answers.
+
+        Raises:
+            ClientError: it is another query.
         """
         head, _, name = key.rpartition("/q/")
         stream = "/".join(head.split("/")[-3:])
+        if name not in _QUERIES:
+            raise ClientError(f"q/{name} is not offered over gRPC; connect to Zenoh")
         method, request, field, kind = _QUERIES[name](stream, payload, encoding)
         call, channel = self._channels.call(method)
         try:

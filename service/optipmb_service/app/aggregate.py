@@ -22,7 +22,7 @@ from optipmb_service.observability.health import STUCK_S
 from optipmb_service.observability.metrics import Collected, ReadOnDemand, families
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.ports import TransportError
-from optipmb_service.runtime.queries import drain_asked, move_asked
+from optipmb_service.runtime.queries import UNDRAINED, drain_asked, move_asked
 from optipmb_service.session.problems import problem_of
 
 if TYPE_CHECKING:
@@ -225,7 +225,7 @@ class AggregateView:
         payload, encoding = schemas.encode(asked), schemas.encoding_of(schemas.DrainRequest)
         answers = list(self._asking.map(lambda key: self._network.ask(key, MOVE_S, payload, encoding), keys))
         if None in answers:
-            raise schemas.MessageError("invalid_value", "drain", "members that take the streams", "not all in time")
+            raise schemas.MessageError("invalid_value", "drain", "members that take the streams", UNDRAINED)
         request.answer(request.key, asked)
 
     def _members(self) -> tuple[schemas.MemberSummary, ...]:

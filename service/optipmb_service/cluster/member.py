@@ -167,9 +167,10 @@ class Member:
         self._wake.set()
 
     def drained(self, timeout: float) -> bool:
-        """Wait until nothing is held, or nobody is there to take it, at most so long (s); False when that was it."""
+        """Wait until nothing is held, or nobody is there to take it, at most so long (s); return whether it is left."""
         with self._came:
-            return self._came.wait_for(lambda: not (self._table.held and self.others), timeout)
+            self._came.wait_for(lambda: not (self._table.held and self.others), timeout)
+            return not self._table.held
 
     def leases(self) -> list[MemberLease]:
         """Return the living members as this one knows them."""

@@ -46,6 +46,9 @@ JSON = "application/json"
 MOVE_S = 15.0
 """How long a stream may take to be moved; it takes a second."""
 
+UNDRAINED = "not all taken in time; it goes on draining until that is undone"
+"""Why a drain was not confirmed."""
+
 MOVES = 16
 """Moves that wait for each other."""
 
@@ -163,7 +166,8 @@ class Queries:
         received = "none" if asked.drain and not self._member.others else ""
         if not received:
             self._member.drain(drains=asked.drain)
-            received = "" if not asked.drain or self._member.drained(MOVE_S) else "not all streams taken in time"
+            if asked.drain and not self._member.drained(MOVE_S):
+                received = UNDRAINED
         if received:
             failed = schemas.MessageError("invalid_value", "drain", "another member that takes the streams", received)
             request.refuse(self._problem("", failed))
