@@ -111,10 +111,10 @@ class LateJoin(Generic[_S]):
         if first:
             self._ask_before(sample.key_expr, source, info.source_sn)
 
-    def forget(self, keys: Container[str]) -> None:
-        """Forget the publishers of some keys: when they are heard again, what their caches hold is asked for anew."""
+    def keep(self, keys: Container[str]) -> None:
+        """Forget the publishers of all other keys: when they are heard again, their caches are asked once more."""
         with self._lock:
-            for source in [one for one, key in self._keys.items() if key in keys and self._sources[one] is None]:
+            for source in [one for one, key in self._keys.items() if key not in keys and self._sources[one] is None]:
                 del self._sources[source], self._keys[source]
 
     def close(self) -> None:

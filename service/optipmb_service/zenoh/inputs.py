@@ -19,13 +19,14 @@ import zenoh
 import zenoh.ext
 from optipmb_schemas.late_join import LateJoin
 
+from optipmb_service.runtime.intake import ALL
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import line
 from optipmb_service.zenoh.handles import undeclare
 from optipmb_service.zenoh.subscription import ask_cache
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from optipmb_service.zenoh.handles import Undeclared
 
@@ -63,8 +64,8 @@ class Topic:
         self._name = name
         self._session = session
         self._receive = receive
-        self._waiting: queue.Queue[zenoh.Sample | Callable[[], None] | None] = queue.Queue(waiting)
-        self._subscribers: dict[str, Undeclared] = {}
+        self._waiting: queue.Queue[zenoh.Sample | Callable[[], object] | None] = queue.Queue(waiting)
+        self._subscribers: dict[str, tuple[str, Undeclared]] = {}
         self._late_join: LateJoin[zenoh.Sample] = LateJoin(
             self._hand_over, lambda *asked: ask_cache(session, *asked), answered
         )
@@ -75,7 +76,7 @@ class Topic:
         """Receive what is published under a key expression from now on, and what caches hold of it.
 
         Args:
-            name: of the subscription.
+            name: of the subscription; `ALL` for that of all streams.
             key: the key expression.
             passing: called for each sample, on the thread, instead of the topic's function; nothing is recovered then.
 
@@ -93,20 +94,27 @@ class Topic:
                 subscriber = self._session.declare_subscriber(key, passed)
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
-        self._subscribers[name] = subscriber
+        self._subscribers[name] = key, subscriber
 
-    def leave(self, name: str, key: str = "") -> None:
-        """Withdraw a subscription; what came before is handed over. When the key comes again, its caches are asked."""
-        undeclare(self._subscribers.pop(name))
-        self._late_join.forget({key})
+    def leave(self, names: Iterable[str]) -> None:
+        """Withdraw subscriptions; what came before is handed over. Caches are asked again when their keys come again.
 
-    def pass_through(self, then: Callable[[], None]) -> None:
+        While all streams are received, none has gone.
+        """
+        left = [self._subscribers.pop(name) for name in names]
+        for _, subscriber in left:
+            undeclare(subscriber)
+        if left and ALL not in self._subscribers:
+            kept = frozenset(key for key, _ in self._subscribers.values())
+            self._waiting.put(partial(self._late_join.keep, kept))  # after what waits, which would be known again
+
+    def pass_through(self, then: Callable[[], object]) -> None:
         """Call `then`, on the thread, when all that has come until now is handed over."""
         self._waiting.put(then)
 
     def close(self, timeout: float) -> None:
         """End it; what came before is handed over within `timeout` seconds, and nothing afterwards."""
-        for subscriber in self._subscribers.values():
+        for _, subscriber in self._subscribers.values():
             undeclare(subscriber)
         self._subscribers.clear()
         if self._thread.is_alive():
@@ -124,7 +132,7 @@ class Topic:
     def _hand_over(self, sample: zenoh.Sample) -> None:
         self._guarded(partial(self._receive, sample))
 
-    def _guarded(self, work: Callable[[], None]) -> None:
+    def _guarded(self, work: Callable[[], object]) -> None:
         try:
             work()
         except Exception:

@@ -127,12 +127,15 @@ class Transport:
 
     def unsubscribe(self, inputs: Iterable[tuple[Kind, str]]) -> None:
         """Withdraw subscriptions."""
+        names: dict[str, list[str]] = {topic: [] for topic in self._topics}
         for kind, stream in inputs:
             if kind == "discovery":
-                self._topics["detections"].leave(kind)
+                names["detections"].append(kind)
             else:
                 self._all = self._all and bool(stream)
-                self._topics[kind].leave(stream, self._key(kind, stream))
+                names[kind].append(stream)
+        for topic, left in names.items():
+            self._topics[topic].leave(left)
 
     def _key(self, topic: schemas.Topic, stream: str) -> str:
         return self._keys.matching(stream, topic) if stream else self._keys.all(topic)

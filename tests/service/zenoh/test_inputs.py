@@ -1,0 +1,102 @@
+"""Subscriptions of a topic that come and go, and what is asked of the caches of publishers meanwhile."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import pytest
+from optipmb_schemas import Detections, Keys
+from optipmb_service.runtime.intake import ALL
+from optipmb_service.zenoh.handles import cached_publisher
+from optipmb_service.zenoh.inputs import Topic
+from router import Collected
+from routers import free_endpoint, open_router
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import zenoh
+
+KEYS: Final = Keys()
+STREAM: Final = "site/node/lidar"
+KEY: Final = KEYS.detections(STREAM)
+CLOSE_S: Final = 10.0
+
+
+class Network:
+    """A topic, and a publisher with a cache on the same session, where each message is with its subscribers at once."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.session = session
+        self.publisher = cached_publisher(session, KEY, Detections, 100)
+        self.received = Collected()
+        self.answered: list[str] = []
+        self.topic = Topic("detections", session, self._receive, 100, self.answered.append)
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        self.received.add(str(sample.key_expr), sample.payload.to_bytes(), "")
+
+    def publish(self, *payloads: bytes) -> None:
+        """Send messages."""
+        for payload in payloads:
+            self.publisher.put(payload)
+
+    def counts(self, *payloads: bytes) -> Counter[bytes]:
+        """How often each message was handed over, when all of these were."""
+        self.received.wait(lambda items: {*payloads} <= {one for _, one, _ in items}, repr(payloads))
+        return Counter(one for _, one, _ in self.received.items)
+
+
+@pytest.fixture
+def network() -> Iterator[Network]:
+    """A publisher that has sent two messages before anybody subscribed."""
+    with open_router(free_endpoint()) as session:
+        one = Network(session)
+        one.publish(b"0", b"1")
+        yield one
+        one.topic.close(CLOSE_S)
+
+
+def test_no_cache_is_asked_again_where_all_streams_take_over_from_one(network: Network) -> None:
+    """When a stream is received by the subscription to all from now on, nothing but its newest message comes twice."""
+    network.topic.subscribe(STREAM, KEY)
+    network.publish(b"2")
+    network.counts(b"0", b"1", b"2")
+    network.topic.subscribe(ALL, KEYS.all("detections"))
+    network.topic.leave([STREAM])
+    network.publish(b"3")
+    counts = network.counts(b"3")
+    assert (counts[b"0"], counts[b"1"], network.answered) == (1, 1, [KEY])
+
+
+@pytest.mark.parametrize(("name", "key"), [(STREAM, KEY), (ALL, KEYS.all("detections"))], ids=["one", "all"])
+def test_a_stream_that_comes_again_lacks_nothing(network: Network, name: str, key: str) -> None:
+    """What is sent while neither the stream nor all are subscribed to comes from the cache, whichever was before."""
+    network.topic.subscribe(name, key)
+    network.publish(b"2")
+    network.counts(b"0", b"1", b"2")
+    network.topic.leave([name])
+    network.publish(b"3", b"4")
+    network.topic.subscribe(STREAM, KEY)
+    network.publish(b"5")
+    network.counts(b"3", b"4", b"5")
+
+
+def test_messages_that_wait_when_their_stream_is_left_do_not_hide_what_follows(network: Network) -> None:
+    """Messages that are handed over after a stream was left keep nobody from asking its cache when it comes again."""
+    network.topic.subscribe(STREAM, KEY)
+    network.publish(b"2")
+    network.counts(b"0", b"1", b"2")
+    go_on = threading.Event()
+    network.topic.pass_through(partial(go_on.wait, CLOSE_S))
+    network.publish(b"3", b"4")
+    network.topic.leave([STREAM])
+    go_on.set()
+    network.counts(b"3", b"4")
+    network.publish(b"5", b"6")
+    network.topic.subscribe(STREAM, KEY)
+    network.publish(b"7")
+    network.counts(b"5", b"6", b"7")
