@@ -155,7 +155,10 @@ class LateJoin(Generic[_S]):
             self._told(key)
 
     def _release(self, source: _Source) -> None:
-        waiting, self._sources[source] = self._sources.get(source), None
-        for sample in waiting or ():
+        waiting = self._sources.get(source)
+        if waiting is None:  # released before, and perhaps forgotten since
+            return
+        self._sources[source] = None
+        for sample in waiting:
             self._waiting_bytes -= len(sample.payload)
             self._receive(sample)

@@ -119,6 +119,20 @@ def test_what_waits_and_who_is_known_are_bounded(monkeypatch: pytest.MonkeyPatch
     assert [selector for selector, _, _ in one.asked] == ["a/b/@adv/pub/abc/7/**?_sn=..6"]
 
 
+def test_an_answer_brings_no_forgotten_publisher_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A publisher that did not wait any longer and is forgotten stays so: its cache is asked when it is heard again."""
+    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_WAITING", 2)
+    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_SOURCES", 1)
+    one = Joined()
+    one.take(3, 4)
+    one.join.keep(())
+    one.answer(2)
+    one.take(0, source=Entity("other"))
+    one.take(7)
+    assert one.received == [3, 4, 2, "a/b", 0]
+    assert [selector for selector, _, _ in one.asked] == ["a/b/@adv/pub/abc/7/**?_sn=..6"]
+
+
 def test_bytes_that_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """With more bytes than may wait the publisher concerned waits no longer; what then waits is counted from there."""
     monkeypatch.setattr(optipmb_schemas.late_join, "MAX_WAITING_BYTES", 30)

@@ -127,7 +127,7 @@ class Topic:
             if not isinstance(item, zenoh.Sample):
                 self._guarded(item)
             elif item.kind == zenoh.SampleKind.PUT:
-                self._late_join.take(item)
+                self._guarded(partial(self._late_join.take, item))
 
     def _hand_over(self, sample: zenoh.Sample) -> None:
         self._guarded(partial(self._receive, sample))

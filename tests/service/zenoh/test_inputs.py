@@ -7,6 +7,7 @@ from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+import optipmb_service.zenoh.inputs
 import pytest
 from optipmb_schemas import Detections, Keys
 from optipmb_service.runtime.intake import ALL
@@ -100,3 +101,16 @@ def test_messages_that_wait_when_their_stream_is_left_do_not_hide_what_follows(n
     network.topic.subscribe(STREAM, KEY)
     network.publish(b"7")
     network.counts(b"5", b"6", b"7")
+
+
+def test_an_error_while_a_cache_is_asked_ends_nothing(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
+    """When a cache cannot be asked, messages of others are handed over as before."""
+
+    def fail(_session: zenoh.Session, *_: object) -> None:
+        raise RuntimeError
+
+    monkeypatch.setattr(optipmb_service.zenoh.inputs, "ask_cache", fail)
+    network.topic.subscribe(ALL, KEYS.all("detections"))
+    network.publish(b"2")
+    network.session.put(KEYS.detections("site/node/camera"), b"other")
+    network.counts(b"other")
