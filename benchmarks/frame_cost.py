@@ -12,12 +12,14 @@ router in another one, and the system says what processor time the service takes
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
+from importlib import import_module
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -177,6 +179,10 @@ def measured(objects: int, points: int) -> dict[str, float]:
     ):
         if hasattr(owner, name):
             setattr(owner, name, parts.time(part, getattr(owner, name)))
+    # What another checkout may not have yet.
+    newer: dict[str, Any] = {}
+    with contextlib.suppress(ModuleNotFoundError):
+        newer["missed"] = import_module("optipmb_service.runtime.missed_frames").NoLog()
     registry = Registry(
         Settings(instance="cost", store="none"),
         Profiles.read("nuscenes", {}),
@@ -187,6 +193,7 @@ def measured(objects: int, points: int) -> dict[str, float]:
         persistence=NoPersistence(),
         arm=lambda *_: None,
         metrics=Metrics(),
+        **newer,
     )
     rows: list[dict[str, float]] = []
     checkpoints: list[float] = []
