@@ -24,7 +24,7 @@ class Position:
         epochs: publisher epochs before its own.
         epoch: its own.
         seq: its number.
-        tracked: whether it was tracked: those after it are wanted, however long ago it was.
+        tracked: whether it was tracked: those after it are wanted, within the bound on a stream with a position.
     """
 
     epochs: frozenset[bytes]

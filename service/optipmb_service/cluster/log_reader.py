@@ -7,7 +7,7 @@ number of bytes. What cannot be read is as if it were not there: the caches of p
 from __future__ import annotations
 
 import asyncio
-import math
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -30,11 +30,17 @@ AT_ONCE: Final = 16
 READ_S: Final = 3.0
 """Longest time for one stream."""
 
+OUTAGE_S: Final = 30.0
+"""How far a stream is read at most that has a position, by the log's own times, unless one without has it longer.
+
+To track more than that would keep the newest frames waiting for as long as they are of use.
+"""
+
 MOST_BYTES: Final = 2**25
-"""Bytes that are read of a stream at most, in all."""
+"""Bytes of a stream that are given at once at most; the oldest frames go."""
 
 MOST_FRAMES: Final = 1024
-"""Frames that are read of a stream at most, in all: as many as a session holds while some are missing."""
+"""Frames of a stream that are given at once at most: as many as a session holds while some are missing."""
 
 AGAIN_S: Final = (0.3, 0.7)
 """When the log is read again for what was not there yet, after the first time and after that."""
@@ -110,19 +116,25 @@ class LogReader:
         position = part.position
         before = (lambda _: False) if position is None else position.before
         if part.next is None:
-            back_s = math.inf if position and position.tracked else self._back_s
+            back_s = max(OUTAGE_S, self._back_s) if position and position.tracked else self._back_s
             part.next = await self._log.since("detections", part.stream, before, back_s)
-        while part.next is not None and (found := await self._log.read("detections", part.stream, part.next)):
-            part.next = found[-1][0] + 1
-            for _, message in found:
-                if before(message):
-                    continue
-                part.frames += 1
-                part.size += len(message.payload)
-                if part.frames > MOST_FRAMES or part.size > MOST_BYTES:
-                    log.warning("log_cut", stream=part.stream, frames=part.frames, bytes=part.size)
-                    return
-                messages.append(message)
+        kept: deque[LogMessage] = deque()
+        size = cut = 0
+        try:
+            while part.next is not None and (found := await self._log.read("detections", part.stream, part.next)):
+                part.next = found[-1][0] + 1
+                for _, message in found:
+                    if before(message):
+                        continue
+                    kept.append(message)
+                    size += len(message.payload)
+                    while len(kept) > MOST_FRAMES or size > MOST_BYTES:
+                        size -= len(kept.popleft().payload)
+                        cut += 1
+        finally:  # what was read before a failure is not read again
+            messages.extend(kept)
+        if cut:
+            log.warning("log_cut", stream=part.stream, frames=len(kept) + cut, kept=len(kept))
 
     async def _tracks(
         self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
@@ -147,5 +159,3 @@ class _Part:
     stream: str
     position: Position | None
     next: int | None = None
-    frames: int = 0
-    size: int = 0

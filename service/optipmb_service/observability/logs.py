@@ -56,7 +56,7 @@ EVENTS: Final = {
     "log_failed": "The log cannot be written, for `error`: the bridge holds 256 MB of messages and tries again.",
     "log_back": "The log can be written.",
     "log_unread": "The log could not be read for the session of `streams`: frames that nobody tracked may be missing.",
-    "log_cut": "More of the log was missing than a session takes at once: later frames come from elsewhere, or not.",
+    "log_cut": "More of the log was missing than a session takes at once: the oldest frames are left out.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames arrive again.",
     "problem": "A message was refused or lost; `count` of this kind since the last line. See the table of problems.",

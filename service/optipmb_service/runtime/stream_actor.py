@@ -11,6 +11,7 @@ decisions, the wall clock only for what delivery reports.
 from __future__ import annotations
 
 import time
+from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from optipmb_service.runtime.context import ActorContext
+    from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
     from optipmb_service.session.values import Lineage, MessageCounters
 
 log = structlog.get_logger("optipmb_service")
@@ -67,6 +69,7 @@ class StreamActor:
         self._accounts = StreamCounters(self.mailbox)
         self._context = context
         self._waiting = context.buffer()
+        self._missed: deque[TakeoverBuffer] = deque()
         self._out = TrackPublisher(stream, context.instance, context.sink, self.meter, context.metrics, context.member)
         self._asking: list[tuple[Callable[[StreamActor], None], bool]] = []
         self._changed = False
@@ -167,10 +170,12 @@ class StreamActor:
     # Messages
 
     def _receive(self, packet: Packet, *, frame: bool) -> None:
-        session = self.session
-        if session is None:
+        if self.session is None or self._missed:
             self._buffer(packet, frame=frame)
-            return
+        else:
+            self._accept(self.session, packet, frame=frame)
+
+    def _accept(self, session: Session, packet: Packet, *, frame: bool) -> None:
         stream = self._stream_of(packet.origin)
         if time.monotonic_ns() < self._degraded_ns.get(stream, 0):
             self._accounts.receive(frame=frame)
@@ -309,8 +314,8 @@ class StreamActor:
             self._guard(self._receive, packet, frame=frame)
 
     def _buffer(self, packet: Packet, *, frame: bool) -> None:
-        """Keep a packet until there is a session, and begin one if the packet is valid and the stream is to be here."""
-        if not (self._opening or self._closing):
+        """Keep a packet until a session takes it, and begin one if the packet is valid and the stream is to be here."""
+        if not (self._opening or self._closing or self._missed):
             if not self._context.member.holds(self.stream):
                 self._context.keep(self.stream, packet, frame)
                 return
@@ -322,10 +327,13 @@ class StreamActor:
         self._waiting.add(packet, frame=frame)
 
     def ask(self, command: Callable[[StreamActor], None], *, seek: bool) -> None:
-        """Call `command`, as soon as no session is about to begin or end; with `seek`, one begins if there is none."""
+        """Call `command`, as soon as no session is about to begin or end, or has to be told what it missed.
+
+        With `seek`, one begins if there is none.
+        """
         if seek and self.session is None and not self._closing and self._context.member.holds(self.stream):
             _ = self._opening or self._open()
-        if self._opening or self._closing:
+        if self._opening or self._closing or self._missed:
             self._asking.append((command, seek))
         else:
             self._guard(command, self)
@@ -385,20 +393,37 @@ class StreamActor:
             context.missed.fetch(
                 self.stream,
                 taken[-1] if restored and taken else None,
-                lambda packets: self.tell(lambda actor: actor.on_loaded(restored, fence, packets)),
-                lambda packets: self.tell(lambda actor: actor._receive_all(packets)),  # noqa: SLF001 - its own
+                lambda packets: self._hand_over(
+                    packets, lambda actor, missed: actor.on_loaded(restored, fence, missed)
+                ),
+                lambda packets: self._hand_over(packets, StreamActor._catch_up),
             )
 
         context.persistence.recall(self.stream, restore, load)
 
-    def on_loaded(
-        self, restored: Session | None, fence: int | None, missed: Sequence[tuple[Packet, bool]] = ()
+    def _hand_over(
+        self, packets: Sequence[tuple[Packet, bool]], command: Callable[[StreamActor, TakeoverBuffer], None]
     ) -> None:
+        """Have the worker run a command with packets, within the bytes that may wait; called on any thread."""
+        missed = self._context.buffer()
+        for packet, frame in packets:
+            missed.add(packet, frame=frame)
+        if len(missed) < len(packets):
+            log.warning("log_cut", stream=self.stream, frames=len(packets), kept=len(missed))
+        must_send = self.mailbox.offer_command(lambda: command(self, missed), urgent=True)
+        if must_send:
+            self._context.submit(self)
+        elif must_send is None:  # the actor has ended
+            missed.take()
+
+    def on_loaded(self, restored: Session | None, fence: int | None, missed: TakeoverBuffer) -> None:
         """Begin a session, or go on with the one that was kept and what it missed; unless the stream was lost."""
         member, lineage = self._context.member, self._opening
         if lineage is None:
+            missed.take()
             return
         if fence != member.fence(self.stream) and member.holds(self.stream):
+            missed.take()
             self._load()  # lost and taken again: another instance may have gone on in between
             return
         if member.holds(self.stream) and not (restored is None and self._seeking):
@@ -407,8 +432,33 @@ class StreamActor:
             self._context.release(self.stream, lineage)
             member.look()
         self._opening, self._seeking = None, False
-        self._receive_all(missed)
-        self._resume()
+        self._catch_up(missed)
+
+    def _catch_up(self, missed: TakeoverBuffer) -> None:
+        """Have the session take what it missed before all that waits; without a session it waits, too."""
+        if self.session is None:
+            self._receive_all(missed.take())
+        elif missed:
+            self._missed.append(missed)
+        self._take_missed()
+
+    def _take_missed(self) -> None:
+        """Give the session some of what it missed, and come back for the rest when other streams had their turn.
+
+        What comes meanwhile waits for all of it. So does the rest where the session must not publish.
+        """
+        ends_ns = time.monotonic_ns() + TURN_NS
+        for _ in range(BATCH):
+            if self.session is None or not self._missed or time.monotonic_ns() >= ends_ns:
+                break
+            packet, frame = self._missed[0].pop()
+            if not self._missed[0]:
+                self._missed.popleft()
+            self._guard(self._accept, self.session, packet, frame=frame)
+        if self._missed:
+            self.mailbox.offer_command(self._take_missed, urgent=False)
+        else:
+            self._resume()
 
     def _begin(self, restored: Session | None, lineage: Lineage, fence: int | None) -> None:
         context, self._fence = self._context, fence
@@ -467,6 +517,8 @@ class StreamActor:
         if session is None:
             return
         self.session, self._armed_ns = None, None
+        while self._missed:  # who goes on with the stream reads it in the log
+            self._missed.popleft().take()
         self._out.close()
         self._accounts.close(session)
         self._context.release(self.stream, session.life)

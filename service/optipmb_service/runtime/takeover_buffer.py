@@ -50,6 +50,12 @@ class TakeoverBuffer:
         while self._packets and now_ns - self._packets[0][0].now_ns > self._keep_ns:
             self._drop(0)
 
+    def pop(self) -> tuple[Packet, bool]:
+        """Take the oldest packet, with whether it is a frame; there must be one."""
+        packet, frame = self._packets.popleft()
+        self._budget.add(-packet.held)
+        return packet, frame
+
     def take(self) -> list[tuple[Packet, bool]]:
         """Take all packets, the oldest first, each with whether it is a frame."""
         taken = list(self._packets)

@@ -13,7 +13,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lease_log import Alone
-from optipmb_schemas import Detections, Keys, MessageError, MoveRequest, ServiceStatus, SessionState, decode
+from optipmb_schemas import (
+    Detections,
+    Keys,
+    MessageError,
+    MoveRequest,
+    ServiceStatus,
+    SessionState,
+    decode,
+    encode,
+    encoding_of,
+)
 from optipmb_service.app.clustering import STORE_FILE
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.cluster.sqlite import SqliteStore
@@ -21,6 +31,7 @@ from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime import persistence, queries
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.mailbox import Mailbox
+from optipmb_service.runtime.missed_frames import NoLog
 from optipmb_service.runtime.persistence import CheckpointWriter
 from optipmb_service.runtime.ports import PACKET_BYTES, Packet
 from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
@@ -34,6 +45,8 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
+    from optipmb_service.runtime.missed_frames import Take
 
 
 KEYS = Keys()
@@ -137,6 +150,49 @@ def test_catching_up_after_a_restart_is_no_overload(start: Callable[..., Any], t
         until(lambda: [one.queue for one in service.status().sessions] == [30], "the frames are held")
         node.send(CARELESS.detections(1), CARELESS.detections(32))
         assert [one.seq for one in node.tracks(CARELESS.stream, 32)] == list(range(1, 33))
+
+
+def test_catching_up_from_the_log_keeps_no_other_waiting(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a stream has missed is tracked in its order, before what it sends, and others are tracked in between."""
+    missed, newest = 200, 203
+    reached, gate, steps = threading.Event(), threading.Event(), []
+
+    def fetch(_: NoLog, session: str, checkpoint: object, first: Take, later: Take) -> None:
+        del checkpoint, later
+        frames = [CARELESS.detections(seq) for seq in range(missed if session == CARELESS.stream else 0)]
+        key, now_ns = KEYS.detections(session), time.monotonic_ns()
+        payloads = [encode(one) for one in frames]
+        encoding = encoding_of(Detections)
+        first([(Packet(key, one, len(one), encoding, time.time_ns(), now_ns), True) for one in payloads])
+
+    class Noted:
+        def __init__(self, parameters: optipmb.Parameters) -> None:
+            self._tracker = optipmb.Tracker(parameters)
+
+        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+            steps.append(self)
+            if len(steps) == missed // 10:
+                reached.set()
+                assert gate.wait(60)
+            return self._tracker.step(density, frame)
+
+    monkeypatch.setattr(NoLog, "fetch", fetch)
+    service, endpoint = start(tracker=Noted)
+    with Node(endpoint) as node:
+        node.send(CAREFUL.detections(0))
+        node.tracks(CAREFUL.stream, 1)
+        node.send(CARELESS.detections(missed))
+        assert reached.wait(60)
+        node.send(CAREFUL.detections(1), *(CARELESS.detections(seq) for seq in range(missed + 1, newest)))
+        queues = {CAREFUL.stream: 1, CARELESS.stream: 2}
+        until(lambda: {one.stream: one.queue for one in service.status().sessions} == queues, "frames wait")
+        gate.set()
+        assert [one.seq for one in node.tracks(CARELESS.stream, newest)] == list(range(newest))
+        node.tracks(CAREFUL.stream, 2)
+    second = [index for index, one in enumerate(steps) if one is steps[0]][1]
+    assert second < missed // 2
 
 
 def test_a_tracking_thread_that_is_stuck_is_not_healthy(start: Callable[..., Any]) -> None:
