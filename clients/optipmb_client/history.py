@@ -9,7 +9,8 @@ from optipmb_client.transport import Connection
 
 __all__ = ["kept_tracks"]
 
-QUERY_S = 5.0
+QUERY_S = 15.0
+"""Longest wait for an answer: a service reads its log for up to 3 s, and several queries in turn."""
 
 
 def kept_tracks(
@@ -29,7 +30,7 @@ def kept_tracks(
 
     Raises:
         MessageError: The name or a stamp is not valid.
-        ServiceUnavailable: No service answers.
+        ServiceUnavailable: No service answers completely in time.
         ServiceRefused: The service answers that it cannot; the text says why.
     """
     key = Keys(prefix).query(stream, "tracks")
@@ -37,10 +38,14 @@ def kept_tracks(
     while next_ns is not None:
         request = TracksRequest(from_ns=next_ns, to_ns=to_ns)
         answers = connection.query(key, encode(request), encoding_of(request), timeout=QUERY_S)
-        if not answers and not connection.query(Keys(prefix).query(stream, "state"), timeout=QUERY_S):
-            raise ServiceUnavailable(f"no tracking service answers for {stream} (prefix {prefix})")
-        yield from (decode(one.payload, Tracks, encoding=one.encoding) for one in answers if one.ok)
-        next_ns = _rest(next_ns, [decode(one.payload, Problem) for one in answers if not one.ok])
+        if not answers:
+            raise ServiceUnavailable(f"no tracking service answered for {stream} in {QUERY_S:g} s (prefix {prefix})")
+        tracks = [one for one in answers if one.ok and one.encoding != encoding_of(request)]
+        problems = [decode(one.payload, Problem) for one in answers if not one.ok]
+        if not problems and len(tracks) == len(answers):
+            raise ServiceUnavailable(f"the tracks of {stream} did not come completely in {QUERY_S:g} s; ask again")
+        yield from (decode(one.payload, Tracks, encoding=one.encoding) for one in tracks)
+        next_ns = _rest(next_ns, problems)
 
 
 def _rest(asked_ns: int, problems: list[Problem]) -> int | None:

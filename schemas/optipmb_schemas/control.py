@@ -51,8 +51,9 @@ class ResetRequest(Message):
 class TracksRequest(Message):
     """Query `q/tracks`, with or without a payload: tracks of a stream in a range of stamps, as far as they are kept.
 
-    Each reply is a `Tracks` message as it was published: of each frame the one that holds, by stamp. Where there are
-    more than one answer takes, a `Problem` with the code `cut` follows, and its `stamp_ns` is where the rest begins.
+    Each reply is a `Tracks` message as it was published: of each frame the one that holds, by stamp. The last reply
+    repeats the request: all has come. Where there are more than one answer takes, a `Problem` with the code `cut` comes
+    instead, and its `stamp_ns` is where the rest begins.
     """
 
     from_ns: Stamp = Field(default=0, description="First stamp, of the sensor's clock.")

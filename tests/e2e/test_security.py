@@ -15,9 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import zenoh
+from log_process import LogProcess
+from nats_process import NatsProcess
 from optipmb_client import Publisher, Subscriber
 from optipmb_schemas import Density, Keys, ServiceStatus, SessionState, decode
+from optipmb_service.cluster.message_log import MessageLog
+from optipmb_service.cluster.store import StoreError
 from protected import MAKE, REFUSAL_MS, Network, Party, make
+from router import until
 from routers import free_endpoint
 
 if TYPE_CHECKING:
@@ -220,6 +225,35 @@ def test_a_node_cannot_answer_for_a_service(node: Party, viewer: Party, service:
 
 
 # Services and viewers
+
+
+def test_a_bridge_into_the_log_uses_the_certificate_of_a_service(
+    network: Network, service: ServiceProcess, tmp_path: Path
+) -> None:
+    """With it `optipmb-service log` receives the detections and tracks of all streams."""
+    stream = f"{ROBOT}/logged"
+    config = str(network.config("service/spare"))
+    (tmp_path / "nats").mkdir()
+    with (
+        NatsProcess(tmp_path / "nats") as nats,
+        LogProcess(network.endpoint, nats.url, "log", "--zenoh-config", config) as bridge,
+    ):
+        bridge.wait_ready()
+        assert service.process.poll() is None
+        log = MessageLog([nats.url], KEYS.prefix)
+        with publish(network, NODE, stream, FRAMES):
+
+            def logged() -> bool:
+                try:
+                    topics = [
+                        log.connection.call(log.read(topic, stream, 1), 10.0) for topic in ("detections", "tracks")
+                    ]
+                except StoreError:
+                    return False
+                return [len({message.seq for _, message in read}) for read in topics] == [FRAMES, FRAMES]
+
+            until(logged, "all detections and tracks are in the log")
+        log.connection.close(10.0)
 
 
 def test_a_service_cannot_write_inputs(network: Network, viewer: Party) -> None:

@@ -25,12 +25,14 @@ class LogProcess(ServiceProcess):
         endpoint: of the router.
         nats: of the NATS server.
         instance: its name.
+        options: further ones.
     """
 
-    def __init__(self, endpoint: str, nats: str, instance: str = "log") -> None:
+    def __init__(self, endpoint: str, nats: str, instance: str = "log", *options: str) -> None:
         self.http = free_endpoint().removeprefix("tcp/")
         super().__init__(
             *("log", "--connect", endpoint, "--cluster", nats, "--instance", instance, "--http", self.http),
+            *options,
             listen=False,
         )
 

@@ -53,7 +53,7 @@ class TrackQuery:
         wanted = TracksRange(asked.from_ns, asked.to_ns)
 
         def found(failure: str) -> None:
-            self._pool.submit(self._reply, request, stream, wanted, failure)
+            self._pool.submit(self._reply, request, stream, asked, wanted, failure)
 
         self._pool.submit(self._kept.find, stream, wanted, found)
 
@@ -73,12 +73,16 @@ class TrackQuery:
     def _refuse(self, request: Request, stream: str, error: schemas.MessageError) -> None:
         self._finish(request, self._problem(error.code, stream, error.path, error.expected, error.received))
 
-    def _reply(self, request: Request, stream: str, wanted: TracksRange, failure: str) -> None:
+    def _reply(
+        self, request: Request, stream: str, asked: schemas.TracksRequest, wanted: TracksRange, failure: str
+    ) -> None:
         self._room.release()
         last = None
         try:
             for one in () if failure else wanted.messages():
                 request.answer_text(request.key, one.payload, one.encoding)
+            if not failure and wanted.cut_ns is None:
+                request.answer(request.key, asked)
         except TransportError as error:
             log.warning("reply_failed", key=request.key, error=str(error))
         if failure:

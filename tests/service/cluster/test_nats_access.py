@@ -12,15 +12,17 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from lease_log import Alone
+from log_process import LogProcess
 from nats_process import started
+from optipmb_client import Connection, kept_tracks
 from optipmb_service.app.nats import program
 from optipmb_service.cluster.jetstream import JetStream
 from optipmb_service.cluster.nats_access import NatsAccess
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.settings import SettingsInvalidError, load
-from protected import make
-from router import until
-from routers import free_endpoint
+from protected import MAKE, make
+from router import Node, Sensor, until
+from routers import free_endpoint, open_router
 from service_process import ServiceProcess
 
 if TYPE_CHECKING:
@@ -226,6 +228,36 @@ def test_a_service_with_certificates_and_a_password(certificates: Path, serve: S
         service.wait_log("held=64")
         assert service.end()[0] == 0
         assert "secret" not in service.errors.replace(str(secret), "")
+
+
+def test_the_permissions_of_the_page_are_enough(serve: Serve) -> None:
+    """With these, and no others, a service keeps its state, and a bridge its log, which the service reads."""
+    publish = [
+        "$JS.API.>",
+        "OPTIPMB_optipmb_2fv1.>",
+        "OPTIPMB-DETECTIONS_optipmb_2fv1.>",
+        "OPTIPMB-TRACKS_optipmb_2fv1.>",
+    ]
+    subscribe = ["_INBOX.>"]
+    page = (MAKE.parents[2] / "docs" / "security.md").read_text()
+    assert all(f"`{subject}`" in page for subject in publish + subscribe)
+    allowed = json.dumps({"publish": publish, "subscribe": subscribe})
+    user = f'{{ user: "tracker", password: "secret", permissions: {allowed} }}'
+    server = f"nats://tracker:secret@{serve(f'authorization {{ users: [{user}] }}')}"
+    endpoint, sensor = free_endpoint(), Sensor()
+    with open_router(endpoint), Node(endpoint) as node, LogProcess(endpoint, server) as bridge:
+        bridge.wait_receiving(node)
+        options = ("--connect", endpoint, "--cluster", server, "--instance")
+        with ServiceProcess(*options, "a", listen=False) as service, Connection(endpoint) as connection:
+            service.wait_log("held=64")
+            node.send(*(sensor.detections(seq) for seq in range(60)))
+            node.tracks(sensor.stream, 60)
+            until(lambda: len(list(kept_tracks(connection, sensor.stream))) == 60, "the service reads the log")
+            assert service.end()[0] == 0
+        with ServiceProcess(*options, "b", listen=False) as service:
+            service.wait_log("held=64")
+            node.send(*(sensor.detections(seq) for seq in range(60, 65)))
+            assert [one.gap for one in node.tracks(sensor.stream, 65)] == [0] * 65
 
 
 def test_what_is_wrong_is_said_in_one_line(certificates: Path, tmp_path: Path) -> None:

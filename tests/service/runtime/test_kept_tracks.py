@@ -8,16 +8,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 from commands import run_here
+from fake_service import tracks_of
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, kept_tracks
 from optipmb_client.table_files import read_table
-from optipmb_schemas import Keys, Tracks, TracksRequest, decode
+from optipmb_schemas import Keys, Tracks, TracksRequest, decode, encode, encoding_of
 from optipmb_service.runtime import track_query
 from optipmb_service.runtime.kept_tracks import LATE_NS, TracksRange
 from router import Node, Sensor, plain, until
+from routers import free_endpoint, open_client, open_router
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from pathlib import Path
+
+    import zenoh
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -100,13 +104,15 @@ def test_the_newest_tracks_are_there_without_a_log(node: Node) -> None:
     def asked(request: TracksRequest | None = None) -> dict[int, bytes]:
         answers = node.query(key, request)
         assert all(ok for ok, _, _ in answers)
-        return {one.seq: plain(one) for one in (decode(payload, Tracks) for _, _, payload in answers)}
+        assert decode(answers[-1][2], TracksRequest) == (request or TracksRequest())
+        return {one.seq: plain(one) for one in (decode(payload, Tracks) for _, _, payload in answers[:-1])}
 
     until(lambda: asked() == published, "all are kept")
     some = TracksRequest(from_ns=SENSOR.stamp_ns(3), to_ns=SENSOR.stamp_ns(6))
     assert asked(some) == {seq: published[seq] for seq in range(3, 7)}
     assert asked(TracksRequest(from_ns=SENSOR.stamp_ns(10))) == {}
-    assert node.query(KEYS.query("site/node/nobody", "tracks")) == []
+    ((_, _, end),) = node.query(KEYS.query("site/node/nobody", "tracks"))
+    assert decode(end, TracksRequest) == TracksRequest()
 
 
 def test_a_range_that_ends_before_it_begins_is_refused(node: Node) -> None:
@@ -116,6 +122,27 @@ def test_a_range_that_ends_before_it_begins_is_refused(node: Node) -> None:
     problem = node.refused(KEYS.query(SENSOR.stream, "tracks"), TracksRequest(from_ns=5, to_ns=4))
     assert (problem.code, problem.path) == ("invalid_value", "to_ns")
     assert node.refused(KEYS.query(SENSOR.stream, "tracks"), b"\xc1").code == "malformed"
+
+
+@pytest.mark.parametrize("payload", [encode(TracksRequest()), b""])
+def test_an_answer_that_breaks_off_is_an_error(payload: bytes) -> None:
+    """Without the last reply not all tracks have come; what has come is not taken for all."""
+    key = KEYS.query(SENSOR.stream, "tracks")
+    endpoint, example = free_endpoint(), encode(tracks_of(SENSOR.detections(0)))
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply(key, example, encoding=encoding_of(Tracks))
+        if payload:
+            query.reply(key, payload, encoding=encoding_of(TracksRequest))
+
+    with open_router(endpoint), open_client(endpoint) as service, Connection(endpoint) as connection:
+        service.declare_queryable(key, answer)
+        until(lambda: connection.query(key), "the service answers")
+        if payload:
+            assert len(list(kept_tracks(connection, SENSOR.stream))) == 1
+        else:
+            with pytest.raises(ServiceUnavailable, match="did not come completely"):
+                list(kept_tracks(connection, SENSOR.stream))
 
 
 def test_the_client_asks_part_by_part(
