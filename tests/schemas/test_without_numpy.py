@@ -106,10 +106,11 @@ for wrong in (slice(1), (0, 1)):
         raise AssertionError(wrong)
 assert numeric.given(memoryview((ctypes.c_double * 2)(1, 2))).tolist() == [1, 2]
 assert numeric.given(memoryview((ctypes.c_int64 * 2)(1, 2))).tolist() == [1, 2]
+from optipmb_client.publisher import _array
 try:
-    numeric.given(memoryview((ctypes.c_bool * 2)()))
-except MessageError:
-    pass
+    _array("center", memoryview((ctypes.c_bool * 2)()), 3)
+except MessageError as error:
+    assert error.path == "center"
 else:
     raise AssertionError
 """
