@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum, unique
+from functools import lru_cache
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Final
 
@@ -56,6 +57,7 @@ MAX_ENDED: Final = 1024
 """Members that have ended and are remembered."""
 
 
+@lru_cache(65_536)  # as many streams as are known at once; asked about all of them whenever one comes or goes
 def partition_of(stream: str) -> int:
     """Return the partition of a stream."""
     return int.from_bytes(blake2b(stream.encode(), digest_size=8).digest()) % PARTITIONS

@@ -51,15 +51,19 @@ DRAIN_S: Final = 0.5
 DRAIN_POLL_S: Final = 0.005
 END_S: Final = 5.0
 
+NEW_STREAMS: Final = 128
+"""New streams without a cache that are taken in at once; what they sent is asked for before the next are taken in."""
+
 Kind = Literal["detections", "points", "discovery"]
 
 
 @dataclass(frozen=True, order=True)
 class Input:
-    """A subscription: what of a stream, or of all of them."""
+    """A subscription: what of a stream, or of all of them, and whether what was lost is recovered from a cache."""
 
     kind: Kind
     stream: str = ALL
+    cached: bool = True
 
 
 class Inputs(Protocol):
@@ -75,10 +79,10 @@ class Inputs(Protocol):
     ) -> None:
         """Say where messages go, who decides which of those discovered do, who counts the rest, who hears of caches."""
 
-    def subscribe(self, kind: Kind, stream: str) -> None:
-        """Receive a stream, or all of them."""
+    def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
+        """Receive a stream, or all of them; what was lost comes from the cache of the publisher where it has one."""
 
-    def unsubscribe(self, inputs: Iterable[tuple[Kind, str]]) -> None:
+    def unsubscribe(self, inputs: Iterable[tuple[Kind, str, bool]]) -> None:
         """Receive streams no longer."""
 
     def watch_streams(
@@ -236,6 +240,7 @@ class Intake:
             return True  # to be reported
         is_raw = self._directory.noticed(stream, time.monotonic_ns(), recoverable=recoverable)
         if is_raw and stream not in self._known:
+            self._registry.expect(self._registry.fusion.session_of(stream))
             self._wake.set()
         return is_raw
 
@@ -265,14 +270,18 @@ class Intake:
         if discovering and Input("discovery") not in self._subscribed and not everything:
             self._directory.adopt(now_ns)
         streams = self._directory.streams()
+        new = [stream for stream, cached in streams.items() if not cached and stream not in self._known]
+        for stream in new[NEW_STREAMS:]:
+            del streams[stream]  # in the next step
+            self._wake.set()
         coming = self._coming(streams, came, held)
         for session in coming:
             self._registry.hold(session)
         wanted = self._wanted(streams, received, everything=everything, discovering=discovering)
         for one in sorted(wanted - self._subscribed):
-            self._inputs.subscribe(one.kind, one.stream)
+            self._inputs.subscribe(one.kind, one.stream, cached=one.cached)
             self._subscribed.add(one)
-        self._inputs.unsubscribe((one.kind, one.stream) for one in sorted(self._subscribed - wanted))
+        self._inputs.unsubscribe((one.kind, one.stream, one.cached) for one in sorted(self._subscribed - wanted))
         self._subscribed &= wanted
         self._inputs.discover(self._directory.announced())
         self._known = set(streams)
@@ -288,17 +297,17 @@ class Intake:
         for stream, cached in streams.items():
             own = partition_of(self._registry.fusion.session_of(stream)) in received
             if own:
-                wanted.add(Input("points", stream))
+                wanted.add(Input("points", stream, cached))
             # What has no cache the discoverer has by its subscription to all.
             if (own and cached) or (not cached and not discovering and (own or self._standby)):
-                wanted.add(Input("detections", stream))
+                wanted.add(Input("detections", stream, cached))
         return wanted
 
     def _coming(self, streams: dict[str, bool], came: set[int], held: set[int]) -> list[str]:
         """Return the sessions that others may have received something of: those that came here, and new streams."""
         session_of = self._registry.fusion.session_of
         own = self._directory.announced()
-        coming = {session_of(stream) for stream in streams if partition_of(session_of(stream)) in came}
+        coming = {session_of(stream) for stream in streams if came and partition_of(session_of(stream)) in came}
         coming |= {
             session
             for stream, cached in streams.items()

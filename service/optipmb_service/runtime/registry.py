@@ -296,8 +296,18 @@ class Registry:
     def recent(self, sessions: Iterable[str]) -> list[Packet]:
         """Return what is kept of sessions, the oldest first."""
         with self._foreign_lock:
-            kept = [one for session in sessions if session in self._foreign for one in self._foreign[session].kept()]
+            buffers = [self._foreign[session] for session in sessions if session in self._foreign]
+            kept = [one for buffer in buffers for one in buffer.kept()]
+            for buffer in buffers:
+                buffer.unasked = False
         return sorted((packet for packet, _ in kept if packet.payload is not None), key=lambda one: one.now_ns)
+
+    def expect(self, session: str) -> None:
+        """Keep what comes of a session that is new to all members until its own has asked for it."""
+        with self._foreign_lock:
+            if session not in self._foreign and not self._member.holds(session):
+                buffer = self._foreign[session] = self._context.buffer()
+                buffer.unasked, buffer.seen_ns = True, time.monotonic_ns()
 
     def hold(self, session: str) -> None:
         """Keep what comes of a session until it is taken up."""

@@ -9,11 +9,16 @@ instance, by bytes.
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
+
+from optipmb_service.session.values import SECOND
 
 if TYPE_CHECKING:
     from optipmb_service.runtime.byte_budget import ByteBudget
     from optipmb_service.runtime.ports import Packet
+
+UNASKED_NS: Final = 120 * SECOND
+"""Age at which packets are dropped that nobody has asked for yet, where the stream is new to all members."""
 
 
 class TakeoverBuffer:
@@ -30,6 +35,8 @@ class TakeoverBuffer:
         self._packets: deque[tuple[Packet, bool]] = deque()
         self.answered = False
         """Whether all has come that the publisher's cache holds."""
+        self.unasked = False
+        """Whether the stream is new and its member has yet to ask, which takes long where many are new at once."""
         self.seen_ns = 0
         """When the stream was last heard of, monotonic; set by whoever keeps the buffer."""
 
@@ -47,7 +54,8 @@ class TakeoverBuffer:
 
     def trim(self, now_ns: int) -> None:
         """Drop what is old."""
-        while self._packets and now_ns - self._packets[0][0].now_ns > self._keep_ns:
+        keep_ns = max(self._keep_ns, UNASKED_NS) if self.unasked else self._keep_ns
+        while self._packets and now_ns - self._packets[0][0].now_ns > keep_ns:
             self._drop(0)
 
     def pop(self) -> tuple[Packet, bool]:

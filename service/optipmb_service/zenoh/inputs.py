@@ -72,25 +72,29 @@ class Topic:
         self._thread = threading.Thread(target=self._drain, name=f"reader-{name}", daemon=True)
         self._thread.start()
 
-    def subscribe(self, name: str, key: str, passing: Callable[[zenoh.Sample], None] | None = None) -> None:
+    def subscribe(
+        self, name: str, key: str, passing: Callable[[zenoh.Sample], None] | None = None, *, cached: bool = True
+    ) -> None:
         """Receive what is published under a key expression from now on, and what caches hold of it.
 
         Args:
             name: of the subscription; `ALL` for that of all streams.
             key: the key expression.
             passing: called for each sample, on the thread, instead of the topic's function; nothing is recovered then.
+            cached: whether what was lost is recovered from caches. To declare that takes Zenoh several times as long,
+                and longer the more is declared already.
 
         Raises:
             TransportError: the session is closed.
         """
         put = self._waiting.put  # all that is done on the thread of the network
         try:
-            if passing is None:
+            if passing is None and cached:
                 subscriber: Undeclared = zenoh.ext.declare_advanced_subscriber(
                     self._session, key, _directly(put), history=NEWEST, recovery=RECOVERY
                 )
             else:
-                passed = _directly(lambda sample: put(partial(passing, sample)))
+                passed = _directly(put if passing is None else lambda sample: put(partial(passing, sample)))
                 subscriber = self._session.declare_subscriber(key, passed)
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error

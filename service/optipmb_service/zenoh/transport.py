@@ -113,8 +113,13 @@ class Transport:
             "points": Topic("points", self._session, lambda one: self._receive(one, on_cloud), CHANNEL // 16),
         }
 
-    def subscribe(self, kind: Kind, stream: str) -> None:
+    def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
         """Receive the detections or clouds of a stream, or of all of them where it is empty; `discovery` is of all.
+
+        Args:
+            kind: what of it.
+            stream: its name.
+            cached: whether what was lost is recovered from the publisher's cache.
 
         Raises:
             TransportError: the session is closed.
@@ -123,17 +128,17 @@ class Transport:
             self._topics["detections"].subscribe(kind, self._keys.all("detections"), self._discover)
         else:
             self._all = self._all or not stream
-            self._topics[kind].subscribe(stream, self._key(kind, stream))
+            self._topics[kind].subscribe(_name(stream, cached=cached), self._key(kind, stream), cached=cached)
 
-    def unsubscribe(self, inputs: Iterable[tuple[Kind, str]]) -> None:
+    def unsubscribe(self, inputs: Iterable[tuple[Kind, str, bool]]) -> None:
         """Withdraw subscriptions."""
         names: dict[str, list[str]] = {topic: [] for topic in self._topics}
-        for kind, stream in inputs:
+        for kind, stream, cached in inputs:
             if kind == "discovery":
                 names["detections"].append(kind)
             else:
                 self._all = self._all and bool(stream)
-                names[kind].append(stream)
+                names[kind].append(_name(stream, cached=cached))
         for topic, left in names.items():
             self._topics[topic].leave(left)
 
@@ -343,6 +348,11 @@ class Transport:
     def _forget(self, claim: Publisher) -> None:
         with self._lock:
             self._claims.discard(claim)
+
+
+def _name(stream: str, *, cached: bool) -> str:
+    """Return the name of a subscription; for a moment there may be one with recovery and one without."""
+    return stream if cached else f"{stream} plain"
 
 
 def _answering(answer: Callable[[Request], None]) -> Callable[[zenoh.Query], None]:

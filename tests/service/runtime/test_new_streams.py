@@ -1,0 +1,142 @@
+"""What streams cost that begin at once, and what becomes of their first frames: counted, without a network."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from optipmb_schemas import Keys
+from optipmb_service.cluster.leases import PARTITIONS, partition_of
+from optipmb_service.runtime.byte_budget import ByteBudget
+from optipmb_service.runtime.fusion import Fusion
+from optipmb_service.runtime.intake import NEW_STREAMS, Intake
+from optipmb_service.runtime.ports import Packet
+from optipmb_service.runtime.registry import Registry
+from optipmb_service.runtime.takeover_buffer import UNASKED_NS, TakeoverBuffer
+from optipmb_service.session.values import SECOND
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+KEYS = Keys()
+STREAMS = [f"site/n{number:04}/lidar" for number in range(3 * NEW_STREAMS)]
+WAIT_S = 60.0
+
+
+class Network:
+    """Writes down what a member asks of the network; when it watches for tokens, another one announces streams."""
+
+    def __init__(self, announced: Sequence[str] = (), published: Sequence[str] = ()) -> None:
+        self.asked: list[list[str]] = []
+        self.subscribed: list[tuple[str, str, bool]] = []
+        self.unasked: list[int] = []
+        """At each question: streams of which something is subscribed to, and nothing has been asked."""
+        self._announced, self._published = announced, published
+
+    def receive(self, *_: Callable[..., object]) -> None:
+        """Nothing comes here."""
+
+    def watch_streams(self, published: Callable[..., None], discovered: Callable[..., None]) -> None:
+        """Tell of the streams that there are."""
+        for stream in self._announced:
+            discovered(KEYS.discovered(stream, "other"), "other", True)
+        for stream in self._published:
+            published(f"{KEYS.detections(stream)}/@adv/pub/1/2/_", "token", True)
+
+    def subscribe(self, kind: str, stream: str, *, cached: bool) -> None:
+        """Note it."""
+        self.subscribed.append((kind, stream, cached))
+
+    def unsubscribe(self, inputs: Iterable[object]) -> None:
+        """Nothing is withdrawn here."""
+        assert not list(inputs)
+
+    def discover(self, streams: set[str]) -> None:
+        """Nothing is announced here."""
+        assert not streams
+
+    def ask_recent(self, sessions: Sequence[str]) -> list[object]:
+        """Note it; nobody has anything."""
+        asked = {session for group in self.asked for session in group}
+        self.unasked.append(len({stream for _, stream, _ in self.subscribed} - asked))
+        self.asked.append(list(sessions))
+        return []
+
+
+def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
+    """Return the intake of a member that holds some partitions and tracks nothing yet."""
+    registry = SimpleNamespace(
+        instance="m",
+        keys=KEYS,
+        fusion=Fusion(),
+        frame=None,
+        cloud=None,
+        passed_by=None,
+        caches_answered=None,
+        actor=lambda _: None,
+        foreign=lambda _: set(),
+        hold=lambda _: None,
+        take_up=lambda *_: None,
+    )
+    member = SimpleNamespace(partitions=held, holds=lambda stream: partition_of(stream) in held)
+    untyped: Any = registry, member, network
+    return Intake(*untyped, standby=False, linger_s=10.0, idle_s=3600.0), registry
+
+
+def run(network: Network, intake: Intake, done: Callable[[], bool]) -> None:
+    """Have an intake work until something is reached."""
+    intake.start()
+    try:
+        ends = time.monotonic() + WAIT_S
+        while not done():
+            assert time.monotonic() < ends, network.subscribed[-1:]
+            time.sleep(0.01)
+    finally:
+        intake.close()
+
+
+def test_new_streams_are_asked_for_a_few_at_a_time() -> None:
+    """A member with many new streams asks for the first frames of the first before it has subscribed to all."""
+    network = Network(announced=STREAMS)
+    intake, _ = member_of(network, set(range(1, PARTITIONS)))
+    own = {stream for stream in STREAMS if partition_of(stream)}
+    run(network, intake, lambda: sum(map(len, network.asked)) >= len(own))
+    assert Counter(session for group in network.asked for session in group) == Counter(own)
+    assert max(network.unasked) <= NEW_STREAMS
+    assert Counter(network.subscribed) == Counter(
+        (kind, stream, False) for stream in own for kind in ("detections", "points")
+    )
+
+
+def test_only_publishers_with_a_cache_are_subscribed_to_with_recovery() -> None:
+    """Recovery, which is expensive to declare, is asked for where there is a cache, and nowhere else."""
+    plain, cached = STREAMS[:5], STREAMS[5:10]
+    network = Network(announced=plain, published=cached)
+    intake, _ = member_of(network, set(range(1, PARTITIONS)))
+    own = {stream for stream in plain + cached if partition_of(stream)}
+    run(network, intake, lambda: len(network.subscribed) >= 2 * len(own))
+    assert {stream for _, stream, recovered in network.subscribed if recovered} == own.intersection(cached)
+    assert {stream for _, stream, recovered in network.subscribed if not recovered} == own.intersection(plain)
+
+
+@pytest.mark.parametrize("new", [True, False], ids=["new", "known"])
+def test_the_first_frame_of_a_new_stream_is_kept_until_it_is_asked_for(new: bool) -> None:  # noqa: FBT001 - a parameter
+    """What a new stream sent is kept beyond the usual time until its member has asked; no other stream's is."""
+    registry: Any = Registry.__new__(Registry)
+    budget, keep_ns = ByteBudget(1 << 20), 10 * SECOND
+    registry._foreign, registry._foreign_lock = {}, threading.Lock()
+    registry._member = SimpleNamespace(holds=lambda _: False)
+    registry._context = SimpleNamespace(buffer=lambda: TakeoverBuffer(keep_ns, budget))
+    stream, at_ns = STREAMS[0], 0
+    if new:
+        registry.expect(stream)
+    assert registry._kept_for_takeover(stream, Packet(KEYS.detections(stream), b"1", 1, "", at_ns, at_ns), frame=True)
+    buffer = registry._foreign[stream]
+    buffer.trim(UNASKED_NS)
+    assert len(registry.recent([stream])) == new
+    buffer.trim(keep_ns + 1)
+    assert not buffer
