@@ -28,7 +28,10 @@ AT_ONCE: Final = 16
 """Streams that are read at once."""
 
 READ_S: Final = 3.0
-"""Longest time for one stream."""
+"""Longest time for one stream, from its turn on."""
+
+WAIT_S: Final = 30.0
+"""Longest time in all, with what it waits for its turn."""
 
 OUTAGE_S: Final = 30.0
 """How far a stream is read at most that has a position, by the log's own times, unless one without has it longer.
@@ -101,7 +104,7 @@ class LogReader:
         """Return what is new in the log; nothing where it cannot be read in time."""
         messages: list[LogMessage] = []
         try:
-            async with asyncio.timeout(READ_S), self._turns:
+            async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
                 streams = set(wanted.streams)
                 if wanted.node:
                     streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.node)))
@@ -109,6 +112,8 @@ class LogReader:
                     await self._read(parts.setdefault(stream, _Part(stream, wanted.positions.get(stream))), messages)
         except (NatsError, RefusedError, TimeoutError, OSError) as error:
             log.warning("log_unread", streams=sorted(wanted.streams), error=self._log.connection.described(error))
+        except Exception:
+            log.exception("internal_error", streams=sorted(wanted.streams))  # the session waits for whatever there is
         return messages
 
     async def _read(self, part: _Part, messages: list[LogMessage]) -> None:
@@ -141,7 +146,7 @@ class LogReader:
     ) -> None:
         failure = ""
         try:
-            async with asyncio.timeout(READ_S), self._turns:
+            async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
                 number = await self._log.since("tracks", stream, lambda one: one.stamp_ns < from_ns)
                 while number is not None and (found := await self._log.read("tracks", stream, number)):
                     number = found[-1][0] + 1
@@ -149,6 +154,9 @@ class LogReader:
                         break
         except (NatsError, RefusedError, TimeoutError, OSError) as error:
             failure = self._log.connection.described(error)
+        except Exception as error:
+            log.exception("internal_error", stream=stream)
+            failure = f"{type(error).__name__}: {error}"
         end(failure)
 
 

@@ -112,6 +112,7 @@ class LogWriter:
     async def _run(self) -> None:
         while not await self._ready():  # noqa: ASYNC110 - the servers are asked again, nobody else says anything
             await asyncio.sleep(RETRY_S)
+        self._works()
         while True:
             await self._came.wait()
             self._came.clear()
@@ -130,9 +131,6 @@ class LogWriter:
         except (NatsError, RefusedError, TimeoutError, OSError) as error:
             self._failed(error)
             return False
-        if self._failure:
-            self._failure = ""
-            log.info("log_back")
         return True
 
     def _next(self) -> list[LogMessage]:
@@ -157,7 +155,14 @@ class LogWriter:
             else:
                 self.written += result
                 self.repeated += not result
+        if not failed:
+            self._works()
         return failed
+
+    def _works(self) -> None:
+        if self._failure:
+            self._failure = ""
+            log.info("log_back")
 
     def _failed(self, error: BaseException) -> None:
         if not self._failure:

@@ -16,7 +16,6 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from nats.errors import Error as NatsError
-from nats.errors import MaxPayloadError
 
 from optipmb_service.cluster.nats_connection import NatsConnection, NobodyAnswersError, RefusedError, text_of, token
 
@@ -45,6 +44,7 @@ NO_LOG: Final = 10059
 ID: Final = "Nats-Msg-Id"
 FRAME: Final = "Optipmb-Frame"
 ENCODING: Final = "Optipmb-Encoding"
+HEADERS: Final = len(b"NATS/1.0\r\n\r\n")
 
 
 class NotKeptError(Exception):
@@ -163,11 +163,16 @@ class MessageLog:
             NatsError: the servers cannot be reached, or do not answer.
             RefusedError: they do not take it now.
         """
-        subject = self._subject(message.topic, message.stream)
-        try:
-            answer = await self.connection.request(subject, message.payload, message.headers)
-        except MaxPayloadError as error:
-            raise NotKeptError(f"{len(message.payload)} bytes, and the servers take fewer at once") from error
+        subject, headers = self._subject(message.topic, message.stream), message.headers
+        # The server closes the connection over a message that is too large with its headers; the client counts without.
+        size = (
+            len(message.payload)
+            + HEADERS
+            + sum(len(f"{name}: {value}\r\n".encode()) for name, value in headers.items())
+        )
+        if size > (most := self.connection.client().max_payload):
+            raise NotKeptError(f"{size} bytes with its headers, and the servers take {most} at once")
+        answer = await self.connection.request(subject, message.payload, headers)
         if "error" in answer:
             raise RefusedError(answer["error"])
         return not answer.get("duplicate", False)

@@ -170,7 +170,10 @@ class LoggedTracks:
             if read or failure:
                 then(failure)
             else:
-                self._recent.find(stream, wanted, then)
+                try:
+                    self._recent.find(stream, wanted, then)
+                except Exception as error:  # noqa: BLE001 - said to whoever asked
+                    then(f"{type(error).__name__}: {error}")
 
         self._reader.tracks(stream, max(0, wanted.from_ns - LATE_NS), take, end)
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Protocol
 
+import structlog
+
 from optipmb_service.cluster.log_position import Missed, Position
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.session.timeline import number_of
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
 
     Take = Callable[[list[tuple[Packet, bool]]], None]
+
+
+log = structlog.get_logger("optipmb_service")
 
 
 class MissedFrames(Protocol):
@@ -67,14 +72,21 @@ class LoggedFrames:
     def fetch(self, session: str, checkpoint: Checkpoint | None, first: Take, later: Take) -> None:
         """Have the log read."""
         fused = self._fusion.is_session(session)
-        wanted = Missed(
-            streams=() if fused else (session,),
-            node=session.rpartition("/")[0] if fused else "",
-            belongs=lambda stream: self._fusion.session_of(stream) == session,
-            positions={} if checkpoint is None else positions_of(checkpoint),
-        )
+        if checkpoint is not None and checkpoint.fused and not checkpoint.seen:
+            first([])  # it was closed by a query, and knows no longer what it has tracked
+            return
         takes = iter((first,))
-        self._reader.missed(wanted, lambda messages: next(takes, later)(self._packets(messages)))
+        try:
+            wanted = Missed(
+                streams=() if fused else (session,),
+                node=session.rpartition("/")[0] if fused else "",
+                belongs=lambda stream: self._fusion.session_of(stream) == session,
+                positions={} if checkpoint is None else positions_of(checkpoint),
+            )
+            self._reader.missed(wanted, lambda messages: next(takes, later)(self._packets(messages)))
+        except Exception:
+            log.exception("internal_error", stream=session)
+            first([])
 
     def close(self, timeout: float) -> None:
         """Close the connection."""

@@ -219,7 +219,10 @@ class CheckpointWriter:
                 restored = self._recalled(stream, restore)
             except Exception:
                 log.exception("internal_error", stream=stream)  # the stream begins anew
-            then(restored)
+            try:
+                then(restored)
+            except Exception:
+                log.exception("internal_error", stream=stream)
 
         with contextlib.suppress(RuntimeError):  # at the end: it has closed
             self._reading.submit(read)

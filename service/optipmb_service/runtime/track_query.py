@@ -14,6 +14,8 @@ from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.problems import problem_of
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from optipmb_service.runtime.kept_tracks import KeptTracks
     from optipmb_service.runtime.ports import Request
 
@@ -55,7 +57,14 @@ class TrackQuery:
         def found(failure: str) -> None:
             self._pool.submit(self._reply, request, stream, asked, wanted, failure)
 
-        self._pool.submit(self._kept.find, stream, wanted, found)
+        self._pool.submit(self._find, stream, wanted, found)
+
+    def _find(self, stream: str, wanted: TracksRange, found: Callable[[str], None]) -> None:
+        try:
+            self._kept.find(stream, wanted, found)
+        except Exception as error:
+            log.exception("internal_error", stream=stream)
+            found(f"{type(error).__name__}: {error}")
 
     def _asked(self, request: Request) -> schemas.TracksRequest:
         """Return what a query asks for.

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 from nats_process import NatsProcess
+from optipmb_schemas import Keys
 from optipmb_service.cluster import log_reader
 from optipmb_service.cluster.log_position import Missed, Position
 from optipmb_service.cluster.log_reader import LogReader
 from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
+from optipmb_service.runtime.fusion import Fusion
+from optipmb_service.runtime.missed_frames import LoggedFrames
+from optipmb_service.session.checkpoint import forgotten
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Policy
 from router import until
 
+import optipmb
+
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
+
+    from optipmb_service.runtime.ports import Packet
 
 STREAM = "a/b/c"
 EPOCH = bytes(16)
@@ -41,8 +53,8 @@ def filled(tmp_path: Path) -> Iterator[MessageLog]:
         one.connection.close(10.0)
 
 
-def missed(reader: LogReader) -> list[int]:
-    """The numbers of the frames after the one that was tracked last, as they are given first."""
+def asked(reader: LogReader) -> Callable[[], list[int]]:
+    """Ask for the frames after the one that was tracked last; waits for the numbers of those that are given first."""
     found: list[list[int]] = []
     came = threading.Event()
 
@@ -50,9 +62,17 @@ def missed(reader: LogReader) -> list[int]:
         found.append([one.seq for one in messages])
         came.set()
 
+    def wait() -> list[int]:
+        assert came.wait(60.0)
+        return found[0]
+
     reader.missed(LAST_TRACKED, take)
-    assert came.wait(60.0)
-    return found[0]
+    return wait
+
+
+def missed(reader: LogReader) -> list[int]:
+    """The numbers of the frames after the one that was tracked last, as they are given first."""
+    return asked(reader)()
 
 
 def test_the_newest_frames_are_given(filled: MessageLog, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,3 +86,53 @@ def test_the_newest_frames_are_given(filled: MessageLog, monkeypatch: pytest.Mon
     monkeypatch.undo()
     monkeypatch.setattr(log_reader, "OUTAGE_S", 0.0)
     assert missed(reader) == [FRAMES - 1]
+
+
+def test_the_time_for_a_stream_begins_with_its_turn(filled: MessageLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stream that waits until another one has used up its time is read all the same."""
+    monkeypatch.setattr(log_reader, "AT_ONCE", 1)
+    monkeypatch.setattr(log_reader, "READ_S", 2.0)
+    since, stuck = filled.since, threading.Event()
+
+    async def once_stuck(*what: Any) -> int | None:
+        if not stuck.is_set():
+            stuck.set()
+            await asyncio.Event().wait()
+        return await since(*what)
+
+    monkeypatch.setattr(filled, "since", once_stuck)
+    reader = LogReader(filled, 0.0)
+    first, second = asked(reader), asked(reader)
+    assert first() == []
+    assert second() == list(range(TRACKED + 1, FRAMES))
+
+
+def test_a_session_begins_whatever_the_log_says(filled: MessageLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error that nobody foresaw, in the reading or before it, is as if nothing had been missed."""
+    monkeypatch.setattr(filled, "since", AsyncMock(side_effect=ValueError("no JSON")))
+    reader = LogReader(filled, 0.0)
+    assert missed(reader) == []
+
+    found: list[Sequence[object]] = []
+    monkeypatch.setattr(reader, "missed", Mock(side_effect=ValueError("a mistake")))
+    LoggedFrames(reader, Keys(), Fusion(())).fetch(STREAM, None, found.append, found.append)
+    assert found == [[]]
+
+
+def test_what_was_closed_does_not_come_back(filled: MessageLog) -> None:
+    """A session of several sensors that was closed by a query begins with what comes, not with what the log has."""
+    session = Session("a/b/fused", optipmb.load_profile("nuscenes"), Policy(), fused=True)
+    closed = forgotten(session.snapshot())
+    found: list[list[tuple[Packet, bool]]] = []
+    came = threading.Event()
+
+    def take(packets: list[tuple[Packet, bool]]) -> None:
+        found.append(packets)
+        came.set()
+
+    frames = LoggedFrames(LogReader(filled, 600.0), Keys(), Fusion(("a/*/*",)))
+    for checkpoint in (None, closed):
+        came.clear()
+        frames.fetch("a/b/fused", checkpoint, take, lambda _: None)
+        assert came.wait(60.0)
+    assert [len(one) for one in found] == [FRAMES, 0]

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import queue
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
+from unittest.mock import Mock
 
 import pytest
 from commands import run_here
 from fake_service import tracks_of
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, kept_tracks
 from optipmb_client.table_files import read_table
-from optipmb_schemas import Keys, Tracks, TracksRequest, decode, encode, encoding_of
+from optipmb_schemas import Keys, Limits, Tracks, TracksRequest, decode, encode, encoding_of
 from optipmb_service.runtime import track_query
 from optipmb_service.runtime.kept_tracks import LATE_NS, TracksRange
 from router import Node, Sensor, plain, until
@@ -143,6 +145,18 @@ def test_an_answer_that_breaks_off_is_an_error(payload: bytes) -> None:
         else:
             with pytest.raises(ServiceUnavailable, match="did not come completely"):
                 list(kept_tracks(connection, SENSOR.stream))
+
+
+def test_a_search_that_fails_takes_no_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A query that fails by an error that nobody foresaw is answered, and so is the next."""
+    monkeypatch.setattr(track_query, "AT_ONCE", 1)
+    kept, refused = Mock(), queue.SimpleQueue[Any]()
+    kept.find.side_effect = ValueError("a mistake")
+    query = track_query.TrackQuery(kept, "test", Limits())
+    for _ in range(track_query.AT_ONCE + 1):
+        query.answer(Mock(payload=b"", refuse=refused.put), SENSOR.stream)
+        problem = refused.get(timeout=60.0)
+        assert (problem.code, problem.received) == ("unlogged", "ValueError: a mistake")
 
 
 def test_the_client_asks_part_by_part(
