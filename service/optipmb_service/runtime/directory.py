@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from optipmb_service.session.values import SECOND
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 MAX_STREAMS: Final = 65_536
 """Streams that are known at once; publishers beyond it are not heard."""
@@ -21,6 +24,16 @@ FORGET_NS: Final = 10 * SECOND
 
 TOKEN_NS: Final = SECOND
 """How long the token of a publisher whose messages can be recovered may come after its first message."""
+
+
+MAX_UNPROVEN: Final = 256
+"""Streams without a session that this instance announces at once: each costs members a token and subscriptions."""
+
+UNPROVEN_NS: Final = 10 * SECOND
+"""How long a stream is announced that gets no session; after that others may be, and it again with its next message."""
+
+QUEUED_NS: Final = 120 * SECOND
+"""How long a stream beyond them waits for its turn after its last message: as long as first frames are kept."""
 
 
 @dataclass(slots=True)
@@ -43,11 +56,15 @@ class StreamDirectory:
     Args:
         instance: the name of this one.
         idle_ns: silence after which an announced stream is announced no longer.
+        has_session: whether a stream is tracked, here or elsewhere.
     """
 
-    def __init__(self, instance: str, idle_ns: int) -> None:
+    def __init__(self, instance: str, idle_ns: int, has_session: Callable[[str], bool]) -> None:
         self._instance = instance
         self._idle_ns = idle_ns
+        self._has_session = has_session
+        self._unproven: dict[str, int] = {}
+        self._queued: dict[str, int] = {}
         self._lock = threading.Lock()
         self._streams: dict[str, _Known] = {}
         self._awaited: dict[str, int] = {}
@@ -74,6 +91,8 @@ class StreamDirectory:
     def noticed(self, stream: str, now_ns: int, *, recoverable: bool) -> bool:
         """Take in a message that the discoverer received; True: its publisher has no token.
 
+        While too many streams wait for a session, a new one is announced when it is its turn.
+
         Args:
             stream: of the message.
             now_ns: monotonic time.
@@ -89,6 +108,8 @@ class StreamDirectory:
                     if len(self._awaited) > MAX_STREAMS:
                         self._awaited.clear()
                     return False
+                if (known is None or not known.tokens) and not self._admitted(stream, now_ns):
+                    return True
                 known = self._found(stream)
                 if known is None:
                     return False
@@ -106,6 +127,9 @@ class StreamDirectory:
     def expire(self, now_ns: int, *, discovering: bool) -> None:
         """Forget streams whose publishers are gone, and announce those no longer that need it no longer."""
         with self._lock:
+            if not discovering:
+                self._queued.clear()
+            self._look(now_ns)
             for stream, known in tuple(self._streams.items()):
                 if known.announced and (known.tokens or not discovering or now_ns - known.seen_ns > self._idle_ns):
                     known.announced = False
@@ -123,6 +147,41 @@ class StreamDirectory:
         """Return the streams that this instance is to announce."""
         with self._lock:
             return {stream for stream, known in self._streams.items() if known.announced}
+
+    def announces(self, stream: str) -> bool:
+        """Whether this instance announces a stream."""
+        known = self._streams.get(stream)
+        return known is not None and known.announced
+
+    def _admitted(self, stream: str, now_ns: int) -> bool:
+        """Whether a stream may be announced: it has a session, or not too many wait for one."""
+        if self._has_session(stream):
+            return True
+        if len(self._unproven) >= MAX_UNPROVEN:
+            if stream in self._queued or len(self._queued) < MAX_STREAMS:
+                self._queued[stream] = now_ns
+            return False
+        self._queued.pop(stream, None)
+        self._unproven[stream] = now_ns
+        return True
+
+    def _look(self, now_ns: int) -> None:
+        """See which streams have got a session, forget those that have waited too long, and announce the next."""
+        for stream, since_ns in tuple(self._unproven.items()):
+            known = self._streams.get(stream)
+            if known is None or not known.announced or self._has_session(stream):
+                del self._unproven[stream]
+            elif now_ns - since_ns > UNPROVEN_NS:
+                del self._unproven[stream]
+                known.announced = False
+                self._settled(known, now_ns)
+        for stream, seen_ns in tuple(self._queued.items()):
+            if len(self._unproven) >= MAX_UNPROVEN:
+                break
+            del self._queued[stream]
+            if now_ns - seen_ns <= QUEUED_NS and (known := self._found(stream)) is not None and not known.tokens:
+                self._unproven[stream] = now_ns
+                known.announced, known.left_ns, known.seen_ns = True, None, now_ns
 
     def _found(self, stream: str) -> _Known | None:
         known = self._streams.get(stream)

@@ -120,7 +120,10 @@ class Intake:
         self._inputs = inputs
         self._standby = standby
         self._linger_ns = round(linger_s * SECOND)
-        self._directory = StreamDirectory(registry.instance, round(idle_s * SECOND))
+        session_of = registry.fusion.session_of
+        self._directory = StreamDirectory(
+            registry.instance, round(idle_s * SECOND), lambda stream: registry.tracked(session_of(stream))
+        )
         self._subscribed: set[Input] = set()
         self._known: set[str] = set()
         self._lock = threading.Lock()
@@ -241,7 +244,8 @@ class Intake:
         is_raw = self._directory.noticed(stream, time.monotonic_ns(), recoverable=recoverable)
         if is_raw and stream not in self._known:
             self._registry.expect(self._registry.fusion.session_of(stream))
-            self._wake.set()
+            if self._directory.announces(stream):
+                self._wake.set()
         return is_raw
 
     # The thread

@@ -329,6 +329,10 @@ class Registry:
             self._offer(session, partial(_take_up, packets=packets, answered=buffer.answered), limited=False)
             del self._foreign[session]  # from now on readers hand over newer ones
 
+    def tracked(self, session: str) -> bool:
+        """Whether a session is there, here or elsewhere: something valid has come of it."""
+        return self.actor(session) is not None or self._rivals.tracks(session)
+
     def elsewhere(self, stream: str) -> bool:
         """Whether another instance tracks a stream, and answers for it."""
         return not self._member.holds(stream) and self.actor(stream) is None

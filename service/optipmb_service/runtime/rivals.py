@@ -34,6 +34,10 @@ class Rivals:
             if not others:
                 del self._others[stream]
 
+    def tracks(self, stream: str) -> bool:
+        """Whether another instance says that it tracks a stream."""
+        return stream in self._others
+
     def contested(self, tracked: Collection[str], now_ns: int) -> Iterator[tuple[str, str]]:
         """Yield the streams tracked here that another instance has tracked too for longer than is right, and its name.
 

@@ -1,0 +1,62 @@
+"""Which streams a discoverer announces that have no session."""
+
+from __future__ import annotations
+
+from optipmb_service.runtime.directory import MAX_UNPROVEN, QUEUED_NS, UNPROVEN_NS, StreamDirectory
+from optipmb_service.session.values import SECOND
+
+IDLE_NS = 600 * SECOND
+
+
+class Discoverer:
+    """A directory, with the sessions that there are."""
+
+    def __init__(self) -> None:
+        self.sessions: set[str] = set()
+        self.directory = StreamDirectory("a", IDLE_NS, self.sessions.__contains__)
+
+    def hear(self, now_ns: int, *streams: str) -> set[str]:
+        """Notice a message of each stream; which streams are announced then."""
+        for stream in streams:
+            assert self.directory.noticed(stream, now_ns, recoverable=False)
+        self.directory.expire(now_ns, discovering=True)
+        return self.directory.announced()
+
+
+def names(count: int, site: str = "site") -> list[str]:
+    """Names of streams."""
+    return [f"{site}/node-{number}/lidar" for number in range(count)]
+
+
+def test_names_without_a_session_cost_a_bounded_number_of_tokens() -> None:
+    """Of many streams that get no session a few are announced at once, and all are forgotten soon."""
+    one, many = Discoverer(), names(50 * MAX_UNPROVEN)
+    assert one.hear(0, *many) == set(many[:MAX_UNPROVEN])
+    assert len(one.directory.streams()) == MAX_UNPROVEN
+    for turn in range(1, QUEUED_NS // UNPROVEN_NS + 3):
+        assert len(one.hear(turn * (UNPROVEN_NS + 1))) <= MAX_UNPROVEN
+        assert len(one.directory.streams()) <= 3 * MAX_UNPROVEN
+    one.hear(QUEUED_NS + 5 * UNPROVEN_NS)
+    assert one.directory.streams() == {}
+
+
+def test_a_fleet_that_begins_at_once_is_announced() -> None:
+    """Ten thousand streams that send one message and get sessions are all announced, in turns, and stay so."""
+    one, fleet = Discoverer(), names(10_000)
+    announced, now_ns = one.hear(0, *fleet), 0
+    while len(announced) < len(fleet):
+        assert len(announced - one.sessions) == MAX_UNPROVEN
+        one.sessions |= announced
+        now_ns += SECOND
+        announced = one.hear(now_ns)
+    one.sessions |= announced
+    assert one.hear(now_ns + 2 * UNPROVEN_NS) == set(fleet)
+    assert now_ns < QUEUED_NS
+
+
+def test_a_stream_with_a_session_is_announced_at_once() -> None:
+    """What is tracked already waits for nobody: a discoverer that begins hears of all streams at once."""
+    one, fleet = Discoverer(), names(10_000)
+    one.sessions |= set(fleet)
+    one.hear(0, *names(2 * MAX_UNPROVEN, "other"))
+    assert set(fleet) <= one.hear(1, *fleet)
