@@ -40,6 +40,9 @@ ANSWER_S: Final = 1.0
 MOVE_S: Final = 20.0
 """How long a worker may take to have a stream brought to it."""
 
+QUERIES: Final = ("status", "metrics", "move", "drain")
+"""What is answered for all workers; they answer the rest."""
+
 TEXT: Final = "text/plain;version=0.0.4"
 PROBLEMS: Final = 100
 SESSIONS: Final = 10_000

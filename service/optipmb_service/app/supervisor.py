@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import structlog
 
 from optipmb_service import __version__
-from optipmb_service.app.aggregate import AggregateView
+from optipmb_service.app.aggregate import QUERIES, AggregateView
 from optipmb_service.app.edges import grpc_edge, monitoring
 from optipmb_service.app.loops import HANDOVER_S, StopRequest, beat, say_ready, unless
 from optipmb_service.app.private_folder import private_folder
@@ -210,7 +210,7 @@ async def _supervised(
         with monitoring(settings, view):
             if await supervisor.start():
                 transport.watch()
-                transport.serve_service(view.answer)
+                transport.serve_service(view.answer, QUERIES)
                 transport.announce()
                 with grpc_edge(settings, transport.client, view.add):
                     say_ready(settings)

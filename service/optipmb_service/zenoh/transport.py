@@ -202,9 +202,13 @@ class Transport:
         self._serve(f"{self._prefix}/*/*/*/q/*", about_streams)
         self.serve_service(about_service)
 
-    def serve_service(self, about_service: Callable[[Request], None]) -> None:
-        """Hand over the queries about this instance alone, on a thread of its own."""
-        self._serve(f"{self._prefix}/service/{self._instance}/q/*", about_service)
+    def serve_service(self, about_service: Callable[[Request], None], names: Sequence[str] = ("*",)) -> None:
+        """Hand over the queries about this instance alone, those of each name on a thread of its own.
+
+        Who asks all instances waits for each that declares the name, so one that takes no such query must not.
+        """
+        for name in names:
+            self._serve(f"{self._prefix}/service/{self._instance}/q/{name}", about_service)
 
     def ask(self, key: str, timeout: float, payload: bytes = b"", encoding: str = "") -> bytes | None:
         """Ask at a key and return the first answer; None when none comes in time (s)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -28,8 +29,11 @@ from optipmb_schemas import (
     encode_json,
     encoding_of,
 )
+from optipmb_service.app.aggregate import QUERIES
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Tracked
+from optipmb_service.settings import load
+from optipmb_service.zenoh.transport import Transport
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_router
 
@@ -38,6 +42,8 @@ import optipmb
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
+    from optipmb_service.runtime.ports import Request
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -61,6 +67,38 @@ def test_frames_become_tracks(node: Node) -> None:
     assert delivery.instance == "test"
     assert delivery.published_ns >= delivery.received_ns
     assert {encoding for _, _, encoding in node.tracks_seen.items} == {encoding_of(Tracks)}
+
+
+def test_a_parent_that_is_busy_keeps_no_member_waiting() -> None:
+    """While it carries out an order, nobody who asks all members waits for it, and it tells its status."""
+    endpoint, began, gate = free_endpoint(), threading.Event(), threading.Event()
+
+    def answer(request: Request) -> None:
+        if request.key == KEYS.drain("test"):
+            began.set()
+            gate.wait(120)
+        else:
+            request.answer_text(request.key, b"here", "")
+        request.finish()
+
+    transport = Transport(load(None, {"listen": [endpoint], "instance": "test", "store": "none"}).settings)
+    try:
+        transport.serve_service(answer, QUERIES)
+        with Node(endpoint) as node, ThreadPoolExecutor(1) as pool:
+
+            def ordered() -> bool:
+                node.query(KEYS.drain("test"), timeout=0.1)
+                return began.is_set()
+
+            until(ordered, "the order is taken")
+            try:
+                assert pool.submit(node.query, KEYS.recent(), b"", 100.0).result(30.0) == []
+                until(lambda: [one[2] for one in node.query(KEYS.status("test"))] == [b"here"], "its status is told")
+            finally:
+                gate.set()
+    finally:
+        gate.set()
+        transport.close()
 
 
 def test_json_is_understood(node: Node) -> None:
