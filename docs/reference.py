@@ -55,10 +55,10 @@ def events() -> str:
 def metrics() -> str:
     """Return the table of the metrics."""
     rows = [
-        (f"`{NAMESPACE}{name}`", metric.kind, ", ".join(f"`{label}`" for label in metric.labels), metric.meaning)
+        (f"`{NAMESPACE}{name}{'{' + ','.join(metric.labels) + '}' if metric.labels else ''}`", metric.meaning)
         for name, metric in METRICS.items()
     ]
-    return _table(("metric", "kind", "labels", "meaning"), rows)
+    return _table(("metric", "meaning"), rows)
 
 
 def _setting(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
@@ -73,8 +73,6 @@ def _setting(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
     allowed = _interval(bounds)
     if get_origin(field.annotation) is Literal:
         allowed = ", ".join(f"`{choice}`" for choice in get_args(field.annotation))
-    if bool in (field.annotation, *get_args(field.annotation)):
-        allowed = "`true`, `false`"
     if len(allowed) > MOST_ALLOWED:
         return f"`{name}`", "", "", f"{field.description}: {allowed}; default: {shown}"
     return f"`{name}`", shown, allowed, field.description or ""

@@ -115,9 +115,7 @@ class LimitSettings(BaseModel):
 
     max_bytes: int = Field(default=DEFAULT.max_bytes, ge=1024, le=2**30, description="bytes of a msgpack payload")
     max_json_bytes: int = Field(default=2**21, ge=1024, le=2**30, description="bytes of a JSON payload")
-    max_values: int = Field(
-        default=2**17, ge=64, description="values of one message; a number of a plain list counts as one"
-    )
+    max_values: int = Field(default=2**17, ge=64, description="values of one message, each number of a list among them")
     max_points: int = Field(default=DEFAULT.max_points, ge=0, description="points of one cloud")
     max_detections: int = Field(default=DEFAULT.max_detections, ge=1, description="detections of one frame")
 
@@ -151,10 +149,8 @@ class Ros2Stream(BaseModel):
         default="", description="topic of the tracks; default: `/tracks` below that of the detections"
     )
     classes: dict[str, str] = Field(default_factory=dict, description="class names by those in the messages")
-    covariance: bool = Field(
-        default=False, description="take the covariances of positions in the detections for their accuracy"
-    )
-    fixed: bool = Field(default=False, description="the sensor does not move and has no tf: its frame is the world")
+    covariance: bool = Field(default=False, description="use the covariances of the detections' positions")
+    fixed: bool = Field(default=False, description="the sensor does not move and its frame is the world")
 
     @property
     def tracks_topic(self) -> str:
@@ -179,13 +175,13 @@ class Ros2Settings(BaseModel):
     domain: int = Field(default=0, ge=0, le=232, description="`ROS_DOMAIN_ID` of the system")
     node: str = Field(default="optipmb", pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="name of the ROS 2 node")
     fixed_frame: str = Field(
-        default="", description="frame of the tracks; default: the root of the tf tree of the first detections"
+        default="", description="frame of the tracks; default: the root of the first detections' tf tree"
     )
-    odometry: Topic = Field(default="", description="topic of `nav_msgs/Odometry`, when it has the pose and tf has not")
+    odometry: Topic = Field(default="", description="topic of `nav_msgs/Odometry`, for poses that tf has not")
     tf_wait_s: float = Field(default=0.5, ge=0, le=60, description="longest wait of a message for its transform")
     diagnostics: Topic = Field(default="/diagnostics", description="topic of `diagnostic_msgs/DiagnosticArray`")
     streams: Annotated[dict[str, Ros2Stream], AfterValidator(_streams)] = Field(
-        default_factory=dict, description="stream (`site/node/sensor`) to its topics"
+        default_factory=dict, description="topics by stream (`site/node/sensor`)"
     )
 
 
@@ -199,7 +195,7 @@ class Settings(BaseSettings):
     instance: str = Field(
         default_factory=_default_instance,
         pattern=r"^[A-Za-z0-9_.-]{1,64}$",
-        description="name of this instance, one key chunk; default: the host's name and the process number",
+        description="name of this instance; default: the host's name and the process number",
     )
     prefix: Annotated[str, AfterValidator(_prefix)] = Field(
         default="optipmb/v1", description="first chunks of every key"
@@ -214,32 +210,30 @@ class Settings(BaseSettings):
     connect: Endpoints = Field(default=(), description="endpoints of routers to connect to; retried without end")
     zenoh_config: Path | None = Field(
         default=None,
-        description="Zenoh configuration file (JSON5) for what has no setting here: TLS, access control, limits of a"
-        " router; settings override it",
+        description="Zenoh configuration file (JSON5): TLS, access control, limits of a router; settings override it",
     )
     shared_memory: bool = Field(
         default=False,
-        description="Zenoh's implicit shared memory: faster for clouds on one host, but may lose messages and leaves"
-        " files in /dev/shm after a kill",
+        description="Zenoh's shared memory: faster for clouds on one host, but may lose messages, and leaves files in"
+        " /dev/shm after a kill",
     )
     profile: str = Field(
-        default="generic", min_length=1, description="profile name or TOML file, for streams that no pattern matches"
+        default="generic", min_length=1, description="profile name or TOML file, where no pattern matches"
     )
     profiles: dict[str, str] = Field(
         default_factory=dict,
-        description="stream pattern (as `site/*/lidar*`) to profile name or file; the first match applies",
+        description="profiles by stream pattern (as `site/*/lidar*`); the first match applies",
     )
     fuse: Annotated[tuple[Pattern, ...], NoDecode, BeforeValidator(_listed)] = Field(
         default=(),
-        description="patterns of streams (as `site/*/lidar*`) whose sensors feed one session per node, with tracks on"
-        " `site/node/fused`",
+        description="patterns of streams (as `site/*/lidar*`) that feed one session per node, `site/node/fused`",
     )
     cloud_wait_s: float = Field(default=0.1, ge=0, le=60, description="longest wait of a frame for its cloud")
     cloud_memory_s: float = Field(
         default=2.0,
         ge=0,
         le=3600,
-        description="frames without `has_points` wait for a cloud if the stream had one within this time, in stamps",
+        description="frames without `has_points` wait for a cloud if one came within this time, in stamps",
     )
     gap_limit_s: float = Field(
         default=5.0, gt=0, le=86400, description="a larger step of the stamps, forward or back, restarts the session"
@@ -248,104 +242,98 @@ class Settings(BaseSettings):
         default=1.0,
         ge=0,
         le=60,
-        description="sensor time within which a late frame is inserted and tracks are corrected; 0: late frames are"
-        " refused",
+        description="sensor time within which a late frame is inserted and tracks are corrected; 0: never",
     )
     late_clouds: bool = Field(
-        default=False, description="a cloud that arrives after its frame was tracked corrects the tracks"
+        default=False, description="a cloud that comes after its frame was tracked corrects the tracks"
     )
     recovery_wait_s: float = Field(
         default=2.0,
         ge=0,
         le=60,
-        description="after a restart, longest wait for missing frames; it ends when the publisher's cache has answered",
+        description="longest wait for the publisher's cache after a restart",
     )
     max_speed: float = Field(
         default=100.0,
         ge=0,
         le=1e6,
-        description="highest speed of a sensor, m/s; frames with a pose beyond it are refused; 0: no check",
+        description="highest speed of a sensor, m/s; poses beyond it are refused; 0: no check",
     )
     queue_frames: int = Field(
-        default=256, ge=1, le=65536, description="frames waiting per stream; beyond it the oldest is dropped"
+        default=256, ge=1, le=65536, description="frames waiting per stream; then the oldest is dropped"
     )
     queue_clouds: int = Field(
         default=16,
         ge=1,
         le=1024,
-        description="clouds waiting per stream, and as many buffered in its session; beyond it the oldest is dropped",
+        description="clouds waiting per stream, and as many in its session; then the oldest is dropped",
     )
     workers: int = Field(default=1, ge=1, le=64, description="processes that share the streams; 1: this process alone")
     max_pairs: int = Field(
         default=20_000,
         ge=100,
         le=10_000_000,
-        description="pairs of nearby objects in a frame, about a microsecond each; a frame with more is refused",
+        description="pairs of nearby objects in a frame, a microsecond each; a frame with more is refused",
     )
     step_limit_s: float = Field(
         default=0.5,
         gt=0,
         le=60,
-        description="processor time of one message; a stream that takes more is refused for nine times as long",
+        description="processor time of a message; a stream that takes more is refused for nine times as long",
     )
     stream_mb: int = Field(
         default=128,
         ge=4,
         le=65536,
-        description="megabytes of messages per stream, a quarter each for waiting messages, clouds, held frames and"
-        " the window; beyond it the oldest are dropped",
+        description="megabytes per stream, a quarter each for waiting messages, clouds, held frames and the window;"
+        " then the oldest are dropped",
     )
     memory_mb: int = Field(
         default=1024,
         ge=16,
         le=1_048_576,
-        description="megabytes of messages per process, half of them for waiting messages; beyond it messages are"
-        " dropped, and the least recently used sessions are closed",
+        description="megabytes of messages per process, half of them waiting; then messages are dropped, and the least"
+        " recently used sessions closed",
     )
     max_sessions: int = Field(
         default=1000, ge=1, le=100_000, description="streams tracked at once; further ones are refused"
     )
     node_sessions: int = Field(
-        default=64, ge=0, le=100_000, description="streams of one node (`site/node`) tracked at once; 0: no limit"
+        default=64, ge=0, le=100_000, description="the same of one node (`site/node`); 0: no limit"
     )
     node_rate: int = Field(default=2000, ge=0, le=1_000_000, description="messages a second of one node; 0: no limit")
     node_mb_s: int = Field(default=500, ge=0, le=100_000, description="megabytes a second of one node; 0: no limit")
-    site_sessions: int = Field(
-        default=0, ge=0, le=100_000, description="streams of one site tracked at once; 0: no limit"
-    )
+    site_sessions: int = Field(default=0, ge=0, le=100_000, description="the same of one site; 0: no limit")
     site_rate: int = Field(default=0, ge=0, le=1_000_000, description="messages a second of one site; 0: no limit")
     site_mb_s: int = Field(default=0, ge=0, le=100_000, description="megabytes a second of one site; 0: no limit")
     keep_days: float = Field(
         default=30.0,
         ge=0,
         le=36_500,
-        description="checkpoints of a stream that was silent for this long are deleted; 0: never",
+        description="checkpoints of a stream silent for this long are deleted; 0: never",
     )
-    idle_s: float = Field(
-        default=600.0, gt=0, description="a session without a message for this long is closed and freed"
-    )
+    idle_s: float = Field(default=600.0, gt=0, description="a session without messages for this long is freed")
     cluster: Annotated[tuple[Server, ...], NoDecode, BeforeValidator(_listed)] = Field(
         default=(),
-        description="NATS servers where the instances of many machines share streams and checkpoints, as"
-        " `nats://10.0.0.1:4222`; default: none, and instances on one router share the folder `store`",
+        description="NATS servers, as `nats://10.0.0.1:4222`, by which instances on many machines share streams;"
+        " default: none",
     )
     cluster_tls: Path | None = Field(
         default=None,
-        description="folder with `ca.pem`, the authority of `tls://` servers of `cluster`, and `cert.pem` and `key.pem`"
-        " where they ask for a certificate; default: the authorities of the system",
+        description="folder with `ca.pem`, the authority of `tls://` servers, and `cert.pem` and `key.pem` where they"
+        " ask for a certificate; default: the system's authorities",
     )
     cluster_credentials: Path | None = Field(
         default=None,
-        description="file with the credentials of a NATS user (`.creds`), or one line: `user:password`, or a token",
+        description="file with the credentials of a NATS user (`.creds`), `user:password`, or a token",
     )
     store: str = Field(
         default="",
-        description="folder of checkpoints and quarantined sessions; `none`: nothing is kept; default: a folder named"
-        " after prefix and endpoint in `$STATE_DIRECTORY`, else in `optipmb` under `$XDG_STATE_HOME` or"
-        " `~/.local/state`",
+        description="folder of checkpoints and quarantined sessions; `none`: nothing is kept; default: one named after"
+        " prefix and endpoint in `$STATE_DIRECTORY`, else in `optipmb` under `$XDG_STATE_HOME` or `~/.local/state`",
     )
     checkpoint_s: float = Field(
-        default=1.0, ge=0.05, le=3600, description="time between two checkpoints of a changed session"
+        default=1.0, ge=0.05, le=3600, description="time between checkpoints of a changed session"
     )
     lease_s: float = Field(
         default=3.0,
@@ -357,52 +345,45 @@ class Settings(BaseSettings):
         default=10.0,
         ge=0,
         le=600,
-        description="time for which what is received of streams that others track is kept for a takeover;"
-        " longer than `lease_s` and `checkpoint_s` together; with `cluster` also how far back the log is read for a"
-        " stream without a checkpoint",
+        description="how long messages of streams that others track are kept for a takeover; longer than `lease_s` and"
+        " `checkpoint_s` together; with `cluster` also how far back the log is read without a checkpoint",
     )
     standby_mb: int = Field(
         default=256,
         ge=1,
         le=65536,
-        description="megabytes that are kept so, over all streams; clouds are dropped first",
+        description="megabytes kept so; clouds are dropped first",
     )
     log_s: float = Field(
         default=600.0,
         ge=10,
         le=864_000,
-        description="with `optipmb-service log`: age up to which detections are in the log, for a successor",
+        description="age up to which `optipmb-service log` keeps detections, for a successor",
     )
-    log_mb: int = Field(
-        default=1024, ge=16, le=1_048_576, description="megabytes of detections in the log; the oldest go first"
-    )
+    log_mb: int = Field(default=1024, ge=16, le=1_048_576, description="megabytes of these; the oldest go first")
     log_tracks_s: float = Field(
         default=3600.0,
         ge=0,
         le=8_640_000,
-        description="with `optipmb-service log`: age up to which tracks are in the log, for `q/tracks`; 0: none are",
+        description="age up to which it keeps tracks, for `q/tracks`; 0: none",
     )
-    log_tracks_mb: int = Field(
-        default=1024, ge=16, le=1_048_576, description="megabytes of tracks in the log; the oldest go first"
-    )
-    stale_s: float = Field(default=2.0, gt=0, description="a stream without a frame for this long is logged as stale")
+    log_tracks_mb: int = Field(default=1024, ge=16, le=1_048_576, description="megabytes of these; the oldest go first")
+    stale_s: float = Field(default=2.0, gt=0, description="a stream without frames for this long is logged as stale")
     stuck_s: float = Field(
         default=5.0,
         ge=1,
         le=600,
-        description="a tracking thread busy with one task for this long is stuck, and so is a silent worker: the"
-        " process is not healthy, a worker is replaced",
+        description="a thread busy with one task, or a worker silent, for this long is stuck: the process is not"
+        " healthy, the worker is replaced",
     )
-    grace_s: float = Field(default=1.0, ge=0, le=60, description="at shutdown, time for the frames already received")
+    grace_s: float = Field(default=1.0, ge=0, le=60, description="at shutdown, time for frames already received")
     http: Annotated[str, AfterValidator(address)] = Field(
         default="",
-        description="address of the live page, `/healthz`, `/readyz` and `/metrics`, as `127.0.0.1:8080`; default:"
-        " none",
+        description="address of health, metrics and live page, as `127.0.0.1:8080`; default: none",
     )
     http_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)] = Field(
         default=(),
-        description="host names with a dot that HTTP requests may use; addresses and names without a dot are always"
-        " accepted; `*`: any",
+        description="host names with a dot that HTTP requests may use, besides addresses and names without; `*`: any",
     )
     http_streams: int = Field(
         default=100, ge=0, le=10_000, description="streams with series of their own in the metrics, by name"
@@ -413,15 +394,15 @@ class Settings(BaseSettings):
     grpc_tls: Path | None = Field(
         default=None,
         description="folder with `key.pem`, `cert.pem` and `ca.pem` for gRPC: callers need a certificate of that"
-        " authority, whose name determines their rights; default: no TLS, everybody may do everything",
+        " authority, by whose name they have rights; default: no TLS, all may do everything",
     )
     grpc_names: Path | None = Field(
-        default=None, description="JSON list of the names that may call; default: all that have a certificate or token"
+        default=None, description="JSON list of the names that may call; default: all with a certificate or token"
     )
     grpc_tokens: str = Field(
         default="",
         pattern=r"^([A-Za-z_][\w.]*:[A-Za-z_]\w*)?$",
-        description="`module:function` that returns the caller's name from the metadata of a call; default: none",
+        description="`module:function` that finds the caller's name in the metadata of a call; default: none",
     )
     grpc_calls: int = Field(
         default=1000, ge=1, le=100_000, description="gRPC calls open at once; further ones are refused"
@@ -430,8 +411,7 @@ class Settings(BaseSettings):
         default=10_000,
         ge=1,
         le=1_000_000,
-        description="gRPC connections open at once, fewer where the limit of open files is lower; further ones are"
-        " closed",
+        description="gRPC connections open at once, fewer by the limit of open files; further ones are closed",
     )
     log_format: Literal["console", "json"] = Field(default="console", description="form of the log lines on stderr")
     log_level: Literal["debug", "info", "warning", "error"] = Field(

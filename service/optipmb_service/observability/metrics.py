@@ -46,79 +46,73 @@ SERVICE_METRICS: Final = {
     "received_total": MetricFamily("counter", ("topic",), "Messages received, before any check."),
     "received_bytes_total": MetricFamily("counter", ("topic",), "Bytes of their payloads."),
     "foreign_total": MetricFamily(
-        "counter", ("topic",), "Messages received of streams that another member tracks; not among `received`."
+        "counter", ("topic",), "Messages of streams that another member tracks; not among `received`."
     ),
     "foreign_bytes_total": MetricFamily("counter", ("topic",), "Bytes of their payloads."),
     "frames_total": MetricFamily("counter", (), "Frames tracked."),
     "dropped_total": MetricFamily(
         "counter",
         ("reason",),
-        "Frames that came and were not tracked: `duplicate`, `late`, `shed` (queue full), `refused` (not valid).",
+        "Frames not tracked: `duplicate`, `late`, `shed` (queue full), `refused` (not valid).",
     ),
-    "gaps_total": MetricFamily("counter", (), "Frames that publishers numbered and that never came."),
-    "inserted_total": MetricFamily("counter", (), "Late frames that were put in their place."),
-    "corrected_total": MetricFamily("counter", (), "Frames whose tracks were published again because of them."),
-    "problems_total": MetricFamily("counter", ("code",), "Problems by code, each with all that it stands for."),
+    "gaps_total": MetricFamily("counter", (), "Frames that never came, by their numbers."),
+    "inserted_total": MetricFamily("counter", (), "Late frames put in their place."),
+    "corrected_total": MetricFamily("counter", (), "Frames whose tracks were published again for them."),
+    "problems_total": MetricFamily("counter", ("code",), "Problems, each with its `count`."),
     "publishers_restarted_total": MetricFamily("counter", (), "New epochs of publishers."),
-    "clouds_total": MetricFamily(
-        "counter", ("result",), "Frames that were tracked with their cloud, or waited in vain."
-    ),
-    "clouds_shed_total": MetricFamily("counter", (), "Point clouds dropped because the queue was full."),
-    "clouds_refused_total": MetricFamily("counter", (), "Point clouds that were not valid."),
-    "repaired_total": MetricFamily("counter", (), "Covariances that lost rank in rounding and were repaired."),
-    "sessions": MetricFamily("gauge", ("state",), "Sessions, by state."),
+    "clouds_total": MetricFamily("counter", ("result",), "Frames tracked with their cloud, or that waited in vain."),
+    "clouds_shed_total": MetricFamily("counter", (), "Clouds dropped from a full queue."),
+    "clouds_refused_total": MetricFamily("counter", (), "Clouds that were not valid."),
+    "repaired_total": MetricFamily("counter", (), "Covariances repaired after a loss of rank by rounding."),
+    "sessions": MetricFamily("gauge", ("state",), "Sessions."),
     "streams": MetricFamily(
-        "gauge", ("role",), "Streams that this instance tracks (`owner`) or stands by for (`standby`)."
+        "gauge", ("role",), "Streams tracked here (`owner`) or ready to be taken over (`standby`)."
     ),
-    "sessions_restored_total": MetricFamily("counter", (), "Sessions that went on from a checkpoint."),
+    "sessions_restored_total": MetricFamily("counter", (), "Sessions restored from a checkpoint."),
     "checkpoints_total": MetricFamily("counter", (), "Checkpoints written."),
-    "checkpoint_age_seconds": MetricFamily(
-        "gauge", (), "Time since the store had all that it should: what a crash now would have to recover."
-    ),
-    "queue_frames": MetricFamily("gauge", (), "Frames waiting, over all streams."),
-    "oldest_data_seconds": MetricFamily("gauge", (), "Time since the last frame of the stream that is silent longest."),
-    "tracks": MetricFamily("gauge", (), "Tracks in the newest frames of all streams."),
-    "tracks_started_total": MetricFamily("counter", (), "Track ids that came into the published tracks of a stream."),
+    "checkpoint_age_seconds": MetricFamily("gauge", (), "Age of the state that a crash now would go back to."),
+    "queue_frames": MetricFamily("gauge", (), "Frames waiting."),
+    "oldest_data_seconds": MetricFamily("gauge", (), "Time since the last frame of the longest silent stream."),
+    "tracks": MetricFamily("gauge", (), "Tracks in the newest frames."),
+    "tracks_started_total": MetricFamily("counter", (), "Track ids that appeared in the published tracks."),
     "tracks_ended_total": MetricFamily("counter", (), "Track ids that left them."),
-    "bernoullis": MetricFamily("gauge", (), "Bernoulli components of all densities."),
-    "poissons": MetricFamily("gauge", (), "Poisson components of all densities."),
-    "latency_seconds": MetricFamily("histogram", (), "From the arrival of a frame to the publication of its tracks."),
-    "queue_seconds": MetricFamily("histogram", (), "The part of it spent waiting: for a worker and for the cloud."),
-    "decode_seconds": MetricFamily("histogram", (), "The part of it spent decoding."),
-    "step_seconds": MetricFamily("histogram", (), "The part of it spent converting and tracking."),
-    "stream_frames_total": MetricFamily("counter", ("stream",), "Frames tracked in a stream."),
-    "stream_shed_total": MetricFamily("counter", ("stream",), "Frames of a stream dropped because its queue was full."),
-    "stream_queue_frames": MetricFamily("gauge", ("stream",), "Frames of a stream that wait."),
-    "stream_age_seconds": MetricFamily("gauge", ("stream",), "Time since the last frame of a stream."),
-    "stream_tracks": MetricFamily("gauge", ("stream",), "Tracks in the newest frame of a stream."),
+    "bernoullis": MetricFamily("gauge", (), "Bernoulli components."),
+    "poissons": MetricFamily("gauge", (), "Poisson components."),
+    "latency_seconds": MetricFamily("histogram", (), "From arrival of a frame to publication of its tracks."),
+    "queue_seconds": MetricFamily("histogram", (), "Its part spent waiting for a worker and for the cloud."),
+    "decode_seconds": MetricFamily("histogram", (), "Its part spent decoding."),
+    "step_seconds": MetricFamily("histogram", (), "Its part spent converting and tracking."),
+    "stream_frames_total": MetricFamily("counter", ("stream",), "Frames tracked."),
+    "stream_shed_total": MetricFamily("counter", ("stream",), "Frames dropped from a full queue."),
+    "stream_queue_frames": MetricFamily("gauge", ("stream",), "Frames waiting."),
+    "stream_age_seconds": MetricFamily("gauge", ("stream",), "Time since the last frame."),
+    "stream_tracks": MetricFamily("gauge", ("stream",), "Tracks in the newest frame."),
     "stream_latency_seconds": MetricFamily(
-        "gauge", ("stream", "quantile"), "Median and 99th percentile of a stream's last 512 latencies."
+        "gauge", ("stream", "quantile"), "Median and 99th percentile of the last 512 latencies."
     ),
-    "streams_unlisted": MetricFamily("gauge", (), "Streams without series of their own: more than `http_streams`."),
+    "streams_unlisted": MetricFamily("gauge", (), "Streams beyond `http_streams`, without series of their own."),
 }
 """Those of a process that tracks, by their names without the prefix `optipmb_`."""
 
 GATEWAY_METRICS: Final = {
-    "grpc_open_calls": MetricFamily("gauge", ("method",), "Calls over gRPC under way."),
-    "grpc_calls_total": MetricFamily("counter", ("method", "code"), "Calls over gRPC that have ended, by status code."),
-    "grpc_requests_total": MetricFamily("counter", ("method",), "Messages that callers sent over gRPC."),
-    "grpc_responses_total": MetricFamily("counter", ("method",), "Messages that were sent to callers over gRPC."),
+    "grpc_open_calls": MetricFamily("gauge", ("method",), "Calls under way."),
+    "grpc_calls_total": MetricFamily("counter", ("method", "code"), "Calls that have ended, by status code."),
+    "grpc_requests_total": MetricFamily("counter", ("method",), "Messages from callers."),
+    "grpc_responses_total": MetricFamily("counter", ("method",), "Messages to callers."),
     "grpc_skipped_total": MetricFamily(
-        "counter", ("method",), "Messages left out because the caller read too slowly; counted when its call ends."
+        "counter", ("method",), "Messages left out for a slow caller; counted when its call ends."
     ),
-    "grpc_refused_total": MetricFamily("counter", ("code",), "Messages of callers over gRPC that were not valid."),
-    "grpc_invalid_total": MetricFamily("counter", (), "Messages of the network that were not valid and not sent on."),
+    "grpc_refused_total": MetricFamily("counter", ("code",), "Messages of callers that were not valid."),
+    "grpc_invalid_total": MetricFamily("counter", (), "Messages of the network that were not valid, so not sent on."),
 }
 """Those of a process that serves gRPC, by itself or beside tracking."""
 
 LOG_METRICS: Final = {
-    "log_written_total": MetricFamily("counter", (), "Messages that this bridge has put into the log."),
-    "log_repeated_total": MetricFamily("counter", (), "Messages that another bridge had put there before."),
-    "log_dropped_total": MetricFamily(
-        "counter", (), "Messages that are not in the log: too many waited for NATS, or it does not take them."
-    ),
-    "log_invalid_total": MetricFamily("counter", (), "Messages that were not valid and not put into the log."),
-    "log_waiting_bytes": MetricFamily("gauge", (), "Bytes of messages that wait for NATS."),
+    "log_written_total": MetricFamily("counter", (), "Messages put into the log."),
+    "log_repeated_total": MetricFamily("counter", (), "Messages that another bridge had put there."),
+    "log_dropped_total": MetricFamily("counter", (), "Messages not put there: too many waited, or NATS refused them."),
+    "log_invalid_total": MetricFamily("counter", (), "Messages that were not valid, so not put there."),
+    "log_waiting_bytes": MetricFamily("gauge", (), "Bytes waiting for NATS."),
 }
 """Those of a bridge into the log."""
 
