@@ -27,17 +27,15 @@ class SessionParameters(Message):
     """Query `q/parameters`. Without a payload it asks; with one it sets what is present. The reply has all fields."""
 
     profile: Name | None = Field(default=None, description="Name of a profile of the service, such as `nuscenes`.")
-    cloud_wait_s: NonNegative | None = Field(
-        default=None, description="Longest time in seconds that detections wait for the cloud of the same stamp."
-    )
+    cloud_wait_s: NonNegative | None = Field(default=None, description="Longest wait of detections for their cloud, s.")
     horizons: Horizons | None = Field(
         default=None,
-        description="Times ahead of predicted paths, s, ascending; none: no paths. They may change at any time; a "
-        "profile that is set brings its own.",
+        description="Times ahead of predicted paths, s, ascending; none: no paths. A profile that is set brings "
+        "its own.",
     )
     restart: Flag = Field(
         default=False,
-        description="Restart the session when the parameters change; without it a running session refuses a change.",
+        description="Restart the session for a change; without it a running session refuses one.",
     )
     values: Plain | None = Field(default=None, description="In replies: all parameters in force. Ignored in queries.")
 
@@ -45,7 +43,7 @@ class SessionParameters(Message):
 class ResetRequest(Message):
     """Query `q/reset`, with or without a payload. The session starts anew without tracks. No track id is used again."""
 
-    close: Flag = Field(default=False, description="End the session and free it instead of starting it anew.")
+    close: Flag = Field(default=False, description="Free the session instead of restarting it.")
 
 
 class TracksRequest(Message):
@@ -89,8 +87,8 @@ class SessionState(Message):
     stream: Stream = Field(description="Name of the stream.")
     session: SessionId = Field(description="32 hexadecimal digits, as in the tracks.")
     state: Literal["new", "running", "recovering", "quarantined", "closed"] = Field(
-        description="New: no frame yet. Recovering: after a restart, missed frames may still come. Quarantined: "
-        "tracking failed, frames are refused until a reset or another start of the publisher."
+        description="New: no frame yet. Recovering: missed frames may still come. Quarantined: tracking failed, frames "
+        "are refused until a reset or a restart of the publisher."
     )
     profile: Name = Field(description="Name of the parameters in force.")
     epoch: Epoch | None = Field(default=None, description="Epoch of the newest frame.")
@@ -98,21 +96,20 @@ class SessionState(Message):
     stamp_ns: Stamp | None = Field(default=None, description="Stamp of the newest frame.")
     received: Count = Field(
         default=0,
-        description="Detections messages that arrived: the sum of `frames`, `duplicates`, `late`, `refused`, `shed` "
-        "and `queue`.",
+        description="Detections messages: the sum of `frames`, `duplicates`, `late`, `refused`, `shed` and `queue`.",
     )
     frames: Count = Field(default=0, description="Frames tracked.")
-    duplicates: Count = Field(default=0, description="Frames that had been tracked before and were dropped.")
-    late: Count = Field(default=0, description="Frames that came too late and were dropped.")
-    inserted: Count = Field(default=0, description="Late frames and clouds that were put in their place.")
-    corrected: Count = Field(default=0, description="Tracks that were published anew because of these.")
-    refused: Count = Field(default=0, description="Detections messages that were not valid, or could not be tracked.")
+    duplicates: Count = Field(default=0, description="Frames that had been tracked before.")
+    late: Count = Field(default=0, description="Frames that came too late.")
+    inserted: Count = Field(default=0, description="Late frames and clouds put in their place.")
+    corrected: Count = Field(default=0, description="Tracks published again for these.")
+    refused: Count = Field(default=0, description="Detections messages not valid, or that could not be tracked.")
     shed: Count = Field(default=0, description="Frames dropped because the queue was full.")
     gaps: Count = Field(default=0, description="Frames missing.")
-    new_epochs: Count = Field(default=0, description="How often the publisher started anew or its stamps jumped.")
+    new_epochs: Count = Field(default=0, description="Restarts of the publisher and jumps of its stamps.")
     clouds_used: Count = Field(default=0, description="Frames tracked with their cloud.")
     clouds_missed: Count = Field(default=0, description="Frames that waited for a cloud in vain.")
-    repaired: Count = Field(default=0, description="Covariances that had lost rank in rounding and were repaired.")
+    repaired: Count = Field(default=0, description="Covariances repaired after a loss of rank by rounding.")
     clouds_refused: Count = Field(default=0, description="Points messages that were not valid.")
     tracks: Count = Field(default=0, description="Tracks extracted at the newest frame.")
     bernoullis: Count = Field(default=0, description="Bernoulli components now.")
@@ -128,17 +125,17 @@ class SessionState(Message):
 class Problem(Message):
     """What was refused or lost, why, and where. Texts are cut to their limits."""
 
-    stream: Text = Field(description="Name of the stream; empty when the problem belongs to none.")
-    instance: Name = Field(description="Name of the service instance that reports.")
-    code: Word = Field(description="Kind of the problem, for programs. More may be added.")
+    stream: Text = Field(description="Name of the stream; empty: none.")
+    instance: Name = Field(description="Instance that reports.")
+    code: Word = Field(description="Kind of the problem; more may be added.")
     path: Text = Field(default="", description="Field and element at fault, as `score[3]`; empty: the whole message.")
     expected: Text = Field(default="", description="What was expected there.")
-    received: Text = Field(default="", description="What was received, cut to a short printable text.")
+    received: Text = Field(default="", description="What was received, in short.")
     message: Text = Field(description="One sentence for people.")
     seq: Count | None = Field(default=None, description="Number of the frame, when known.")
     stamp_ns: Stamp | None = Field(default=None, description="Stamp of the frame, when known.")
-    count: Count = Field(default=1, description="How many equal problems this one stands for.")
-    reported_ns: Stamp | None = Field(default=None, description="When it was reported, ns since 1970 UTC.")
+    count: Count = Field(default=1, description="Number of equal problems.")
+    reported_ns: Stamp | None = Field(default=None, description="Time of the report, ns since 1970 UTC.")
 
     @classmethod
     def of(cls, error: MessageError, *, stream: str, instance: str) -> "Problem":
@@ -161,32 +158,30 @@ class SessionSummary(Message):
     profile: Name = Field(description="Name of the parameters in force.")
     state: Word = Field(description="State of the session, such as `running`.")
     rate_hz: NonNegative = Field(default=0.0, description="Frames per second in the last 5 s.")
-    latency_p50_ms: NonNegative = Field(default=0.0, description="Median time from arrival to publication, ms.")
+    latency_p50_ms: NonNegative = Field(default=0.0, description="Median from arrival to publication, ms.")
     latency_p99_ms: NonNegative = Field(default=0.0, description="99th percentile of the same, ms.")
     frames: Count = Field(default=0, description="Frames tracked.")
-    refused: Count = Field(default=0, description="Messages that were not valid.")
+    refused: Count = Field(default=0, description="Detections messages not valid, or that could not be tracked.")
     shed: Count = Field(default=0, description="Frames dropped because the queue was full.")
     gaps: Count = Field(default=0, description="Frames missing.")
     tracks: Count = Field(default=0, description="Tracks extracted at the newest frame.")
     queue: Count = Field(default=0, description="Frames waiting now.")
     age_s: NonNegative | None = Field(default=None, description="Seconds since the last frame arrived.")
     worker: Count | None = Field(
-        default=None, description="Number of the worker process that has the stream, where there are several."
+        default=None, description="Number of the worker that has the stream, where there are several."
     )
     sensors: tuple[Stream, ...] = Field(
-        default=(), max_length=256, description="Streams that share the session; none where it is that of one stream."
+        default=(), max_length=256, description="Streams that share the session; none: it is that of one stream."
     )
-    silent: tuple[Stream, ...] = Field(
-        default=(), max_length=256, description="Those of them that have sent no frame lately."
-    )
+    silent: tuple[Stream, ...] = Field(default=(), max_length=256, description="Those of them without a frame lately.")
 
 
 class MemberSummary(Message):
     """A member: one run of a process that tracks, with the leases of partitions that it holds."""
 
-    member: Text = Field(description="Name of the instance, `/`, and eight hexadecimal digits that no other run has.")
-    state: Word = Field(description="`alive`, or `draining`: it gives its partitions up and takes none.")
-    age_s: NonNegative = Field(description="Age of its lease: seconds since its last renewal was seen.")
+    member: Text = Field(description="Name of the instance, `/`, and eight hexadecimal digits of this run.")
+    state: Word = Field(description="`alive`, or `draining`: it takes no partitions.")
+    age_s: NonNegative = Field(description="Seconds since its last renewal.")
     partitions: tuple[Count, ...] = Field(
         default=(), max_length=4096, fail_fast=True, description="Partitions that it holds."
     )
@@ -206,26 +201,24 @@ class ServiceStatus(Message):
     sessions: tuple[SessionSummary, ...] = Field(
         default=(), max_length=10_000, fail_fast=True, description="The sessions of this instance."
     )
-    standby: Count = Field(
-        default=0, description="Streams that another instance tracks and this one is ready to take over."
-    )
+    standby: Count = Field(default=0, description="Streams that another instance tracks and this one may take over.")
     members: tuple[MemberSummary, ...] = Field(
         default=(),
         max_length=4096,
         fail_fast=True,
-        description="The living members that share streams with this instance, itself among them.",
+        description="Members that share streams with this instance, itself among them.",
     )
     received: Count = Field(
         default=0,
-        description="Detections messages since the start: the sum of `frames`, `duplicates`, `late`, `refused`, "
-        "`shed`, and those that wait.",
+        description="Detections messages since the start, as all counters here: as in `SessionState`, over "
+        "all sessions.",
     )
-    frames: Count = Field(default=0, description="Frames tracked since the start.")
-    duplicates: Count = Field(default=0, description="Frames dropped since the start because they had been tracked.")
-    late: Count = Field(default=0, description="Frames that came too late since the start.")
-    refused: Count = Field(default=0, description="Detections messages refused since the start.")
-    shed: Count = Field(default=0, description="Frames dropped since the start because a queue was full.")
-    clouds_refused: Count = Field(default=0, description="Points messages refused since the start.")
+    frames: Count = Field(default=0, description="Frames tracked.")
+    duplicates: Count = Field(default=0, description="Frames that had been tracked before.")
+    late: Count = Field(default=0, description="Frames that came too late.")
+    refused: Count = Field(default=0, description="Detections messages not valid, or that could not be tracked.")
+    shed: Count = Field(default=0, description="Frames dropped because the queue was full.")
+    clouds_refused: Count = Field(default=0, description="Points messages that were not valid.")
     problems: tuple[Problem, ...] = Field(
         default=(), max_length=100, fail_fast=True, description="The newest problems, the oldest first."
     )

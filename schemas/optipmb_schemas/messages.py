@@ -99,7 +99,7 @@ class SensorMessage(Header):
 class Detections(SensorMessage):
     """The detected objects of one frame, M of them (M may be 0). One row of every array is one object."""
 
-    labels: Labels = Field(description="Names of the classes, for example `car`. All different.")
+    labels: Labels = Field(description="Names of the classes, as `car`; all different.")
     label: Annotated[Integers, Array("i8", ("M",), 0, 255)] = Field(
         description="Class of each object as an index into `labels`, from 0."
     )
@@ -159,10 +159,10 @@ class Points(SensorMessage):
 class Delivery(Message):
     """How one publication of the tracks came about. The only part that differs when the same tracks are sent again."""
 
-    instance: Name = Field(description="Name of the service instance that published.")
-    received_ns: Stamp = Field(description="When the detections arrived: clock of the service, ns since 1970 UTC.")
-    published_ns: Stamp = Field(description="When the tracks were handed to Zenoh: same clock.")
-    queue_ms: NonNegative = Field(description="Milliseconds spent waiting, for a worker and for the cloud.")
+    instance: Name = Field(description="Instance that published.")
+    received_ns: Stamp = Field(description="Arrival of the detections by the service's clock, ns since 1970 UTC.")
+    published_ns: Stamp = Field(description="Hand-over of the tracks to Zenoh, same clock.")
+    queue_ms: NonNegative = Field(description="Milliseconds spent waiting for a worker and the cloud.")
     decode_ms: NonNegative = Field(description="Milliseconds spent decoding.")
     step_ms: NonNegative = Field(description="Milliseconds spent in the tracker.")
     run: Count = Field(
@@ -186,14 +186,12 @@ class Tracks(Header):
         "and `seq`.",
     )
     profile: Name = Field(description="Name of the parameters in force.")
-    cloud_used: Flag = Field(description="Whether a point cloud took part in this frame.")
-    gap: Count = Field(default=0, description="Number of frames known to be missing directly before this one.")
-    ignored: Count = Field(
-        default=0, description="Number of detections left out: their class is not in the profile, or their score is 0."
-    )
+    cloud_used: Flag = Field(description="Whether the frame was tracked with a cloud.")
+    gap: Count = Field(default=0, description="Frames known to be missing directly before this one.")
+    ignored: Count = Field(default=0, description="Detections left out: class not in the profile, or score 0.")
     labels: Labels = Field(description="Names of the classes that `label` counts.")
     id: Annotated[Integers, Array("i8", ("N",), 0, INT64)] = Field(
-        description="Identity of the track: unique in the stream, never used again. Ascending."
+        description="Identity: unique in the stream, never used again. Ascending."
     )
     label: Annotated[Integers, Array("i8", ("N",), 0, 255)] = Field(description="Class, an index into `labels`.")
     center: Annotated[Reals, Array("f8", ("N", 3), -FAR * 10, FAR * 10)] = Field(
@@ -203,7 +201,7 @@ class Tracks(Header):
         description="Length, width, height in metres."
     )
     yaw: Annotated[Reals, Array("f8", ("N",), -1e5, 1e5)] = Field(
-        description="Heading in radians, counter-clockwise about z from the x axis of the world frame."
+        description="Heading in radians, counter-clockwise about z from x of the world frame."
     )
     heading_confidence: Annotated[Reals, Array("f8", ("N",), 0, 1)] | None = Field(
         default=None,
@@ -222,14 +220,12 @@ class Tracks(Header):
     covariance: Annotated[Reals, Array("f8", ("N", 6, 6), -1e30, 1e30)] = Field(
         description="Covariance of [x, y, speed, heading, turn rate, acceleration], in the units above."
     )
-    age: Annotated[Reals, Array("f8", ("N",), 0, 1e12)] = Field(
-        description="Seconds since the first detection of the track."
-    )
+    age: Annotated[Reals, Array("f8", ("N",), 0, 1e12)] = Field(description="Seconds since its first detection.")
     time_since_detection: Annotated[Reals, Array("f8", ("N",), 0, 1e12)] = Field(
-        description="Seconds since the last detection of the track; 0 when this frame has one."
+        description="Seconds since its last detection."
     )
     detection: Annotated[Integers, Array("i8", ("N",), -1, INT64)] = Field(
-        description="Row of the associated detection in the `Detections` message of this frame; -1: none."
+        description="Row of its detection in the `Detections` of this frame; -1: none."
     )
     confirmed: Annotated[Integers, Array("i8", ("N",), 0, 1)] | None = Field(
         default=None,
@@ -242,7 +238,7 @@ class Tracks(Header):
         "session has none.",
     )
     path_position: Annotated[Reals, Array("f8", ("N", "H", 2), -FAR * 1e4, FAR * 1e4)] | None = Field(
-        default=None, description="Predicted x and y of the centres at each horizon: metres, world frame."
+        default=None, description="Predicted x and y of the centres: metres, world frame."
     )
     path_yaw: Annotated[Singles, Array("f4", ("N", "H"), -1e5, 1e5)] | None = Field(
         default=None, description="Predicted headings, as `yaw`."
