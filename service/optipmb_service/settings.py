@@ -144,7 +144,7 @@ class Ros2Stream(BaseModel):
         "autoware_perception_msgs/msg/DetectedObjects",
         "autoware_auto_perception_msgs/msg/DetectedObjects",
     ] = Field(default="vision_msgs/msg/Detection3DArray", description="type of the detections")
-    points: Topic = Field(default="", description="topic of the point clouds; default: none")
+    points: Topic = Field(default="", description="topic of the point clouds")
     tracks: Topic = Field(
         default="", description="topic of the tracks; default: `/tracks` below that of the detections"
     )
@@ -315,8 +315,7 @@ class Settings(BaseSettings):
     idle_s: float = Field(default=600.0, gt=0, description="a session without messages for this long is freed")
     cluster: Annotated[tuple[Server, ...], NoDecode, BeforeValidator(_listed)] = Field(
         default=(),
-        description="NATS servers, as `nats://10.0.0.1:4222`, by which instances on many machines share streams;"
-        " default: none",
+        description="NATS servers, as `nats://10.0.0.1:4222`, by which instances on many machines share streams",
     )
     cluster_tls: Path | None = Field(
         default=None,
@@ -379,7 +378,7 @@ class Settings(BaseSettings):
     grace_s: float = Field(default=1.0, ge=0, le=60, description="at shutdown, time for frames already received")
     http: Annotated[str, AfterValidator(address)] = Field(
         default="",
-        description="address of health, metrics and live page, as `127.0.0.1:8080`; default: none",
+        description="address of health, metrics and live page, as `127.0.0.1:8080`",
     )
     http_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)] = Field(
         default=(),
@@ -389,7 +388,7 @@ class Settings(BaseSettings):
         default=100, ge=0, le=10_000, description="streams with series of their own in the metrics, by name"
     )
     grpc: Annotated[str, AfterValidator(address)] = Field(
-        default="", description="address of the gRPC server, as `127.0.0.1:50051`; default: none"
+        default="", description="address of the gRPC server, as `127.0.0.1:50051`"
     )
     grpc_tls: Path | None = Field(
         default=None,
@@ -402,7 +401,7 @@ class Settings(BaseSettings):
     grpc_tokens: str = Field(
         default="",
         pattern=r"^([A-Za-z_][\w.]*:[A-Za-z_]\w*)?$",
-        description="`module:function` that finds the caller's name in the metadata of a call; default: none",
+        description="`module:function` that finds the caller's name in the metadata of a call",
     )
     grpc_calls: int = Field(
         default=1000, ge=1, le=100_000, description="gRPC calls open at once; further ones are refused"
