@@ -19,11 +19,19 @@ from optipmb_schemas import (
     encoding_of,
 )
 
-from optipmb_client.errors import ServiceRefused, ServiceUnavailable
+from optipmb_client.errors import ServiceRefused, ServiceUnavailable, UsageError
 from optipmb_client.links import Link
 from optipmb_client.transport import Answer, Connection
 
-__all__ = ["close_session", "drain_service", "find_services", "move_stream", "session_state", "set_parameters"]
+__all__ = [
+    "close_session",
+    "drain_service",
+    "find_services",
+    "move_stream",
+    "only_service",
+    "session_state",
+    "set_parameters",
+]
 
 QUERY_S = 2.0
 MOVE_S = 25.0
@@ -118,6 +126,21 @@ def find_services(connection: Connection, *, prefix: str = PREFIX, patience_s: f
     instances = [key.rsplit("/", 2)[1] for key in alive]
     answers = [connection.query(keys.status(instance), timeout=QUERY_S) for instance in instances]
     return [_read(answer, ServiceStatus) for answer in answers if answer]
+
+
+def only_service(connection: Connection, option: str, *, prefix: str = PREFIX) -> str:
+    """Return the name of the one service that is alive.
+
+    Raises:
+        ServiceUnavailable: There is none.
+        UsageError: There are several; says which, and the option that names one.
+    """
+    names = [found.instance for found in find_services(connection, prefix=prefix)]
+    if not names:
+        raise ServiceUnavailable(f"no tracking service is alive at {connection.where} (prefix {prefix})")
+    if len(names) > 1:
+        raise UsageError(f"{option}: one of {', '.join(names)}")
+    return names[0]
 
 
 def _read(answers: tuple[Answer, ...], expected: type[Message]) -> Message:

@@ -120,8 +120,11 @@ def _rebuilt(data: bytes, code: str, shape: tuple[int, ...]) -> Numbers:
 
 
 def _flat(data: bytes | memoryview, code: str) -> memoryview:
-    view: Any = memoryview(data or array.array(code))  # what is empty cannot be cast
-    return view.cast("B").cast(code) if data else view  # type: ignore[no-any-return]
+    if not data:  # what is empty cannot be cast
+        return memoryview(array.array(code))
+    as_bytes: Any = memoryview(data).cast("B")
+    flat: memoryview = as_bytes.cast(code)
+    return flat
 
 
 def of_leaves(leaves: list[Any], dtype: str, shape: tuple[int, ...]) -> Numbers:
@@ -181,7 +184,7 @@ def first_outside(numbers: Numbers, description: "Array") -> int | None:
 
 def finite(points: Any) -> Any:
     """Return x, y, z of the points whose coordinates are finite; what is no cloud as it is."""
-    if not (isinstance(points, Numbers) and len(points.shape) == 2 and points.flat.format in _FLOATS):  # noqa: PLR2004
+    if not (isinstance(points, Numbers) and len(points.shape) == 2 and points.flat.format in _FLOATS):  # noqa: PLR2004  rows
         return points
     xyz = _columns(points, 3)
     flat, width = xyz.flat, xyz.shape[1]

@@ -6,8 +6,7 @@ import typer
 from optipmb_schemas import PREFIX
 
 from optipmb_client.commands.options import AsJson, Config, Connect, Prefix, print_json, say
-from optipmb_client.errors import ServiceUnavailable, UsageError
-from optipmb_client.sessions import drain_service, find_services
+from optipmb_client.sessions import drain_service, only_service
 from optipmb_client.transport import Connection
 
 
@@ -24,13 +23,9 @@ def drain(
 ) -> None:
     """Give all streams of a service to the others, each with its state; it takes none until it ends, or --undo."""
     with Connection(connect, config=config, timeout=2.0) as connection:
-        names = [member] if member else [found.instance for found in find_services(connection, prefix=prefix)]
-        if not names:
-            raise ServiceUnavailable(f"no tracking service is alive at {connection.where} (prefix {prefix})")
-        if len(names) > 1:
-            raise UsageError(f"MEMBER: one of {', '.join(names)}")
-        drain_service(connection, names[0], drains=not undo, prefix=prefix)
+        name = member or only_service(connection, "MEMBER", prefix=prefix)
+        drain_service(connection, name, drains=not undo, prefix=prefix)
     if as_json:
-        print_json({"command": "drain", "member": names[0], "drain": not undo})
+        print_json({"command": "drain", "member": name, "drain": not undo})
     else:
-        say(f"{names[0]} {'takes its share of the streams again' if undo else 'holds no streams'}")
+        say(f"{name} {'takes its share of the streams again' if undo else 'holds no streams'}")

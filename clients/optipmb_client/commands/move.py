@@ -6,8 +6,7 @@ import typer
 from optipmb_schemas import PREFIX
 
 from optipmb_client.commands.options import AsJson, Config, Connect, Prefix, print_json, say
-from optipmb_client.errors import ServiceUnavailable, UsageError
-from optipmb_client.sessions import find_services, move_stream
+from optipmb_client.sessions import move_stream, only_service
 from optipmb_client.transport import Connection
 
 
@@ -23,13 +22,9 @@ def move(
 ) -> None:
     """Move a stream to another worker process of a service; tracks and ids continue."""
     with Connection(connect, config=config, timeout=2.0) as connection:
-        names = [instance] if instance else [found.instance for found in find_services(connection, prefix=prefix)]
-        if not names:
-            raise ServiceUnavailable(f"no tracking service is alive at {connection.where} (prefix {prefix})")
-        if len(names) > 1:
-            raise UsageError(f"--instance: one of {', '.join(names)}")
-        move_stream(connection, names[0], stream, to, prefix=prefix)
+        name = instance or only_service(connection, "--instance", prefix=prefix)
+        move_stream(connection, name, stream, to, prefix=prefix)
     if as_json:
-        print_json({"command": "move", "instance": names[0], "stream": stream, "worker": to})
+        print_json({"command": "move", "instance": name, "stream": stream, "worker": to})
     else:
-        say(f"{stream} is with worker {to} of {names[0]}")
+        say(f"{stream} is with worker {to} of {name}")
