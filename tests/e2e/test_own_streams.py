@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Self
 
 import pytest
 from fleet import PROFILE, Fleet, RouterProcess
-from optipmb_schemas import ServiceStatus, encode, encoding_of
+from optipmb_schemas import ServiceStatus, SessionState, encode, encoding_of
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Tracked
@@ -223,3 +223,25 @@ def begins(node: Node, sensor: Sensor) -> bool:
     """Send the first cloud and frame until they were tracked together; whether they were."""
     raw(node, sensor.points(0), sensor.detections(0, has_points=True))
     return len(distinct(node, sensor)) == 1
+
+
+@pytest.mark.timeout(600)
+def test_what_waits_in_a_session_moves_with_it(pair: Pair) -> None:
+    """A frame that is held for its cloud, and a cloud before its frame, are there where the stream goes on."""
+    node, sensor = pair.node, SENSORS[0]
+    node.move("a", sensor.stream)
+    until(lambda: begins(node, sensor), "it has begun")
+    raw(node, sensor.detections(1, has_points=True))
+    until(lambda: node.ask(KEYS.query(sensor.stream, "state"), SessionState).queue == 1, "the frame is held")
+    node.move("b", sensor.stream)
+    raw(node, sensor.points(1))
+    until(lambda: len(distinct(node, sensor)) == 2, "it is tracked")
+    before = pair.figure("b", "received_total", "points")
+    raw(node, sensor.points(2))
+    until(lambda: pair.figure("b", "received_total", "points") > before, "the cloud is there")
+    node.move("a", sensor.stream)
+    raw(node, sensor.detections(2, has_points=True))
+    until(lambda: len(distinct(node, sensor)) == 3, "it is tracked, too")
+    assert distinct(node, sensor) == with_clouds(sensor, 3)
+    states = [node.ask(KEYS.status(instance), ServiceStatus) for instance in "ab"]
+    assert sum(one.received for one in states) == sum(one.frames + one.duplicates for one in states)

@@ -485,12 +485,15 @@ class StreamActor:
         """End the session and free what it holds; the next valid message of the stream begins another, or goes on.
 
         A session that is idle or moved is kept as it is; one that is closed by a query forgets its density and its
-        counters.
+        counters. What waits is processed, in a session that is moved by whoever goes on with it.
         """
         session = self.session
         if session is None:
             return
-        self._deliver(session.flush())
+        if reason == "moved":
+            self._pass_on(session)
+        else:
+            self._deliver(session.flush())
         self._out.flush()  # what waited for the write lease is in the state that is kept
         state = session.snapshot()
         if reason == "query":
@@ -499,6 +502,17 @@ class StreamActor:
         self._closing = True
         self._drop_session(reason)
         self._context.persistence.put(state, self._fence, lambda: self.tell(StreamActor.on_kept))
+
+    def _pass_on(self, session: Session) -> None:
+        """Keep what waits in a session for the instance that goes on with it: clouds of held frames come there."""
+        keys, now_ns, wall_ns = self._context.keys, time.monotonic_ns(), time.time_ns()
+        for message, ticket in session.unprocessed():
+            frame = isinstance(message, schemas.Detections)
+            payload, key = schemas.encode(message), (keys.detections if frame else keys.points)(message.stream)
+            came = (ticket.wall_ns, ticket.now_ns) if isinstance(ticket, Arrival) else (wall_ns, now_ns)
+            packet = Packet(key, payload, len(payload), schemas.encoding_of(message), *came)
+            self._context.keep(self.stream, packet, frame)
+        self._accounts.pass_on(session.held)
 
     def on_kept(self) -> None:
         """Leave the stream: the state of the session that has ended is kept."""

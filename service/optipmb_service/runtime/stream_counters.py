@@ -45,6 +45,10 @@ class StreamCounters:
             self._traffic.received += 1
             self._traffic.refused += 1
 
+    def pass_on(self, frames: int) -> None:
+        """Do not count frames that waited here and will be tracked, and counted, by another instance."""
+        self._traffic.received -= frames
+
     def shed(self) -> int:
         """Count what the mailbox shed since the last time; returns how many frames."""
         shed, _, clouds = self._mailbox.counts()

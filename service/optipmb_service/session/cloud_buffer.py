@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     import optipmb_schemas as schemas
 
@@ -33,6 +33,9 @@ class CloudBuffer:
 
     def __len__(self) -> int:
         return len(self._kept)
+
+    def __iter__(self) -> Iterator[schemas.Points]:
+        return iter(self._kept.values())
 
     def add(self, cloud: schemas.Points) -> None:
         """Keep a cloud."""

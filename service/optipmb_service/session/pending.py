@@ -16,7 +16,7 @@ from optipmb_service.session.state import size_of
 from optipmb_service.session.timeline import FrameId, hold_until
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Container
 
     import optipmb_schemas as schemas
 
@@ -145,6 +145,15 @@ class PendingFrames:
             self._timeline, self._behind = past, True  # judged when it is asked for: many are let go before that
         elif gone:
             self.timeline = self.timeline.settle(base.cursors, base.last, gone)
+
+    def unprocessed(self, used: Container[int]) -> list[tuple[schemas.Detections | schemas.Points, Any]]:
+        """Return clouds and frames that were not gone through, frames with the ticket they came with.
+
+        Args:
+            used: of clouds, by `id`, that frames have had.
+        """
+        clouds = [(cloud, None) for cloud in self.clouds if id(cloud) not in used]
+        return [*clouds, *((one.message, one.ticket) for one in self._held)]
 
     def clear(self) -> int:
         """Drop all; returns how many there were."""

@@ -327,6 +327,11 @@ class Session:
         self._recover_until(None)
         return self._advance(now_ns)
 
+    def unprocessed(self) -> list[tuple[schemas.Detections | schemas.Points, Any]]:
+        """Return what came and is in no snapshot: clouds without their frame, and frames held, each with its ticket."""
+        used = frozenset(id(entry.points) for entry in self._processed.entries)
+        return [one for pending in self._pending.values() for one in pending.unprocessed(used)]
+
     # What it is
 
     @property
