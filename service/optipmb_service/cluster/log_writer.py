@@ -32,6 +32,9 @@ OVERHEAD: Final = 512
 RETRY_S: Final = 0.5
 """Between two tries."""
 
+TRIES: Final = 5
+"""How often a message is tried alone that is not written by servers that work."""
+
 
 class LogWriter:
     """The writer of one process.
@@ -60,6 +63,8 @@ class LogWriter:
         self._came = asyncio.Event()
         self.held_bytes = 0
         """Bytes that wait, nearly."""
+        self._at_once = AT_ONCE
+        self._tries = 0
         self._failure = "the log was not reached yet"
         self.written = 0
         """Messages that are in the log by this writer."""
@@ -118,6 +123,10 @@ class LogWriter:
             self._came.clear()
             while batch := self._next():
                 failed = await self._write(batch)
+                if self._tries == TRIES:
+                    self._tries = 0
+                    self._lose(failed.pop(), self._failure)
+                    self._go_on()
                 with self._lock:
                     self._waiting.extendleft(reversed(failed))
                     self.held_bytes -= sum(map(_size, batch)) - sum(map(_size, failed))
@@ -136,14 +145,18 @@ class LogWriter:
     def _next(self) -> list[LogMessage]:
         """Take what is to be written at once; its bytes still count."""
         with self._lock:
-            return [self._waiting.popleft() for _ in range(min(AT_ONCE, len(self._waiting)))]
+            return [self._waiting.popleft() for _ in range(min(self._at_once, len(self._waiting)))]
 
     async def _write(self, batch: list[LogMessage]) -> list[LogMessage]:
-        """Write messages; return those that have to be tried again."""
+        """Write messages; return those that have to be tried again.
+
+        One message can keep all beside it from being written, by having the connection closed. So after a failure they
+        are tried alone, and the tries of the first one count while the servers say that its log is there.
+        """
         if not await self._ready():
             return batch
         results = await asyncio.gather(*map(self._log.put, batch), return_exceptions=True)
-        failed = []
+        failed: list[LogMessage] = []
         for message, result in zip(batch, results, strict=True):
             if isinstance(result, NotKeptError):
                 self._lose(message, str(result))
@@ -155,9 +168,20 @@ class LogWriter:
             else:
                 self.written += result
                 self.repeated += not result
-        if not failed:
-            self._works()
+        if failed:
+            self._log.look_again()
+            self._tries = self._tries + 1 if len(batch) == 1 else 0
+            self._at_once = 1
+        else:
+            self._tries = 0
+            self._at_once = min(AT_ONCE, 2 * self._at_once)
+            self._go_on()
         return failed
+
+    def _go_on(self) -> None:
+        """Take the servers for sound, unless what failed before may be among the messages that wait."""
+        if self._at_once == AT_ONCE or not self._waiting:
+            self._works()
 
     def _works(self) -> None:
         if self._failure:

@@ -41,6 +41,7 @@ NEAR_S: Final = 2.0
 BATCH: Final = 128
 BATCH_BYTES: Final = 2**21
 NO_LOG: Final = 10059
+TOO_LARGE: Final = 10054
 ID: Final = "Nats-Msg-Id"
 FRAME: Final = "Optipmb-Frame"
 ENCODING: Final = "Optipmb-Encoding"
@@ -118,11 +119,12 @@ class MessageLog:
 
     def __init__(self, servers: Sequence[str], prefix: str, access: NatsAccess | None = None) -> None:
         self._names = {topic: f"OPTIPMB-{topic.upper()}_{token(prefix)}" for topic in ("detections", "tracks")}
-        self.connection = NatsConnection(servers, self._lost, access)
+        self.connection = NatsConnection(servers, self.look_again, access)
         self._there: set[str] = set()
 
-    def _lost(self) -> None:
-        self._there.clear()  # the server may come back without its files
+    def look_again(self) -> None:
+        """Have `ready` ask the servers again: they may have come back without their files."""
+        self._there.clear()
 
     async def ready(self, topic: Topic, keep: Retention) -> None:
         """Have a log there that keeps so much.
@@ -174,7 +176,8 @@ class MessageLog:
             raise NotKeptError(f"{size} bytes with its headers, and the servers take {most} at once")
         answer = await self.connection.request(subject, message.payload, headers)
         if "error" in answer:
-            raise RefusedError(answer["error"])
+            refused = RefusedError(answer["error"])
+            raise NotKeptError(str(refused)) if refused.code == TOO_LARGE else refused
         return not answer.get("duplicate", False)
 
     async def since(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
-from nats_process import NatsProcess
-from optipmb_service.cluster.log_writer import OVERHEAD, LogWriter
+from nats_process import NatsProcess, started
+from optipmb_service.app.nats import program
+from optipmb_service.cluster.log_writer import OVERHEAD, TRIES, LogWriter
 from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
 from optipmb_service.cluster.nats_connection import RefusedError
 from router import until
@@ -15,6 +17,7 @@ from routers import free_endpoint
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+    from typing import Any
 
 ROOM = 5
 KEEP = {"detections": Retention(60, 2**25)}
@@ -86,3 +89,120 @@ def test_a_failure_holds_until_something_is_written(log: MessageLog, monkeypatch
     writer.close()
     assert ["no room" in one for one in failures] == [False, True, True]
     assert (writer.written, writer.failure) == (1, "")
+
+
+def test_a_message_that_may_not_be_published_is_given_up(tmp_path: Path) -> None:
+    """One on whose subject the server lets nobody publish is lost after some tries; those behind it are written."""
+    address = free_endpoint().removeprefix("tcp/")
+    file = tmp_path / "nats.conf"
+    file.write_text(f"""
+        listen: "{address}"
+        jetstream {{ store_dir: "{tmp_path / "store"}" }}
+        authorization {{ users: [
+            {{ user: one, password: one, permissions: {{ publish: {{ deny: "*.a.b.c" }} }} }}
+        ] }}
+    """)
+    server = program()
+    assert server is not None
+    process = started([server, "--config", str(file)], address, tmp_path / "nats.log")
+    log = MessageLog([f"nats://one:one@{address}"], "optipmb")
+    lost: list[tuple[str, str]] = []
+    try:
+        until(lambda: not log.connection.failure, "it is connected")
+        writer = LogWriter(log, KEEP, lambda *one: lost.append(one))
+        for seq in range(ROOM):
+            writer.put(message(seq, 100) if seq == 0 else message(seq, 100)._replace(stream="a/b/d"))
+        until(writer.idle, "all are written, or lost")
+        writer.close()
+        assert (writer.written, writer.dropped, writer.failure) == (ROOM - 1, 1, "")
+        assert [stream for stream, _ in lost] == ["a/b/c"]
+    finally:
+        log.connection.close(10.0)
+        process.kill()
+        process.wait()
+
+
+def test_a_message_that_lets_no_other_be_written_is_given_up(log: MessageLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that has the server close the connection costs itself alone, and is tried a bounded number of times."""
+    put, tries, at_once = log.put, [], 0
+
+    async def closing(one: LogMessage) -> bool:
+        nonlocal at_once
+        at_once += 1
+        try:
+            await asyncio.sleep(0)
+            if one.seq == ROOM:
+                tries.append(at_once)
+            if one.seq == ROOM or at_once > 1:
+                raise RefusedError({"description": "closed"})
+            return await put(one)
+        finally:
+            at_once -= 1
+
+    writer = LogWriter(log, KEEP, lambda *_: None)
+    until(lambda: not writer.failure, "the log is there")
+    monkeypatch.setattr(log, "put", closing)
+    for seq in range(2 * ROOM):
+        writer.put(message(seq, 100))
+    until(lambda: writer.written >= 2 * ROOM - 1, "the others are written")
+    until(writer.idle, "nothing waits")
+    writer.close()
+    assert (writer.written, writer.dropped) == (2 * ROOM - 1, 1)
+    assert tries.count(1) >= TRIES
+    assert len(tries) <= 3 * TRIES
+
+
+def test_servers_that_are_away_cost_no_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What fails while the log is not there is no try: all is written when it is back."""
+    with NatsProcess(tmp_path) as nats:
+        log = MessageLog([nats.url], "optipmb/v1")
+        writer = LogWriter(log, KEEP, lambda *_: None)
+        asked: list[object] = []
+        ready = log.ready
+
+        async def counting(*arguments: Any) -> None:
+            asked.append(arguments)
+            await ready(*arguments)
+
+        try:
+            writer.put(message(0, 100))
+            until(writer.idle, "it is written")
+            monkeypatch.setattr(log, "ready", counting)
+            nats.kill()
+            for seq in range(1, ROOM):
+                writer.put(message(seq, 100))
+            until(lambda: len(asked) > 2 * TRIES, "it was tried more often than a message would be")
+            nats.start()
+            until(writer.idle, "all are written")
+            assert (writer.written, writer.dropped, writer.failure) == (ROOM, 0, "")
+        finally:
+            writer.close()
+            log.connection.close(10.0)
+
+
+def test_a_log_that_somebody_has_removed_is_made_again(log: MessageLog) -> None:
+    """The first message that finds no log waits for it; none is lost."""
+    writer = LogWriter(log, KEEP, lambda *_: None)
+    writer.put(message(0, 100))
+    until(writer.idle, "it is written")
+    log.connection.call(log.connection.ask("STREAM.DELETE.OPTIPMB-DETECTIONS_optipmb_2fv1", {}))
+    writer.put(message(1, 100))
+    until(writer.idle, "it is written")
+    writer.close()
+    assert (writer.written, writer.dropped, writer.failure) == (2, 0, "")
+
+
+def test_a_message_that_is_too_large_for_its_log_is_given_up_at_once(log: MessageLog) -> None:
+    """A limit that somebody has set for the messages of a log is as one of the servers."""
+    lost: list[tuple[str, str]] = []
+    writer = LogWriter(log, KEEP, lambda *one: lost.append(one))
+    until(lambda: not writer.failure, "the log is there")
+    name = "OPTIPMB-DETECTIONS_optipmb_2fv1"
+    config = log.connection.call(log.connection.ask(f"STREAM.INFO.{name}", {}))["config"]
+    log.connection.call(log.connection.ask(f"STREAM.UPDATE.{name}", {**config, "max_msg_size": 1000}))
+    for seq, size in enumerate((100, 2000, 100)):
+        writer.put(message(seq, size))
+    until(writer.idle, "all are written, or lost")
+    writer.close()
+    assert (writer.written, writer.dropped, writer.failure) == (2, 1, "")
+    assert "size" in lost[0][1]
