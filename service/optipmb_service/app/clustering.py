@@ -115,17 +115,12 @@ def _reach(store: LeaseStore) -> None:
             return
 
 
-def open_log(settings: Settings, recent: KeptTracks) -> tuple[MissedFrames, KeptTracks]:
-    """Return where frames are that a session has missed, and tracks: in the log, where there is a cluster.
-
-    Args:
-        settings: what is in force.
-        recent: what is kept without a log.
-    """
+def open_log(settings: Settings) -> tuple[MissedFrames, list[KeptTracks]]:
+    """Return where frames are that a session has missed, and tracks: in the log, where there is a cluster."""
     if not settings.cluster:
-        return NoLog(), recent
+        return NoLog(), []
     from optipmb_service.cluster.log_reader import LogReader  # noqa: PLC0415 - an extra
     from optipmb_service.cluster.message_log import MessageLog  # noqa: PLC0415 - an extra
 
     reader = LogReader(MessageLog(settings.cluster, settings.prefix, nats_access(settings)), settings.standby_s)
-    return LoggedFrames(reader, Keys(settings.prefix), Fusion(settings.fuse)), LoggedTracks(reader, recent)
+    return LoggedFrames(reader, Keys(settings.prefix), Fusion(settings.fuse)), [LoggedTracks(reader)]

@@ -108,7 +108,7 @@ class Service:
             else NoPersistence(keeps_nothing)
         )
         recent = RecentTracks(self._transport.recent_tracks, settings.limits.limits())
-        self._missed, kept = open_log(settings, recent)
+        self._missed, logged = open_log(settings)
         self._registry = Registry(
             settings,
             profiles,
@@ -139,7 +139,7 @@ class Service:
             self._member,
             self._intake.hand_over,
             settings.workers,
-            TrackQuery(kept, settings.instance, settings.limits.limits()),
+            TrackQuery([*logged, recent], settings.instance, settings.limits.limits()),
         )
 
     def start(self, *, announce: bool = True) -> None:

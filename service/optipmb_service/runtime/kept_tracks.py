@@ -62,7 +62,10 @@ class KeptTracks(Protocol):
     """Where tracks are kept."""
 
     def find(self, stream: str, wanted: TracksRange, then: Callable[[str], None]) -> None:
-        """Put what is kept into a range, and call `then`, on any thread, with the reason when it cannot be read."""
+        """Put what is kept into a range, and call `then` with the reason when it cannot be read.
+
+        It is called on a thread that it must not keep.
+        """
 
 
 class TracksRange:
@@ -77,6 +80,8 @@ class TracksRange:
 
     def __init__(self, from_ns: int, to_ns: int | None, most: int = MOST, most_bytes: int = MOST_BYTES) -> None:
         self.from_ns = from_ns
+        self.known = False
+        """Whether anything is kept of the stream, in the range or not."""
         self.cut_ns: int | None = None
         """The stamp from which on there is more; None: this is all."""
         self._to_ns = to_ns
@@ -88,6 +93,7 @@ class TracksRange:
         """Take messages in the order of their publication; False: no later one belongs here."""
         latest_ns = 0
         for one in messages:
+            self.known = True
             latest_ns = max(latest_ns, one.stamp_ns)
             if one.stamp_ns < self.from_ns or (self._to_ns is not None and one.stamp_ns > self._to_ns):
                 continue
@@ -147,35 +153,18 @@ class RecentTracks:
 
 
 class LoggedTracks:
-    """What is in the log; for a stream of which it has nothing, what is kept for subscribers that come late.
+    """What is in the log.
 
     Args:
         reader: reads the log.
-        recent: what is kept beside it.
     """
 
-    def __init__(self, reader: LogReader, recent: KeptTracks) -> None:
+    def __init__(self, reader: LogReader) -> None:
         self._reader = reader
-        self._recent = recent
 
     def find(self, stream: str, wanted: TracksRange, then: Callable[[str], None]) -> None:
         """Read the log."""
-        read = []
-
-        def take(messages: Sequence[Published]) -> bool:
-            read.append(len(messages))
-            return wanted.add(messages)
-
-        def end(failure: str) -> None:
-            if read or failure:
-                then(failure)
-            else:
-                try:
-                    self._recent.find(stream, wanted, then)
-                except Exception as error:  # noqa: BLE001 - said to whoever asked
-                    then(f"{type(error).__name__}: {error}")
-
-        self._reader.tracks(stream, max(0, wanted.from_ns - LATE_NS), take, end)
+        self._reader.tracks(stream, max(0, wanted.from_ns - LATE_NS), wanted.add, then)
 
 
 class _Recent(NamedTuple):

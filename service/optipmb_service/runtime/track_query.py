@@ -14,7 +14,7 @@ from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.problems import problem_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Sequence
 
     from optipmb_service.runtime.kept_tracks import KeptTracks
     from optipmb_service.runtime.ports import Request
@@ -29,12 +29,12 @@ class TrackQuery:
     """Answers queries for tracks of a range of stamps.
 
     Args:
-        kept: where tracks are kept.
+        kept: where tracks are kept; each is asked where those before it know nothing of the stream.
         instance: name of the service.
         limits: of messages.
     """
 
-    def __init__(self, kept: KeptTracks, instance: str, limits: schemas.Limits) -> None:
+    def __init__(self, kept: Sequence[KeptTracks], instance: str, limits: schemas.Limits) -> None:
         self._kept = kept
         self._instance = instance
         self._limits = limits
@@ -53,15 +53,24 @@ class TrackQuery:
             self._refuse(request, stream, many)
             return
         wanted = TracksRange(asked.from_ns, asked.to_ns)
+        self._pool.submit(self._find, request, stream, asked, wanted, self._kept)
 
+    def _find(
+        self,
+        request: Request,
+        stream: str,
+        asked: schemas.TracksRequest,
+        wanted: TracksRange,
+        kept: Sequence[KeptTracks],
+    ) -> None:
         def found(failure: str) -> None:
-            self._pool.submit(self._reply, request, stream, asked, wanted, failure)
+            if failure or wanted.known or not kept[1:]:
+                self._pool.submit(self._reply, request, stream, asked, wanted, failure)
+            else:
+                self._pool.submit(self._find, request, stream, asked, wanted, kept[1:])
 
-        self._pool.submit(self._find, stream, wanted, found)
-
-    def _find(self, stream: str, wanted: TracksRange, found: Callable[[str], None]) -> None:
         try:
-            self._kept.find(stream, wanted, found)
+            kept[0].find(stream, wanted, found)
         except Exception as error:
             log.exception("internal_error", stream=stream)
             found(f"{type(error).__name__}: {error}")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import queue
+import threading
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 from unittest.mock import Mock
@@ -11,11 +13,14 @@ from unittest.mock import Mock
 import pytest
 from commands import run_here
 from fake_service import tracks_of
+from nats_process import NatsProcess
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, kept_tracks
 from optipmb_client.table_files import read_table
 from optipmb_schemas import Keys, Limits, Tracks, TracksRequest, decode, encode, encoding_of
+from optipmb_service.cluster.log_reader import LogReader
+from optipmb_service.cluster.message_log import MessageLog
 from optipmb_service.runtime import track_query
-from optipmb_service.runtime.kept_tracks import LATE_NS, TracksRange
+from optipmb_service.runtime.kept_tracks import LATE_NS, LoggedTracks, RecentTracks, TracksRange
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_client, open_router
 
@@ -152,11 +157,35 @@ def test_a_search_that_fails_takes_no_room(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(track_query, "AT_ONCE", 1)
     kept, refused = Mock(), queue.SimpleQueue[Any]()
     kept.find.side_effect = ValueError("a mistake")
-    query = track_query.TrackQuery(kept, "test", Limits())
+    query = track_query.TrackQuery([kept], "test", Limits())
     for _ in range(track_query.AT_ONCE + 1):
         query.answer(Mock(payload=b"", refuse=refused.put), SENSOR.stream)
         problem = refused.get(timeout=60.0)
         assert (problem.code, problem.received) == ("unlogged", "ValueError: a mistake")
+
+
+def test_caches_that_do_not_answer_keep_nothing_of_the_log_waiting(tmp_path: Path) -> None:
+    """The loop of the connection to NATS goes on while the caches are asked for what the log does not have."""
+    asked, answered, finished = threading.Event(), threading.Event(), threading.Event()
+
+    def recent(_: str) -> list[tuple[bytes, str]]:
+        asked.set()
+        answered.wait()
+        return []
+
+    with NatsProcess(tmp_path) as nats:
+        reader = LogReader(log := MessageLog([nats.url], KEYS.prefix), 1.0)
+        until(lambda: not log.connection.failure, "it is connected")
+        kept = [LoggedTracks(reader), RecentTracks(recent, Limits())]
+        query = track_query.TrackQuery(kept, "test", Limits())
+        try:
+            query.answer(Mock(payload=b"", finish=finished.set), SENSOR.stream)
+            assert asked.wait(60.0)
+            log.connection.call(asyncio.sleep(0), calls=60.0)
+        finally:
+            answered.set()
+            assert finished.wait(60.0)
+            reader.close(60.0)
 
 
 def test_the_client_asks_part_by_part(
