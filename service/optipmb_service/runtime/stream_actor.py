@@ -290,8 +290,8 @@ class StreamActor:
     def take_up(self, packets: Sequence[tuple[Packet, bool]], *, answered: bool = False) -> None:
         """Go on with a stream that has come here, and with what it sent before, each packet with whether it is a frame.
 
-        A session that is kept goes on at once; without one the first valid packet begins it. `answered`: all that the
-        publisher's cache holds is among them.
+        A session that is kept, and was not closed, goes on at once; else the first valid packet begins one. `answered`:
+        all that the publisher's cache holds is among them.
         """
         if not self.occupied and self._context.member.holds(self.stream) and not self._context.room(self.stream):
             self._seeking = self._open()
@@ -426,7 +426,8 @@ class StreamActor:
             missed.take()
             self._load()  # lost and taken again: another instance may have gone on in between
             return
-        if member.holds(self.stream) and not (restored is None and self._seeking):
+        is_closed = restored is None or not restored.counters.frames
+        if member.holds(self.stream) and not (is_closed and self._seeking):
             self._begin(restored, lineage, fence)
         else:
             self._context.release(self.stream, lineage)

@@ -64,6 +64,23 @@ def test_an_idle_session_is_kept_and_goes_on(start: Callable[..., Any], tmp_path
     assert digest not in {"", asked.digest}
 
 
+def test_a_closed_stream_that_moves_stays_closed(start: Callable[..., Any], tmp_path: Path) -> None:
+    """Whoever gets it has no session of it until its next frame, which then gets ids that were never used before."""
+    service, endpoint = start(store=str(tmp_path))
+    with Node(endpoint) as node:
+        node.send(*(SENSOR.detections(seq) for seq in range(5)))
+        before = node.tracks(SENSOR.stream, 5)[-1]
+        assert node.ask(KEYS.query(SENSOR.stream, "reset"), SessionState, b'{"close": true}').state == "closed"
+        until(lambda: not service._registry.waits(SENSOR.stream), "its state is kept")
+        service._registry.hold(SENSOR.stream)
+        service._registry.take_up(SENSOR.stream, [])
+        until(lambda: not service._registry.waits(SENSOR.stream), "it is taken up, and no session is there")
+        node.send(*(SENSOR.detections(seq) for seq in range(5, 10)))
+        after = node.tracks(SENSOR.stream, 10)[-1]
+    assert after.seq == 9
+    assert not set(after.id) & set(before.id)
+
+
 def test_a_restart_goes_on(start: Callable[..., Any], tmp_path: Path) -> None:
     """Fault 18: what was tracked before the end is there after the start, to the byte, without the publisher's help."""
     service, endpoint = start(store=str(tmp_path))
