@@ -262,12 +262,23 @@ class Intake:
                 log.exception("internal_error", thread="intake")
 
     def _step(self) -> None:
-        """Bring the subscriptions in line with what is held and known, and take up what came here."""
+        """See what is held and known now, and act on it; the next step does again what failed in this one."""
         now_ns, held = time.monotonic_ns(), self._member.partitions
         with self._lock:
             came, self._came = self._came, set()
             self._left = {partition: until for partition, until in self._left.items() if until > now_ns}
             received = self._received = held | self._left.keys()
+        known = self._known
+        try:
+            self._align(came, held, received, now_ns)
+        except Exception:
+            with self._lock:
+                self._came |= came
+            self._known = known
+            raise
+
+    def _align(self, came: set[int], held: set[int], received: set[int], now_ns: int) -> None:
+        """Bring the subscriptions in line, and take up what came here."""
         everything = len(held) == PARTITIONS
         discovering = DISCOVERY in held
         self._directory.expire(now_ns, discovering=discovering)

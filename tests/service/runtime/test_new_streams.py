@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from optipmb_schemas import Keys
-from optipmb_service.cluster.leases import PARTITIONS, partition_of
+from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.intake import NEW_STREAMS, Intake
@@ -18,6 +18,7 @@ from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.registry import Registry
 from optipmb_service.runtime.takeover_buffer import UNASKED_NS, TakeoverBuffer
 from optipmb_service.session.values import SECOND
+from router import until
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -78,9 +79,10 @@ def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
         passed_by=None,
         caches_answered=None,
         actor=lambda _: None,
-        foreign=lambda _: set(),
+        foreign=lambda _: set[str](),
         hold=lambda _: None,
         take_up=lambda *_: None,
+        changed=lambda *_: None,
     )
     member = SimpleNamespace(partitions=held, holds=lambda stream: partition_of(stream) in held)
     untyped: Any = registry, member, network
@@ -121,6 +123,35 @@ def test_only_publishers_with_a_cache_are_subscribed_to_with_recovery() -> None:
     run(network, intake, lambda: len(network.subscribed) >= 2 * len(own))
     assert {stream for _, stream, recovered in network.subscribed if recovered} == own.intersection(cached)
     assert {stream for _, stream, recovered in network.subscribed if not recovered} == own.intersection(plain)
+
+
+@pytest.mark.parametrize("fails", ["subscribe", "discover", "ask_recent", "take_up"])
+def test_a_step_that_fails_is_done_again(monkeypatch: pytest.MonkeyPatch, fails: str) -> None:
+    """Sessions that are held while their streams come here are taken up, whatever raised in between."""
+    network, held = Network(announced=STREAMS[:5], published=STREAMS[5:10]), set[int]()
+    intake, registry = member_of(network, held)
+    kept, taken, failed = set[str](), set[str](), list[str]()
+    registry.hold = kept.add
+    registry.take_up = lambda session, _: (kept.discard(session), taken.add(session))
+    where: Any = registry if fails == "take_up" else network
+    works = getattr(where, fails)
+
+    def failing(*arguments: Any, **named: Any) -> object:
+        if kept and not failed:
+            failed.append(fails)
+            raise RuntimeError("a mistake")
+        return works(*arguments, **named)
+
+    monkeypatch.setattr(where, fails, failing)
+    intake.start()
+    try:
+        held.update(range(1, PARTITIONS))
+        for partition in tuple(held):
+            intake.changed(partition, Change.HELD)
+        own = {stream for stream in STREAMS[:10] if partition_of(stream)}
+        until(lambda: failed == [fails] and taken == own and not kept, "all are taken up", WAIT_S)
+    finally:
+        intake.close()
 
 
 @pytest.mark.parametrize("new", [True, False], ids=["new", "known"])
