@@ -192,8 +192,10 @@ class MessageLog:
             back_s: how much older than the newest message they are at most.
         """
         newest = await self._one(topic, {"last_by_subj": self._subject(topic, stream)})
-        oldest = await self._first_at(topic, stream, 0.0 if newest is None else newest.at_s - back_s)
-        if newest is None or oldest is None or old(newest.message):
+        if newest is None or old(newest.message):
+            return None
+        oldest = await self._first_at(topic, stream, newest.at_s - back_s)
+        if oldest is None:
             return None
         if not old(oldest.message):
             return oldest.number

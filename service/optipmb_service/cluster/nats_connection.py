@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import structlog
 from nats.errors import Error as NatsError
+from nats.errors import NoRespondersError
 
 from optipmb_service.cluster.nats_access import SecuredClient
 from optipmb_service.cluster.store import StoreError
@@ -206,6 +207,13 @@ class NatsConnection:
     async def read(self, name: str, request: Mapping[str, Any]) -> list[Msg]:
         """Return the messages of a JetStream stream that a request names, from the server that is nearest."""
         client = self.client()
+        if "batch" not in request:
+            try:
+                return _answered(
+                    await client.request(f"$JS.API.DIRECT.GET.{name}", json.dumps(request).encode(), timeout=CALL_S)
+                )
+            except NoRespondersError as error:
+                raise NobodyAnswersError(f"nobody answers for {name}") from error
         inbox = client.new_inbox()
         subscription = await client.subscribe(inbox)
         messages: list[Msg] = []
@@ -213,15 +221,11 @@ class NatsConnection:
             await client.publish(f"$JS.API.DIRECT.GET.{name}", json.dumps(request).encode(), reply=inbox)
             while True:
                 message = await subscription.next_msg(CALL_S)
-                if (status := (message.headers or {}).get("Status")) is not None:
-                    if status == NOBODY:
-                        raise NobodyAnswersError(f"nobody answers for {name}")
-                    if status not in ENDS:
-                        raise NatsError(f"status {status}")
+                if (message.headers or {}).get("Status") == NOBODY:
+                    raise NobodyAnswersError(f"nobody answers for {name}")
+                if not (found := _answered(message)):
                     return messages
-                messages.append(message)
-                if "batch" not in request:
-                    return messages
+                messages += found
         finally:
             await subscription.unsubscribe()
 
@@ -244,6 +248,20 @@ class NatsConnection:
 
     async def _disconnected(self) -> None:
         self._lost()
+
+
+def _answered(message: Msg) -> list[Msg]:
+    """Return the message of an answer; none where its status says that there are no more.
+
+    Raises:
+        NatsError: the status says something else.
+    """
+    status = (message.headers or {}).get("Status")
+    if status is None:
+        return [message]
+    if status not in ENDS:
+        raise NatsError(f"status {status}")
+    return []
 
 
 def token(text: str) -> str:

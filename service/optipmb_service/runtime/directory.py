@@ -26,7 +26,7 @@ TOKEN_NS: Final = SECOND
 """How long the token of a publisher whose messages can be recovered may come after its first message."""
 
 
-MAX_UNPROVEN: Final = 256
+MAX_UNPROVEN: Final = 1024
 """Streams without a session that this instance announces at once: each costs members a token and subscriptions."""
 
 UNPROVEN_NS: Final = 10 * SECOND
@@ -129,7 +129,6 @@ class StreamDirectory:
         with self._lock:
             if not discovering:
                 self._queued.clear()
-            self._look(now_ns)
             for stream, known in tuple(self._streams.items()):
                 if known.announced and (known.tokens or not discovering or now_ns - known.seen_ns > self._idle_ns):
                     known.announced = False
@@ -137,6 +136,7 @@ class StreamDirectory:
                 if known.left_ns is not None and now_ns - known.left_ns > FORGET_NS:
                     del self._streams[stream]
             self._awaited = {one: since for one, since in self._awaited.items() if now_ns - since < self._idle_ns}
+        self.admit(now_ns)
 
     def streams(self) -> dict[str, bool]:
         """Return the streams that are known, each with whether its publisher has a cache to ask."""
@@ -165,8 +165,12 @@ class StreamDirectory:
         self._unproven[stream] = now_ns
         return True
 
-    def _look(self, now_ns: int) -> None:
+    def admit(self, now_ns: int) -> None:
         """See which streams have got a session, forget those that have waited too long, and announce the next."""
+        with self._lock:
+            self._admit(now_ns)
+
+    def _admit(self, now_ns: int) -> None:
         for stream, since_ns in tuple(self._unproven.items()):
             known = self._streams.get(stream)
             if known is None or not known.announced or self._has_session(stream):
@@ -175,10 +179,9 @@ class StreamDirectory:
                 del self._unproven[stream]
                 known.announced = False
                 self._settled(known, now_ns)
-        for stream, seen_ns in tuple(self._queued.items()):
-            if len(self._unproven) >= MAX_UNPROVEN:
-                break
-            del self._queued[stream]
+        while self._queued and len(self._unproven) < MAX_UNPROVEN:
+            stream = next(iter(self._queued))
+            seen_ns = self._queued.pop(stream)
             if now_ns - seen_ns <= QUEUED_NS and (known := self._found(stream)) is not None and not known.tokens:
                 self._unproven[stream] = now_ns
                 known.announced, known.left_ns, known.seen_ns = True, None, now_ns

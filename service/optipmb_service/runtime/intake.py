@@ -18,8 +18,7 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol
 
 import optipmb_schemas as schemas
 import structlog
@@ -54,11 +53,15 @@ END_S: Final = 5.0
 NEW_STREAMS: Final = 128
 """New streams without a cache that are taken in at once; what they sent is asked for before the next are taken in."""
 
+REST: Final = 2.0
+"""How many times as long as a step took of the processor the thread rests before the next one."""
+
+MOST_REST_S: Final = 0.5
+
 Kind = Literal["detections", "points", "discovery"]
 
 
-@dataclass(frozen=True, order=True)
-class Input:
+class Input(NamedTuple):
     """A subscription: what of a stream, or of all of them, and whether what was lost is recovered from a cache."""
 
     kind: Kind
@@ -133,6 +136,8 @@ class Intake:
         self._owed: set[str] = set()
         self._handed = threading.Condition()
         self._wake = threading.Event()
+        self._hurry = threading.Event()
+        self._expires_ns = 0
         self._ending = False
         self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
 
@@ -149,6 +154,7 @@ class Intake:
     def close(self) -> None:
         """Change nothing any more."""
         self._ending = True
+        self._hurry.set()
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join(END_S)
@@ -166,6 +172,7 @@ class Intake:
         with self._handed:
             owed = self._registry.foreign({partition})
             (self._owed.update if change is Change.LOST else self._owed.difference_update)(owed)
+        self._hurry.set()
         self._wake.set()
 
     @property
@@ -254,12 +261,16 @@ class Intake:
         while not self._ending:
             self._wake.wait(EXPIRY_S)
             self._wake.clear()
+            self._hurry.clear()
+            began_s = time.thread_time()
             try:
                 self._step()
             except TransportError:
                 return  # the end
             except Exception:
                 log.exception("internal_error", thread="intake")
+            # A step looks at all streams: where thousands begin, what comes meanwhile is seen to in one.
+            self._hurry.wait(min(MOST_REST_S, REST * (time.thread_time() - began_s)))
 
     def _step(self) -> None:
         """See what is held and known now, and act on it; the next step does again what failed in this one."""
@@ -281,11 +292,20 @@ class Intake:
         """Bring the subscriptions in line, and take up what came here."""
         everything = len(held) == PARTITIONS
         discovering = DISCOVERY in held
-        self._directory.expire(now_ns, discovering=discovering)
+        if now_ns >= self._expires_ns:
+            self._directory.expire(now_ns, discovering=discovering)
+            self._expires_ns = now_ns + round(EXPIRY_S * SECOND)
+        elif discovering:
+            self._directory.admit(now_ns)
         if discovering and Input("discovery") not in self._subscribed and not everything:
             self._directory.adopt(now_ns)
         streams = self._directory.streams()
-        new = [stream for stream, cached in streams.items() if not cached and stream not in self._known]
+        session_of = self._registry.fusion.session_of
+        new = [
+            stream
+            for stream, cached in streams.items()
+            if not cached and stream not in self._known and partition_of(session_of(stream)) in held
+        ]
         for stream in new[NEW_STREAMS:]:
             del streams[stream]  # in the next step
             self._wake.set()

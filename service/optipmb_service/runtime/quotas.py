@@ -54,6 +54,7 @@ class Quotas:
         self._quotas = {"node": node, "site": site}
         self._lock = threading.Lock()
         self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
+        self._sessions: Counter[tuple[str, str]] = Counter()
 
     def exceeded(self, stream: str, size: int, now_ns: int) -> str:
         """Take a message of a stream from its quotas; say which has no more, empty while all have."""
@@ -64,18 +65,21 @@ class Quotas:
                     return f"{kind} {owner}: at most {_said(quota)} a second"
         return ""
 
-    def full(self, stream: str, tracked: Iterable[str]) -> str:
-        """Say which quota of sessions a further stream would exceed; empty when none.
+    def count(self, stream: str, sessions: int) -> None:
+        """Take in that a stream has a session (1), or none any more (-1)."""
+        with self._lock:
+            for owner in _owners(stream):
+                self._sessions[owner] += sessions
+                if not self._sessions[owner]:
+                    del self._sessions[owner]
 
-        Args:
-            stream: the further one.
-            tracked: the streams that have a session.
-        """
-        counts = Counter(owner for other in tracked for _, owner in _owners(other))
-        for kind, owner in _owners(stream):
-            most = self._quotas[kind].sessions
-            if most and counts[owner] >= most:
-                return f"{kind} {owner}: at most {most} streams at once"
+    def full(self, stream: str) -> str:
+        """Say which quota of sessions a further stream would exceed; empty when none."""
+        with self._lock:
+            for kind, owner in _owners(stream):
+                most = self._quotas[kind].sessions
+                if most and self._sessions[kind, owner] >= most:
+                    return f"{kind} {owner}: at most {most} streams at once"
         return ""
 
     def _take(self, owner: str, quota: Quota, size: int, now_ns: int) -> bool:

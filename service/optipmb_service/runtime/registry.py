@@ -48,6 +48,9 @@ log = structlog.get_logger("optipmb_service")
 MAX_UNPROVEN: Final = 256
 """Actors at once of streams that have not sent a valid message yet."""
 
+MAX_NEWCOMERS: Final = 16_384
+"""Streams beyond them whose first messages wait, within `standby_mb`, until some of these have sent a valid one."""
+
 MAX_LIVES: Final = 65_536
 """Streams without a session whose past is remembered."""
 
@@ -119,6 +122,8 @@ class Registry:
         self._scheduler = scheduler
         self._lock = threading.Lock()
         self._actors: dict[str, StreamActor] = {}
+        self._unproven: set[StreamActor] = set()
+        self._newcomers: dict[str, None] = {}
         self._sessions = 0
         self._lives: OrderedDict[str, Lineage] = OrderedDict()
         self._streams: dict[str, tuple[str, str]] = {}
@@ -221,7 +226,8 @@ class Registry:
 
     def _hand(self, stream: str, packet: Packet, *, frame: bool) -> None:
         offered = Mailbox.offer_frame if frame else Mailbox.offer_cloud
-        self._offer(stream, lambda actor: offered(actor.mailbox, packet))
+        if not self._offer(stream, lambda actor: offered(actor.mailbox, packet)):
+            self._put_off(stream, packet, frame=frame)
 
     def _kept_for_takeover(self, stream: str, packet: Packet, *, frame: bool) -> bool:
         """Keep a packet of a stream that is not tracked here; False where the stream is to be tracked here.
@@ -247,7 +253,10 @@ class Registry:
 
     def command(self, stream: str, command: Callable[[StreamActor], None], *, urgent: bool) -> bool:
         """Have a worker run a command for a stream; False when the service takes no more streams."""
-        return self._offer(stream, lambda actor: actor.mailbox.offer_command(lambda: command(actor), urgent=urgent))
+        if self._offer(stream, lambda actor: actor.mailbox.offer_command(lambda: command(actor), urgent=urgent)):
+            return True
+        self._refuse(stream)
+        return False
 
     # What is there
 
@@ -312,12 +321,14 @@ class Registry:
     def hold(self, session: str) -> None:
         """Keep what comes of a session until it is taken up."""
         with self._foreign_lock:
+            self._newcomers.pop(session, None)
             self._foreign.setdefault(session, self._context.buffer()).seen_ns = time.monotonic_ns()
 
     def take_up(self, session: str, packets: list[tuple[Packet, bool]]) -> None:
         """Go on with a session that has come here: with what others received of it, then with what was kept here."""
         with self._foreign_lock:
             buffer = self._foreign.get(session)
+            self._newcomers.pop(session, None)
             if buffer is None:
                 return
             if not self._member.holds(session):  # it has gone again
@@ -368,12 +379,14 @@ class Registry:
         for stream, other in self._rivals.contested([actor.stream for actor in self.actors()], now_ns):
             self._report("contested", stream, "one `store`, or `cluster`, for all instances", f"{other} tracks it too")
         self._evict()
+        self._let_in()
         with self._foreign_lock:
             for stream, buffer in tuple(self._foreign.items()):
                 buffer.trim(now_ns)
                 forgotten = len(self._foreign) > MAX_LIVES or now_ns - buffer.seen_ns > self._settings.idle_s * SECOND
                 if not buffer and forgotten:
                     del self._foreign[stream]
+                    self._newcomers.pop(stream, None)
 
     def _evict(self) -> None:
         """Close sessions, the least recently used first, while all together keep more than the process may."""
@@ -450,12 +463,11 @@ class Registry:
         return why
 
     def _look_for_room(self, stream: str) -> str:
-        actors = self.actors()
-        if full := self._quotas.full(stream, (actor.stream for actor in actors)):
+        if full := self._quotas.full(stream):
             return full
         if self._sessions < self._settings.max_sessions:
             return ""
-        tracked = [(actor.stream, actor.meter.active_ns) for actor in actors]
+        tracked = [(actor.stream, actor.meter.active_ns) for actor in self.actors()]
         victim = victim_of(stream, tracked, time.monotonic_ns(), round(EVICT_IDLE_S * SECOND))
         if victim is None:
             return f"at most {self._settings.max_sessions} streams at once"
@@ -469,7 +481,6 @@ class Registry:
         while True:
             actor = self._actor(stream, limited=limited)
             if actor is None:
-                self._refuse(stream)
                 return False
             sent = offer(actor)
             if sent is not None:
@@ -483,16 +494,45 @@ class Registry:
     def _actor(self, stream: str, *, limited: bool) -> StreamActor | None:
         with self._lock:
             actor = self._actors.get(stream)
-            if actor is None and not (limited and self._unproven >= MAX_UNPROVEN):
+            if actor is None and not (self._crowded() and limited):
                 actor = self._actors[stream] = StreamActor(stream, self._context)
+                self._unproven.add(actor)
             return actor
 
-    @property
-    def _unproven(self) -> int:
-        """Actors of streams that have not sent a valid message, as far as is known; called with the lock."""
-        if len(self._actors) < MAX_UNPROVEN:
-            return 0
-        return sum(not actor.occupied for actor in self._actors.values())
+    def _crowded(self) -> bool:
+        """Whether too many streams have not sent a valid message yet, as far as is known; called with the lock."""
+        if len(self._unproven) >= MAX_UNPROVEN:
+            known = self._actors.get
+            self._unproven = {one for one in self._unproven if not one.occupied and known(one.stream) is one}
+        return len(self._unproven) >= MAX_UNPROVEN
+
+    def _put_off(self, session: str, packet: Packet, *, frame: bool) -> None:
+        """Keep the first messages of a stream until there is room for it among those that are new."""
+        with self._foreign_lock:
+            buffer = self._foreign.get(session)
+            if buffer is None and len(self._newcomers) < MAX_NEWCOMERS:
+                buffer = self._foreign[session] = self._context.buffer()
+                buffer.unasked = True
+                self._newcomers[session] = None
+            if buffer is not None:
+                buffer.add(packet, frame=frame)
+                buffer.seen_ns = packet.now_ns
+                if len(buffer):
+                    return
+                del self._foreign[session]
+                self._newcomers.pop(session, None)
+        self._refuse(session)
+
+    def _let_in(self) -> None:
+        """Hand over what was put off, as far as there is room."""
+        while self._newcomers:
+            with self._lock:
+                if self._crowded():
+                    return
+            with self._foreign_lock:
+                session = next(iter(self._newcomers), None)
+            if session is not None:
+                self.take_up(session, [])
 
     def _discard(self, actor: Actor) -> None:
         with self._lock:
@@ -505,7 +545,10 @@ class Registry:
             if self._sessions >= self._settings.max_sessions:
                 return None
             self._sessions += 1
-            return self._lives.pop(stream, Lineage())
+            lineage = self._lives.pop(stream, Lineage())
+        self._quotas.count(stream, 1)
+        self._let_in()
+        return lineage
 
     def _release(self, stream: str, lineage: Lineage) -> None:
         with self._lock:
@@ -514,6 +557,7 @@ class Registry:
             self._lives[stream] = lineage
             if len(self._lives) > MAX_LIVES:
                 self._lives.popitem(last=False)
+        self._quotas.count(stream, -1)
 
     def _refuse(self, stream: str) -> None:
         self._count_refused()

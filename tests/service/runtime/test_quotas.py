@@ -37,10 +37,14 @@ def test_bytes_are_counted_over_a_site() -> None:
 def test_sessions_are_counted_per_node_and_site() -> None:
     """A node with its share of streams gets no further one, and a site likewise."""
     quotas = Quotas(Quota(sessions=2), Quota(sessions=3))
-    tracked = ["site/a/1", "site/a/2"]
-    assert quotas.full("site/a/3", tracked) == "node site/a: at most 2 streams at once"
-    assert quotas.full("site/b/1", tracked) == ""
-    assert quotas.full("site/c/1", [*tracked, "site/b/1"]) == "site site: at most 3 streams at once"
+    quotas.count("site/a/1", 1)
+    quotas.count("site/a/2", 1)
+    assert quotas.full("site/a/3") == "node site/a: at most 2 streams at once"
+    assert quotas.full("site/b/1") == ""
+    quotas.count("site/b/1", 1)
+    assert quotas.full("site/c/1") == "site site: at most 3 streams at once"
+    quotas.count("site/a/2", -1)
+    assert quotas.full("site/a/3") == quotas.full("site/c/1") == ""
 
 
 def test_the_least_recently_used_makes_room() -> None:
