@@ -1,10 +1,11 @@
-"""What a subscription gets of a publisher that was there before it: everything that the publisher's cache still holds.
+"""What a subscription gets of a publisher with a cache: all that the cache still holds, each message in its turn.
 
 A publisher sends to the subscriptions that it knows of. While the declaration of a new one is on its way, messages go
 to the cache alone, and Zenoh's own query of the caches may have been answered before. Once a later message has come,
-Zenoh takes those that are recovered for old ones, and drops them. So the number of the first message that comes of a
-publisher decides here: unless it is 0, the cache is asked for the messages before it, and what comes of this publisher
-meanwhile waits. That happens once for each publisher; later gaps are recovered by Zenoh's advanced subscriber.
+Zenoh takes those that are recovered for old ones, and drops them. So the number of a message decides here: unless it
+follows that of the one before, or is 0 where there was none, the cache is asked for those in between, and what comes of
+this publisher meanwhile waits. Most gaps have been filled by Zenoh's advanced subscriber before. One is left where a
+new subscription takes over: the cache's answer to it may overtake messages on their way, which Zenoh then drops.
 
 It takes Zenoh's samples and imports no Zenoh.
 """
@@ -79,6 +80,7 @@ class LateJoin(Generic[_S]):
         self._ask = ask
         self._told = answered
         self._sources: dict[_Source, list[_S] | None] = {}  # what waits for the answer of a cache; None: nothing does
+        self._due: dict[_Source, int] = {}  # the number after the highest that was handed over
         self._keys: dict[_Source, str] = {}
         self._waiting_bytes = 0
         self._lock = threading.Lock()
@@ -96,26 +98,27 @@ class LateJoin(Generic[_S]):
         with self._lock:
             if self._closed:
                 return
-            if first := source not in self._sources:
+            if source not in self._sources:
                 self._make_room()
-                self._sources[source] = [] if info.source_sn else None
+                self._sources[source] = None
                 self._keys[source] = str(sample.key_expr)
+                self._due[source] = 0
             waiting = self._sources[source]
             if waiting is None:
-                self._receive(sample)
-                return
-            waiting.append(sample)
-            self._waiting_bytes += len(sample.payload)
-            if len(waiting) >= MAX_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
-                self._release(source)
-        if first:
-            self._ask_before(sample.key_expr, source, info.source_sn)
+                missing = self._follow(source, [sample])
+            else:
+                missing = None
+                waiting.append(sample)
+                self._waiting_bytes += len(sample.payload)
+                if len(waiting) >= MAX_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
+                    self._release(source)
+        self._ask_for(source, str(sample.key_expr), missing)
 
     def keep(self, keys: Container[str]) -> None:
         """Forget the publishers of all other keys: when they are heard again, their caches are asked once more."""
         with self._lock:
             for source in [one for one, key in self._keys.items() if key not in keys and self._sources[one] is None]:
-                del self._sources[source], self._keys[source]
+                self._forget(source)
 
     def close(self) -> None:
         """Hand over what still waits, and nothing afterwards."""
@@ -125,6 +128,7 @@ class LateJoin(Generic[_S]):
                     self._receive(sample)
             self._sources.clear()
             self._keys.clear()
+            self._due.clear()
             self._closed = True
 
     def _make_room(self) -> None:
@@ -132,33 +136,66 @@ class LateJoin(Generic[_S]):
         if len(self._sources) >= MAX_SOURCES:
             oldest = next((source for source, waiting in self._sources.items() if waiting is None), None)
             if oldest is not None:
-                del self._sources[oldest], self._keys[oldest]
+                self._forget(oldest)
 
-    def _ask_before(self, key: object, source: _Source, number: int) -> None:
-        early: list[tuple[int, _S]] = []
+    def _forget(self, source: _Source) -> None:
+        del self._sources[source], self._keys[source], self._due[source]
 
-        def reply(cached: _S) -> None:
-            if (info := cached.source_info) is not None:
-                early.append((info.source_sn, cached))
+    def _follow(self, source: _Source, samples: list[_S]) -> tuple[int, int] | None:
+        """Hand over samples of a publisher up to a gap, behind which they wait; return the first and last missing."""
+        for index, sample in enumerate(samples):
+            due, number = self._due[source], self._number(sample)
+            if number > due:
+                self._sources[source] = samples[index:]
+                self._waiting_bytes += sum(len(one.payload) for one in samples[index:])
+                return due, number - 1
+            self._hand_over(source, sample)
+        return None
 
-        zid, eid = source
-        selector = f"{key}/@adv/pub/{zid}/{eid}/**?_sn=..{number - 1}"
-        self._ask(selector, reply, lambda: self._answered(source, early, str(key)))
+    def _hand_over(self, source: _Source, sample: _S) -> None:
+        self._receive(sample)
+        if source in self._due:
+            self._due[source] = max(self._due[source], self._number(sample) + 1)
 
-    def _answered(self, source: _Source, early: list[tuple[int, _S]], key: str) -> None:
+    @staticmethod
+    def _number(sample: _S) -> int:
+        info = sample.source_info
+        return 0 if info is None else info.source_sn
+
+    def _ask_for(self, source: _Source, key: str, missing: tuple[int, int] | None) -> None:
+        """Ask the cache for what is missing, first to last; what it no longer has is not waited for any longer."""
+        if missing is None:
+            return
+        early: list[_S] = []
+        (zid, eid), (first, last) = source, missing
+        selector = f"{key}/@adv/pub/{zid}/{eid}/**?_sn={first}..{last}"
+        self._ask(selector, early.append, lambda: self._answered(source, key, early))
+
+    def _answered(self, source: _Source, key: str, early: list[_S]) -> None:
+        missing = None
         with self._lock:
             if self._closed:
                 return
-            for _, sample in sorted(early, key=lambda one: one[0]):
-                self._receive(sample)
-            self._release(source)
-            self._told(key)
+            for sample in sorted((one for one in early if one.source_info is not None), key=self._number):
+                self._hand_over(source, sample)
+            waiting = self._taken(source)
+            if waiting:
+                self._hand_over(source, waiting[0])
+                missing = self._follow(source, waiting[1:])
+            if missing is None:
+                self._told(key)
+        self._ask_for(source, key, missing)
 
-    def _release(self, source: _Source) -> None:
+    def _taken(self, source: _Source) -> list[_S]:
+        """Take what waits of a publisher; nothing waits any longer."""
         waiting = self._sources.get(source)
         if waiting is None:  # released before, and perhaps forgotten since
-            return
+            return []
         self._sources[source] = None
-        for sample in waiting:
-            self._waiting_bytes -= len(sample.payload)
-            self._receive(sample)
+        self._waiting_bytes -= sum(len(sample.payload) for sample in waiting)
+        return waiting
+
+    def _release(self, source: _Source) -> None:
+        """Hand over what waits, gaps and all: there is too much of it."""
+        for sample in self._taken(source):
+            self._hand_over(source, sample)

@@ -77,10 +77,25 @@ def test_what_came_before_the_first_sample_comes_first() -> None:
     """A first sample with another number waits, and what follows, for those before it; later ones do not."""
     one = Joined()
     one.take(3, 4)
-    assert (one.received, [selector for selector, _, _ in one.asked]) == ([], ["a/b/@adv/pub/abc/7/**?_sn=..2"])
+    assert (one.received, [selector for selector, _, _ in one.asked]) == ([], ["a/b/@adv/pub/abc/7/**?_sn=0..2"])
     one.answer(2, 1)
     one.take(5)
     assert (one.received, one.asked) == ([1, 2, 3, 4, "a/b", 5], [])
+
+
+def test_a_gap_is_asked_for_once() -> None:
+    """What follows a gap waits for the answer of the cache, which may have nothing; further gaps wait for their own."""
+    one = Joined()
+    one.take(0, 1, 4, 6, 7)
+    assert (one.received, [selector for selector, _, _ in one.asked]) == ([0, 1], ["a/b/@adv/pub/abc/7/**?_sn=2..3"])
+    one.answer(3, 2)
+    assert (one.received, [selector for selector, _, _ in one.asked]) == (
+        [0, 1, 2, 3, 4],
+        ["a/b/@adv/pub/abc/7/**?_sn=5..5"],
+    )
+    one.answer()
+    one.take(5, 8)
+    assert (one.received, one.asked) == ([0, 1, 2, 3, 4, 6, 7, "a/b", 5, 8], [])
 
 
 def test_one_publisher_does_not_wait_for_another() -> None:
@@ -116,7 +131,7 @@ def test_what_waits_and_who_is_known_are_bounded(monkeypatch: pytest.MonkeyPatch
         one.take(0, source=Entity(name))
     assert one.asked == []
     one.take(7)
-    assert [selector for selector, _, _ in one.asked] == ["a/b/@adv/pub/abc/7/**?_sn=..6"]
+    assert [selector for selector, _, _ in one.asked] == ["a/b/@adv/pub/abc/7/**?_sn=0..6"]
 
 
 def test_an_answer_brings_no_forgotten_publisher_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,7 +145,7 @@ def test_an_answer_brings_no_forgotten_publisher_back(monkeypatch: pytest.Monkey
     one.take(0, source=Entity("other"))
     one.take(7)
     assert one.received == [3, 4, 2, "a/b", 0]
-    assert [selector for selector, _, _ in one.asked] == ["a/b/@adv/pub/abc/7/**?_sn=..6"]
+    assert [selector for selector, _, _ in one.asked] == ["a/b/@adv/pub/abc/7/**?_sn=0..6"]
 
 
 def test_bytes_that_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
