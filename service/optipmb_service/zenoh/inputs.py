@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -41,6 +42,9 @@ and Zenoh would take these for lost. Heartbeats tell of what was missed.
 
 RECOVERY: Final = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
 
+FULL_S: Final = 0.005
+"""How long the thread of the network waits before it looks again for room in the queue."""
+
 
 class Topic:
     """The subscriptions of one topic.
@@ -49,7 +53,7 @@ class Topic:
         name: of the topic, for the log.
         session: to subscribe on.
         receive: called for each sample, one after the other.
-        waiting: samples that may wait for the thread; Zenoh waits beyond that.
+        most: samples that may wait for the thread; Zenoh waits beyond that.
         answered: told the key of a publisher when all has been handed over that its cache held.
     """
 
@@ -58,13 +62,15 @@ class Topic:
         name: str,
         session: zenoh.Session,
         receive: Callable[[zenoh.Sample], None],
-        waiting: int,
+        most: int,
         answered: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._name = name
         self._session = session
         self._receive = receive
-        self._waiting: queue.Queue[zenoh.Sample | Callable[[], object] | None] = queue.Queue(waiting)
+        self._most = most
+        # To put into this queue and to wake its reader takes half of what `queue.Queue` takes. It has no bound.
+        self._waiting: queue.SimpleQueue[zenoh.Sample | Callable[[], object] | None] = queue.SimpleQueue()
         self._subscribers: dict[str, tuple[str, Undeclared]] = {}
         self._late_join: LateJoin[zenoh.Sample] = LateJoin(
             self._hand_over, lambda *asked: ask_cache(session, *asked), answered
@@ -87,7 +93,7 @@ class Topic:
         Raises:
             TransportError: the session is closed.
         """
-        put = self._waiting.put  # all that is done on the thread of the network
+        put = self._put  # all that is done on the thread of the network
         try:
             if passing is None and cached:
                 subscriber: Undeclared = zenoh.ext.declare_advanced_subscriber(
@@ -125,6 +131,11 @@ class Topic:
             self._waiting.put(None)
             self._thread.join(timeout)
         self._late_join.close()
+
+    def _put(self, item: zenoh.Sample | Callable[[], object]) -> None:
+        while self._waiting.qsize() >= self._most and self._thread.is_alive():
+            time.sleep(FULL_S)
+        self._waiting.put(item)
 
     def _drain(self) -> None:
         while (item := self._waiting.get()) is not None:

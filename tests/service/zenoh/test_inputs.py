@@ -114,3 +114,29 @@ def test_an_error_while_a_cache_is_asked_ends_nothing(network: Network, monkeypa
     network.publish(b"2")
     network.session.put(KEYS.detections("site/node/camera"), b"other")
     network.counts(b"other")
+
+
+def test_zenoh_waits_while_too_many_messages_wait(network: Network) -> None:
+    """While as many messages wait as may, the thread that brings the next one waits; then all come in their order."""
+    may_go_on, received = threading.Event(), Collected()
+
+    def receive(sample: zenoh.Sample) -> None:
+        may_go_on.wait(CLOSE_S)
+        received.add(str(sample.key_expr), sample.payload.to_bytes(), "")
+
+    sent = [bytes((number,)) for number in range(20)]
+    topic = Topic("points", network.session, receive, 2)
+    try:
+        topic.subscribe(ALL, KEYS.all("points"), cached=False)
+        publishing = threading.Thread(
+            target=lambda: [network.session.put(KEYS.points(STREAM), one) for one in sent], daemon=True
+        )
+        publishing.start()
+        publishing.join(0.5)
+        assert publishing.is_alive()
+        may_go_on.set()
+        received.wait(lambda items: len(items) == len(sent), "all messages")
+        assert [payload for _, payload, _ in received.items] == sent
+    finally:
+        may_go_on.set()
+        topic.close(CLOSE_S)
