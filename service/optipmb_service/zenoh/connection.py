@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 from typing import TYPE_CHECKING, Final, Protocol, cast
 
@@ -27,6 +28,9 @@ WAIT_BEFORE_DROP_US: Final = 50_000
 WAIT_BEFORE_DROP_FRAGMENTS_US: Final = 500_000
 
 RETRY_MS: Final = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2}
+
+RUNTIME: Final = "(rx: (worker_threads: 1))"
+"""A client has one link, which one thread reads. Of two, Zenoh's default, each message wakes the other as well."""
 
 MESSAGE_HEADROOM: Final = 4
 """A message up to this many times the limit is received and answered by a problem; a larger one is dropped by Zenoh."""
@@ -45,6 +49,8 @@ def opened(settings: Settings) -> zenoh.Session:
         TransportError: an endpoint is in use or unusable, or the file of the settings is.
     """
     config = _configuration(settings)
+    if not settings.is_router:
+        os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)  # read when the first session of a process opens
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
