@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.byte_budget import ByteBudget
     from optipmb_service.runtime.missed_frames import MissedFrames
     from optipmb_service.runtime.persistence import Persistence
-    from optipmb_service.runtime.ports import MessageSink, Packet
+    from optipmb_service.runtime.ports import Caches, MessageSink, Packet
     from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
     from optipmb_service.session.values import Lineage, Policy
 
@@ -60,6 +60,7 @@ class ActorContext:
         buffer: makes buffers for packets of streams that are not tracked here now.
         keep: takes a packet of a stream that another instance is to track.
         dump: saves what is needed to see an error of a session again; returns the file.
+        caches: returns what is known of the publishers' caches.
         room: why a further stream has no room; empty when it has.
         admit: asked before a session begins; returns what the stream had before, None when there is no room.
         release: called when a session has ended, or was not begun, with what a later one has to know.
@@ -89,6 +90,7 @@ class ActorContext:
     buffer: Callable[[], TakeoverBuffer]
     keep: Callable[[str, Packet, bool], None]
     dump: Callable[[str, bytes], str]
+    caches: Callable[[], Caches]
     room: Callable[[str], str]
     admit: Callable[[str], Lineage | None]
     release: Callable[[str, Lineage], None]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from optipmb_service.session.values import SECOND
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
 MAX_STREAMS: Final = 65_536
 """Streams that are known at once; publishers beyond it are not heard."""
@@ -25,6 +25,8 @@ FORGET_NS: Final = 10 * SECOND
 TOKEN_NS: Final = SECOND
 """How long the token of a publisher whose messages can be recovered may come after its first message."""
 
+BACK_NS: Final = 5 * SECOND
+"""How long a token may come after the start of this process, or back: who lost its router tries every 4 s at least."""
 
 MAX_UNPROVEN: Final = 1024
 """Streams without a session that this instance announces at once: each costs members a token and subscriptions."""
@@ -57,9 +59,11 @@ class StreamDirectory:
         instance: the name of this one.
         idle_ns: silence after which an announced stream is announced no longer.
         has_session: whether a stream is tracked, here or elsewhere.
+        began_ns: since when tokens are heard of.
     """
 
-    def __init__(self, instance: str, idle_ns: int, has_session: Callable[[str], bool]) -> None:
+    def __init__(self, instance: str, idle_ns: int, has_session: Callable[[str], bool], began_ns: int = 0) -> None:
+        self._began_ns = began_ns
         self._instance = instance
         self._idle_ns = idle_ns
         self._has_session = has_session
@@ -142,6 +146,22 @@ class StreamDirectory:
         """Return the streams that are known, each with whether its publisher has a cache to ask."""
         with self._lock:
             return {stream: bool(known.tokens) for stream, known in self._streams.items()}
+
+    def awaited(self, belongs: Callable[[str], bool], sensors: Iterable[str], now_ns: int) -> dict[str, bool]:
+        """Return the streams whose caches may hold something: True where a publisher is there, False: it may come back.
+
+        Args:
+            belongs: whether a stream is among those that are asked about.
+            sensors: those of them that were there before.
+            now_ns: monotonic time.
+        """
+        with self._lock:
+            found = {stream: True for stream, known in self._streams.items() if known.tokens and belongs(stream)}
+            for stream in sensors:
+                known = self._streams.get(stream, _Known(left_ns=self._began_ns))
+                if known.left_ns is not None and now_ns - known.left_ns < BACK_NS:
+                    found[stream] = False
+        return found
 
     def announced(self) -> set[str]:
         """Return the streams that this instance is to announce."""

@@ -99,6 +99,9 @@ class Inputs(Protocol):
     def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
         """Return what other instances have received lately of sessions, each packet with whether it is a frame."""
 
+    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]]], None]) -> None:
+        """Call `then` soon with what the caches of a stream hold of its detections, all frames."""
+
     def pass_through(self, then: Callable[[], None]) -> None:
         """Call `then` when all that has come until now is handed over."""
 
@@ -125,8 +128,12 @@ class Intake:
         self._linger_ns = round(linger_s * SECOND)
         session_of = registry.fusion.session_of
         self._directory = StreamDirectory(
-            registry.instance, round(idle_s * SECOND), lambda stream: registry.tracked(session_of(stream))
+            registry.instance,
+            round(idle_s * SECOND),
+            lambda stream: registry.tracked(session_of(stream)),
+            time.monotonic_ns(),
         )
+        registry.caches = self
         self._subscribed: set[Input] = set()
         self._known: set[str] = set()
         self._lock = threading.Lock()
@@ -214,6 +221,20 @@ class Intake:
         passed.wait(DRAIN_S)
         while any(self._registry.waits(session) for session in sessions) and time.monotonic() < ends:
             time.sleep(DRAIN_POLL_S)
+
+    def awaited(self, session: str, sensors: Iterable[str]) -> dict[str, bool]:
+        """Return the streams of a session whose caches may hold something, each with whether its publisher is there.
+
+        Args:
+            session: its name.
+            sensors: streams that were there before; their publishers may come back.
+        """
+        session_of = self._registry.fusion.session_of
+        return self._directory.awaited(lambda one: session_of(one) == session, sensors, time.monotonic_ns())
+
+    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]]], None]) -> None:
+        """Call `then` soon, on a thread that it must not keep, with what the caches of a stream hold, all frames."""
+        self._inputs.ask_cache(stream, then)
 
     def handed_over(self, timeout: float) -> bool:
         """Wait until who has the partitions that were left has asked, at most so long (s); False when that was it."""

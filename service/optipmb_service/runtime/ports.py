@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
     import optipmb_schemas as schemas
 
 
@@ -42,6 +44,25 @@ class Packet:
     def held(self) -> int:
         """Bytes that it takes while it waits."""
         return PACKET_BYTES + (0 if self.payload is None else self.size)
+
+
+class Caches(Protocol):
+    """What publishers keep of their detections."""
+
+    def awaited(self, session: str, sensors: Iterable[str]) -> dict[str, bool]:
+        """Return the streams of a session whose caches may hold something, each with whether its publisher is there.
+
+        Args:
+            session: its name.
+            sensors: streams that were there before; their publishers may come back.
+        """
+
+    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]]], None]) -> None:
+        """Call `then` soon, on a thread that it must not keep, with what the caches of a stream hold, all frames.
+
+        Raises:
+            TransportError: the network is closed.
+        """
 
 
 class Publisher(Protocol):

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from optipmb_service.observability.problem_reporter import ProblemReporter
     from optipmb_service.runtime.missed_frames import MissedFrames
     from optipmb_service.runtime.persistence import Persistence
-    from optipmb_service.runtime.ports import MessageSink, Packet
+    from optipmb_service.runtime.ports import Caches, MessageSink, Packet
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.runtime.scheduler import Scheduler
     from optipmb_service.settings import Settings
@@ -140,6 +140,8 @@ class Registry:
         foreign = ByteBudget(settings.standby_mb * MEGABYTE)
         self._foreign: dict[str, TakeoverBuffer] = {}
         self._foreign_lock = threading.Lock()
+        self.caches: Caches
+        """What publishers keep; set before anything is received."""
         self._mailboxes = ByteBudget(settings.memory_mb * MEGABYTE // 2)
         self._context = ActorContext(
             instance=settings.instance,
@@ -173,6 +175,7 @@ class Registry:
             dump=lambda stream, dump: _save(settings.folder, stream, dump),
             buffer=lambda: TakeoverBuffer(round(settings.standby_s * SECOND), foreign),
             keep=self._keep,
+            caches=lambda: self.caches,
             room=self._room,
             admit=self._admit,
             release=self._release,
@@ -211,17 +214,17 @@ class Registry:
     def caches_answered(self, key: str) -> None:
         """Tell a session that all has come which the cache of its publisher held."""
         try:
-            _, session = self.parsed(key)
+            stream, session = self.parsed(key)
         except schemas.MessageError:
             return
         with self._foreign_lock:
             buffer = self._foreign.get(session)
             if buffer is not None:
-                buffer.answered = True
+                buffer.answered.add(stream)
                 return
         with self._lock:
             actor = self._actors.get(session)
-        if actor is not None and actor.mailbox.offer_command(actor.on_caches_answered, urgent=False):
+        if actor is not None and actor.mailbox.offer_command(lambda: actor.on_caches_answered(stream), urgent=False):
             self._scheduler.submit(actor)
 
     def _hand(self, stream: str, packet: Packet, *, frame: bool) -> None:
@@ -337,7 +340,7 @@ class Registry:
                 return
             known = {(packet.key, packet.payload) for packet, _ in packets}
             packets = packets + [one for one in buffer.take() if (one[0].key, one[0].payload) not in known]
-            self._offer(session, partial(_take_up, packets=packets, answered=buffer.answered), limited=False)
+            self._offer(session, partial(_take_up, packets=packets, answered=buffer.answered.copy()), limited=False)
             del self._foreign[session]  # from now on readers hand over newer ones
 
     def tracked(self, session: str) -> bool:
@@ -369,6 +372,8 @@ class Registry:
             if self._member.fence(actor.stream) is None:
                 # It began at the very moment in which its partition was left.
                 self.command(actor.stream, StreamActor.on_lost, urgent=True)
+            if actor.fused and actor.session is not None and actor.session.awaits_caches:
+                self.command(actor.stream, StreamActor.on_caches_answered, urgent=False)  # or a publisher may be gone
             for stream, meter in tuple(actor.sensors.items()):
                 age_s = meter.age_s(now_ns)
                 if age_s is not None and age_s > self._settings.stale_s and stream not in actor.stale:
@@ -609,8 +614,8 @@ def _save(folder: Path | None, stream: str, dump: bytes) -> str:
         return ""
 
 
-def _take_up(actor: StreamActor, packets: list[tuple[Packet, bool]], *, answered: bool) -> bool | None:
-    return actor.mailbox.offer_command(lambda: actor.take_up(packets, answered=answered), urgent=True)
+def _take_up(actor: StreamActor, packets: list[tuple[Packet, bool]], *, answered: set[str]) -> bool | None:
+    return actor.mailbox.offer_command(lambda: actor.take_up(packets, answered), urgent=True)
 
 
 def _flush(actor: StreamActor) -> None:

@@ -10,9 +10,11 @@ decisions, the wall clock only for what delivery reports.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
@@ -21,7 +23,7 @@ import structlog
 from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.decoding import message_of
 from optipmb_service.runtime.mailbox import Mailbox
-from optipmb_service.runtime.ports import Packet
+from optipmb_service.runtime.ports import Packet, TransportError
 from optipmb_service.runtime.stream_counters import StreamCounters
 from optipmb_service.runtime.track_publisher import Arrival, TrackPublisher
 from optipmb_service.session.checkpoint import Checkpoint, CheckpointError, forgotten
@@ -30,7 +32,7 @@ from optipmb_service.session.session import Session
 from optipmb_service.session.values import MAX_SENSORS, Begun, Output, Quarantined, Tracked, total
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Collection, Sequence
 
     from optipmb_service.runtime.context import ActorContext
     from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
@@ -77,6 +79,8 @@ class StreamActor:
         self._degraded_ns: dict[str, int] = {}
         self._opening: Lineage | None = None
         self._seeking = False
+        self._answered: set[str] = set()
+        self._asked: set[str] = set()
         self._closing = False
         self._fence: int | None = None
 
@@ -287,27 +291,51 @@ class StreamActor:
 
     # Who tracks the stream; to be called by the worker alone
 
-    def take_up(self, packets: Sequence[tuple[Packet, bool]], *, answered: bool = False) -> None:
+    def take_up(self, packets: Sequence[tuple[Packet, bool]], answered: Collection[str] = ()) -> None:
         """Go on with a stream that has come here, and with what it sent before, each packet with whether it is a frame.
 
         A session that is kept, and was not closed, goes on at once; else the first valid packet begins one. `answered`:
-        all that the publisher's cache holds is among them.
+        streams of which all that the publisher's cache holds is among them.
         """
         if not self.occupied and self._context.member.holds(self.stream) and not self._context.room(self.stream):
             self._seeking = self._open()
         self._receive_all(packets)
         if answered:
-            self.on_caches_answered()
+            self.on_caches_answered(*answered)
 
-    def on_caches_answered(self) -> None:
-        """Go on behind gaps: what is missing is in no cache. Several sensors have several; they wait for a time."""
+    def on_caches_answered(self, *streams: str) -> None:
+        """Go on behind gaps: all that the caches of these streams held has come. Of several sensors all must have."""
+        self._answered.update(streams)
+        self._asked.update(streams)
         self.ask(StreamActor._recovered, seek=False)
 
     def _recovered(self) -> None:
         session = self.session
-        if session is not None and session.recovering and not self.fused:
+        if session is not None and session.awaits_caches and not (self.fused and self._awaits(session)):
             self._changed = True
             self._deliver(session.recovered(time.monotonic_ns()))
+
+    def _awaits(self, session: Session) -> bool:
+        """Whether the caches of sensors may hold what has not come; those that have not answered are asked."""
+        # While a session is young, there may be sensors that it does not know; its own name stands for them.
+        sensors = {*session.sensors, self.stream} if session.young else session.sensors
+        caches = self._context.caches()
+        awaited = caches.awaited(self.stream, sensors)
+        for stream, is_there in awaited.items():
+            if is_there and stream not in self._asked:
+                self._asked.add(stream)
+                with contextlib.suppress(TransportError):  # the end
+                    caches.ask_cache(stream, partial(self._take_cached, stream))
+        return not awaited.keys() <= self._answered
+
+    def _take_cached(self, stream: str, packets: list[tuple[Packet, bool]]) -> None:
+        """Have the worker take what a cache held; called on any thread."""
+
+        def take(actor: StreamActor, cached: TakeoverBuffer) -> None:
+            actor._catch_up(cached)
+            actor.on_caches_answered(stream)
+
+        self._hand_over(packets, take)
 
     def _receive_all(self, packets: Sequence[tuple[Packet, bool]]) -> None:
         for packet, frame in packets:
@@ -532,6 +560,8 @@ class StreamActor:
         if session is None:
             return
         self.session, self._armed_ns = None, None
+        self._answered.clear()
+        self._asked.clear()
         while self._missed:  # who goes on with the stream reads it in the log
             self._missed.popleft().take()
         self._out.close()

@@ -33,8 +33,8 @@ class TakeoverBuffer:
         self._keep_ns = keep_ns
         self._budget = budget
         self._packets: deque[tuple[Packet, bool]] = deque()
-        self.answered = False
-        """Whether all has come that the publisher's cache holds."""
+        self.answered: set[str] = set()
+        """Streams of which all has come that the publisher's cache holds."""
         self.unasked = False
         """Whether the stream is new and its member has yet to ask, which takes long where many are new at once."""
         self.seen_ns = 0

@@ -322,8 +322,23 @@ class Session:
         """Whether frames behind a gap are held, because those missing may still come from the publisher's cache."""
         return self._recovery_ns is not None and not self._began
 
+    @property
+    def awaits_caches(self) -> bool:
+        """Whether frames are held because others before them, or of other sensors, may still come from caches."""
+        return self._recovery_ns is not None
+
+    @property
+    def young(self) -> bool:
+        """Whether it `awaits_caches` so soon after its beginning that it may not know all its sensors."""
+        return self._began is not None or self._young_ns is not None
+
+    @property
+    def sensors(self) -> set[str]:
+        """The sensors that it knows of, by stream; of one stream an empty name."""
+        return set(self._pending)
+
     def recovered(self, now_ns: int) -> list[Output]:
-        """End the waiting: all that the caches have is here. Returns what was held for it."""
+        """End the waiting: all that the caches had is here. Returns what was held for it."""
         self._recover_until(None)
         return self._advance(now_ns)
 

@@ -95,6 +95,7 @@ def ask_cache(
     session.get(
         selector,
         zenoh.handlers.Callback(take, end),
+        target=zenoh.QueryTarget.ALL,
         accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=ANSWER_S,

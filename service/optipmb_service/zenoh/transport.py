@@ -24,6 +24,7 @@ from optipmb_service.zenoh.handles import (
     undeclare,
 )
 from optipmb_service.zenoh.inputs import Topic
+from optipmb_service.zenoh.subscription import ask_cache
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -196,6 +197,22 @@ class Transport:
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
         return found
+
+    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]]], None]) -> None:
+        """Call `then`, on a thread of the network, with what the caches of a stream hold of its detections, all frames.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        found: list[tuple[Packet, bool]] = []
+
+        def reply(sample: zenoh.Sample) -> None:
+            self._receive(sample, lambda packet: found.append((packet, True)))
+
+        try:
+            ask_cache(self._session, f"{self._keys.detections(stream)}/@adv/pub/**", reply, lambda: then(found))
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
 
     def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""

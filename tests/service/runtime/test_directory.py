@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from optipmb_service.runtime.directory import MAX_UNPROVEN, QUEUED_NS, UNPROVEN_NS, StreamDirectory
+from optipmb_service.runtime.directory import BACK_NS, MAX_UNPROVEN, QUEUED_NS, UNPROVEN_NS, StreamDirectory
 from optipmb_service.session.values import SECOND
 
 IDLE_NS = 600 * SECOND
@@ -21,6 +21,25 @@ class Discoverer:
             assert self.directory.noticed(stream, now_ns, recoverable=False)
         self.directory.expire(now_ns, discovering=True)
         return self.directory.announced()
+
+
+def test_caches_are_awaited_of_publishers_that_are_there_or_may_come_back() -> None:
+    """Of sensors that were there before, not of those without a cache, nor of those that are gone for long."""
+    streams = front, rear, plain, other = ["site/node/front", "site/node/rear", "site/node/plain", "site/car/lidar"]
+    one = StreamDirectory("a", IDLE_NS, lambda _: True, SECOND)
+
+    def awaited(now_ns: int, *sensors: str) -> dict[str, bool]:
+        return one.awaited(lambda stream: stream.startswith("site/node/"), sensors, now_ns)
+
+    assert awaited(SECOND + BACK_NS - 1, front) == {front: False}
+    assert awaited(SECOND + BACK_NS, front) == {}
+    for stream in (front, rear, other):
+        one.published(stream, "token", 2 * SECOND, present=True)
+    one.noticed(plain, 2 * SECOND, recoverable=False)
+    assert awaited(2 * SECOND, plain) == awaited(2 * BACK_NS, *streams[:3]) == {front: True, rear: True}
+    one.published(front, "token", 3 * BACK_NS, present=False)
+    assert awaited(4 * BACK_NS - 1, front) == {rear: True, front: False}
+    assert awaited(4 * BACK_NS, front) == {rear: True}
 
 
 def names(count: int, site: str = "site") -> list[str]:

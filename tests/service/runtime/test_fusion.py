@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from optipmb_service.cluster.leases import partition_of
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.ports import Packet
+from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
 from optipmb_service.settings import SettingsInvalidError, load
@@ -22,6 +24,7 @@ import optipmb
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from optipmb_schemas import Detections
 
@@ -35,6 +38,14 @@ def undisturbed(frames: list[Detections]) -> dict[tuple[bytes, int], bytes]:
     for frame in frames:
         merged.take(one.on_detections(frame, 0))
     return merged.plain()
+
+
+def undisturbed_digest(frames: list[Detections]) -> str:
+    """The digest of the state of such a session."""
+    one = Session(FUSED, optipmb.load_profile("nuscenes"), Policy(recovery_wait_ns=0), fused=True)
+    for frame in frames:
+        one.on_detections(frame, 0)
+    return digest_of(one.snapshot())
 
 
 def test_a_car_keeps_its_id_through_the_service(start: Callable[..., Any]) -> None:
@@ -63,6 +74,45 @@ def test_a_car_keeps_its_id_through_the_service(start: Callable[..., Any]) -> No
     assert {int(one) for message in found for one in message.id} == {1}
     assert {message.sensor for message in found if (message.detection >= 0).any()} == {FRONT.stream, REAR.stream}
     assert {KEYS.stream_of(one) for one in owners} == {FUSED, OTHER.stream}
+
+
+@pytest.mark.parametrize("gone", [False, True])
+def test_after_a_restart_no_cache_is_waited_for_that_has_answered_or_is_gone(
+    start: Callable[..., Any],
+    tmp_path: Path,
+    gone: bool,  # noqa: FBT001 - pytest's way
+) -> None:
+    """The session goes on with what the caches of all its sensors held, long before `recovery_wait_s`."""
+    frames = drive(40)
+    options = {"fuse": ["site/node/*"], "store": str(tmp_path)}
+    service, endpoint = start(recovery_wait_s=0, **options)
+    with Node(endpoint) as front, contextlib.ExitStack() as nodes:
+        rear = nodes.enter_context(Node(endpoint))
+
+        def send(*messages: Detections) -> None:
+            for message in messages:
+                (front if message.stream == FRONT.stream else rear).send(message)
+
+        def tracked() -> SessionState | None:
+            service.housekeeping()
+            answers = front.query(KEYS.query(FUSED, "state"))
+            return decode(answers[0][2], SessionState) if answers and answers[0][0] else None
+
+        for first in range(0, 40, 8):
+            send(*frames[first : first + 8])
+            until(lambda: (state := tracked()) is not None and state.frames == first + 8, "they are tracked")  # noqa: B023
+        assert service.stop()
+        if gone:
+            nodes.close()
+        else:
+            send(*(one for one in frames[40:] if one.stream == REAR.stream))
+        send(*(one for one in frames[40:] if one.stream == FRONT.stream))
+        rest = frames[:40] + [one for one in frames[40:] if not gone or one.stream == FRONT.stream]
+        service, _ = start(listen=[endpoint], recovery_wait_s=60, **options)
+        until(lambda: (state := tracked()) is not None and state.frames == len(rest), "all are tracked", 50.0)
+        state = tracked()
+    assert state is not None
+    assert (state.digest, state.late, state.gaps) == (undisturbed_digest(rest), 0, 0)
 
 
 def test_queries_are_answered_for_the_session(start: Callable[..., Any]) -> None:
