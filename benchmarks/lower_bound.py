@@ -16,6 +16,7 @@ import numba
 import numpy as np
 
 from optipmb.association import associate
+from optipmb.class_posterior import UNGROUPED
 from optipmb.density import BernoulliArrays, PoissonArrays, columns_of_rows
 from optipmb.hypotheses import local_hypotheses
 from optipmb.motion import predict_state
@@ -106,7 +107,16 @@ def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: o
     p_d, p_d_poisson = table["detection"][old.label], table["detection"][undetected.label]
     objects, components = BernoulliArrays(*columns_of_rows(old)), PoissonArrays(*columns_of_rows(undetected))
     found = local_hypotheses(
-        objects, p_d, components, p_d_poisson, measurements, table.period, table.period, table.classes
+        objects,
+        UNGROUPED,
+        p_d,
+        components,
+        p_d_poisson,
+        measurements,
+        table.period,
+        table.period,
+        table.confusion,
+        table.classes,
     )
     assigned = associate(found.row, found.measurement, found.detection_cost, found.first_cost, len(old))
     before, waiting = density.bernoulli, density.poisson

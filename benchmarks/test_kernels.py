@@ -10,6 +10,7 @@ from settled import PARAMETERS, settled
 
 import optipmb
 from optipmb.association import associate
+from optipmb.class_posterior import UNGROUPED
 from optipmb.density import BernoulliArrays, PoissonArrays, columns_of_rows
 from optipmb.hypotheses import local_hypotheses
 from optipmb.points import points_in_boxes
@@ -60,7 +61,8 @@ def before_association(objects: int) -> tuple[Any, ...]:
     old, new = density.bernoulli, density.poisson
     p_d = TABLE["detection"][old.label], TABLE["detection"][new.label]
     known, undetected = BernoulliArrays(*columns_of_rows(old)), PoissonArrays(*columns_of_rows(new))
-    return known, p_d[0], undetected, p_d[1], measurements, TABLE.period, TABLE.period, TABLE.classes
+    given = known, UNGROUPED, p_d[0], undetected, p_d[1], measurements, TABLE.period, TABLE.period
+    return *given, TABLE.confusion, TABLE.classes
 
 
 @OBJECTS

@@ -5,7 +5,7 @@ Names are `bernoulli.mean`, `poisson.weight` and so on; the two scalars of a den
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 from numba.core.errors import NumbaError, NumbaWarning
@@ -31,6 +31,12 @@ if TYPE_CHECKING:
 
     from optipmb.records import Columns
 
+CLASSES: Final = "classes.probability"
+"""Name of `Density.class_probability` among the columns."""
+
+ROUNDING: Final = 1e-6
+"""By how much the sum of probabilities may differ from 1."""
+
 _Rows = TypeVar("_Rows", Bernoullis, Misses, Poissons)
 
 
@@ -39,7 +45,9 @@ def fitting(density: Density, classes: int) -> bool:
 
     What `density_of` and the tracker make does; somebody else's arrays may not.
     """
-    misses, objects = density.misses, density.bernoulli
+    misses, objects, pi = density.misses, density.bernoulli, density.class_probability
+    if pi is not None and not (isinstance(pi, np.ndarray) and pi.shape == (len(objects.label), classes)):
+        return False
     try:
         return bool(columns_fit(columns_of_rows(objects), columns_of_rows(density.poisson), classes)) and (
             misses is None or misses.missed_from_ns.shape == misses.looked_ns.shape == objects.label.shape
@@ -87,7 +95,10 @@ def columns_of(density: Density) -> dict[str, NDArray[Any]]:
     parts = (("bernoulli", density.bernoulli), ("poisson", density.poisson))
     if density.misses is not None:
         parts = (*parts, ("misses", density.misses))
-    return {f"{part}.{name}": column for part, rows in parts for name, column in rows.columns()}
+    columns: dict[str, NDArray[Any]] = {
+        f"{part}.{name}": column for part, rows in parts for name, column in rows.columns()
+    }
+    return columns if density.class_probability is None else columns | {CLASSES: density.class_probability}
 
 
 def density_of(
@@ -144,7 +155,19 @@ def density_of(
                 row = int(wrong.argmax())
                 text = f"a stamp from seen_ns, {bernoulli.seen_ns[row]}, to {stamp_ns}"
                 raise DensityError(f"misses.{name}[{row}]", text, str(since[row]))
-    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses)
+    pi = _class_probability(columns[CLASSES], len(bernoulli), len(labels)) if CLASSES in columns else None
+    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses, pi)
+
+
+def _class_probability(column: Any, count: int, classes: int) -> NDArray[np.float64]:
+    """Return the posteriors over the classes, each of which sums to 1."""
+    if not isinstance(column, np.ndarray) or column.dtype != np.float64 or column.shape != (count, classes):
+        raise DensityError(CLASSES, f"({count}, {classes}) float64", _shown(column))
+    wrong = ~((column >= 0.0).all(axis=1) & (np.abs(column.sum(axis=1) - 1.0) <= ROUNDING))
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise DensityError(f"{CLASSES}[{row}]", "probabilities that sum to 1", str(column[row].tolist())[:200])
+    return np.array(column, order="C")
 
 
 def _rows(part: str, kind: type[_Rows], columns: Mapping[str, Any], *, earlier: bool) -> _Rows:

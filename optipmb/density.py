@@ -203,6 +203,8 @@ class Density:
         poisson: undetected potential objects.
         labels: names of the classes that the labels point into, those of the parameters.
         misses: of the detected objects; None while no frame has had a field of view: every frame looks at all of them.
+        class_probability: (N, C) posterior of each detected object over the classes (`optipmb.class_posterior`); None
+            where the profile has no groups.
     """
 
     stamp_ns: int
@@ -211,6 +213,7 @@ class Density:
     poisson: Poissons
     labels: tuple[str, ...]
     misses: Misses | None = None
+    class_probability: NDArray[np.float64] | None = None
 
     @property
     def missed_from_ns(self) -> NDArray[np.int64]:

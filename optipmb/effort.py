@@ -57,8 +57,9 @@ def check_effort(
         )
     )
     widening = gate_widening(measurements.position, measurements.label, table.classes)
-    measured = measurements.position, measurements.label, widening
-    if count_pairs(positions, labels, radius, *measured, len(table.classes), most) > most:
+    group = table["group"]
+    measured = measurements.position, group[measurements.label], widening
+    if count_pairs(positions, group[labels], radius, *measured, len(table.classes), most) > most:
         raise EffortError("center", f"at most {most} pairs of an object and a detection in its gate", "more")
 
 

@@ -102,8 +102,9 @@ def gate(
     position: Array,
     measured_label: Index,
     classes: Sequence[ClassRow],
+    by_group: bool,
 ) -> tuple[Index, Index, Array]:
-    """Find the measurements of an object's class within its gate and their position likelihoods.
+    """Find the measurements of an object's class or group within its gate and their position likelihoods.
 
     Args:
         mean: (N, 6) predicted means.
@@ -113,16 +114,20 @@ def gate(
         position: (M, 2) z_xy, or (M, 5) with rho.
         measured_label: (M,) z_c.
         classes: (C,) parameters: sigma of R_xy = sigma^2 rho, and rho = I without one.
+        by_group: whether the gate is open to all classes of the object's group.
 
     Returns:
         Objects, measurements and log-likelihoods ln N(z_xy; z_hat, S) of the pairs (eq. Predicted Measurement),
         ordered by object, then measurement.
     """
     widening = gate_widening(position, measured_label, classes)
+    kind, measured_kind = label, measured_label
+    if by_group:
+        kind, measured_kind = groups(label, classes), groups(measured_label, classes)
     if position.shape[0] <= FEW:
-        row, measurement = pairs_of_few(mean, label, radius, position, measured_label, widening, len(classes))
+        row, measurement = pairs_of_few(mean, kind, radius, position, measured_kind, widening, len(classes))
     else:
-        row, measurement = pairs_of_many(mean, label, radius, position, measured_label, widening, len(classes))
+        row, measurement = pairs_of_many(mean, kind, radius, position, measured_kind, widening, len(classes))
     log_likelihood = np.empty(row.shape[0])
     own_noise = position.shape[1] > PLAIN
     rho_xx, rho_xy, rho_yy = 1.0, 0.0, 1.0
@@ -130,9 +135,9 @@ def gate(
     s_xx = s_xy = s_yy = determinant = constant = 0.0
     for k in range(row.shape[0]):
         n, m = row[k], measurement[k]
-        if n != before or own_noise:  # what the pairs of an object share
+        if n != before or own_noise or by_group:  # what the pairs of an object share
             before = n
-            variance = classes[label[n]].noise_position ** 2
+            variance = classes[measured_label[m]].noise_position ** 2
             if own_noise:
                 rho_xx, rho_xy, rho_yy = position[m, 2], position[m, 3], position[m, 4]
             s_xx, s_yy = covariance[n, 0, 0] + variance * rho_xx, covariance[n, 1, 1] + variance * rho_yy
@@ -143,6 +148,15 @@ def gate(
         squared = (s_yy * dx * dx - 2.0 * s_xy * dx * dy + s_xx * dy * dy) / determinant
         log_likelihood[k] = constant - 0.5 * squared
     return row, measurement, log_likelihood
+
+
+@kernel
+def groups(label: Index, classes: Sequence[ClassRow]) -> Index:
+    """Return the group (N,) of each class of `label` (N,)."""
+    group = np.empty(label.shape[0], np.int64)
+    for n in range(label.shape[0]):
+        group[n] = classes[label[n]].group
+    return group
 
 
 @kernel

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from optipmb.class_posterior import weigh_by_class
 from optipmb.compiled import kernel
 from optipmb.gating import gate, gate_radii
 
@@ -66,41 +67,49 @@ class Hypotheses(NamedTuple):
 @kernel
 def local_hypotheses(
     objects: Bernoullis,
+    class_probability: Array,
     p_d: Array,
     components: Poissons,
     p_d_poisson: Array,
     measurements: Measurements,
     dt: float,
     period: float,
+    confusion: Array,
     classes: Sequence[ClassRow],
 ) -> Hypotheses:
     """Enumerate the hypotheses that pass the class gate and the distance gate, with their costs.
 
     Resolutions: a likelihood outside the gate counts as zero in p_a, as its cost is infinite; mu_+ in e^j already
-    contains the survival probability that Algorithm 1 writes beside it.
+    contains the survival probability that Algorithm 1 writes beside it. Where classes have groups, the gate of an
+    object is open to its group, and the likelihood has the factor p(d) of `optipmb.class_posterior`.
 
     Args:
         objects: predicted detected objects.
+        class_probability: (N, C) their pi_+.
         p_d: (N,) their detection probabilities.
         components: predicted Poisson components.
         p_d_poisson: (J,) theirs.
         measurements: Z_k.
         dt: s since the last frame.
         period: nominal period, s.
+        confusion: (C, C) Lambda; (0, 0) where no classes have a group in common.
         classes: (C,) parameters.
     """
+    grouped = confusion.shape[0] > 0
     position, label = measurements.position, measurements.label
     radius = gate_radii(objects.covariance, objects.label, dt, period, classes)
     radius_poisson = gate_radii(components.covariance, components.label, dt, period, classes)
     close_gates(p_d, radius)
     close_gates(p_d_poisson, radius_poisson)
     row, measurement, log_likelihood = gate(
-        objects.mean, objects.covariance, objects.label, radius, position, label, classes
+        objects.mean, objects.covariance, objects.label, radius, position, label, classes, grouped
     )
+    if grouped:
+        weigh_by_class(row, measurement, log_likelihood, class_probability, measurements, confusion, classes)
     association = np.empty(label.shape[0])
     detection_cost = detection_costs(row, measurement, log_likelihood, objects.existence, p_d, association)
     component, announced, log_e = gate(
-        components.mean, components.covariance, components.label, radius_poisson, position, label, classes
+        components.mean, components.covariance, components.label, radius_poisson, position, label, classes, False
     )
     for k in range(component.shape[0]):
         j = component[k]

@@ -24,11 +24,13 @@ if TYPE_CHECKING:
     from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
 
 
 @kernel
 def light_weight_filter(
     survivors: Survivors,
+    label: Index,
     mean: Array,
     covariance: Array,
     objects: Bernoullis,
@@ -50,6 +52,7 @@ def light_weight_filter(
 
     Args:
         survivors: which objects the posterior has.
+        label: (K,) their classes.
         mean: (K, 6) their posterior means.
         covariance: (K, 6, 6) their posterior covariances.
         objects: the predicted objects.
@@ -62,7 +65,7 @@ def light_weight_filter(
         classes: (C,) parameters.
     """
     count = survivors.row.shape[0]
-    label, auxiliary, identity = np.empty(count, np.int64), np.empty((count, 4)), np.empty(count, np.int64)
+    auxiliary, identity = np.empty((count, 4)), np.empty(count, np.int64)
     born_ns, seen_ns, score = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
     evidence, heading_odds = np.empty(count), np.empty(count)
     extracted, confirmed = np.empty(count, np.bool_), np.empty(count, np.bool_)
@@ -74,14 +77,14 @@ def light_weight_filter(
     for k in range(count):
         n, m = survivors.row[k], survivors.measurement[k]
         if n == NEW:
-            label[k], identity[k] = measurements.label[m], next_id
+            identity[k] = next_id
             born_ns[k], extracted[k], confirmed[k] = stamp_ns, False, False
             evidence[k] = heading_odds[k] = 0.0
             for s in range(4):
                 auxiliary[k, s] = measurements.auxiliary[m, s]
             next_id += 1
         else:
-            label[k], identity[k] = objects.label[n], objects.id[n]
+            identity[k] = objects.id[n]
             born_ns[k], seen_ns[k], extracted[k] = objects.born_ns[n], objects.seen_ns[n], objects.extracted[n]
             confirmed[k], evidence[k], heading_odds[k] = (
                 objects.confirmed[n],

@@ -277,8 +277,14 @@ class ClassParameters(_Table):
     )
     group: ClassName | None = Field(
         default=None,
-        description="eta_iou holds between detections of all classes with the same group too; none, the paper: within "
-        "the class alone",
+        description="eta_iou and the class gate take classes with the same group for one, and a track has a posterior "
+        "over them (`optipmb.class_posterior`); none, the paper: the class alone",
+    )
+    class_confusion: OpenProbability = Field(
+        default=0.05, exclude_if=(0.05).__eq__, description="kappa: probability of another label of the group"
+    )
+    class_memory: OpenProbability = Field(
+        default=0.95, exclude_if=(0.95).__eq__, description="lambda: what the posterior keeps per nominal period"
     )
     score_calibration: ScoreCalibration | None = Field(
         default=None,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numba.core.errors import NumbaError, NumbaWarning
 
+from optipmb.class_posterior import predict_classes
 from optipmb.columns import check_fitting, columns_fit
 from optipmb.compiled import kernel
 from optipmb.density import (
@@ -63,10 +64,11 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     bernoulli, poisson, misses = density.bernoulli, density.poisson, density.misses
     before_ns = density.stamp_ns
     dt = 0.0 if before_ns == NO_FRAME else (stamp_ns - before_ns) * 1e-9
-    if dt == 0.0 or misses is not None:
+    if dt == 0.0 or misses is not None or len(table.confusion):
         check_fitting(density, density.labels)
     if dt == 0.0:
-        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses), 0
+        pi = predict_classes(density, None, dt, table)
+        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses, pi), 0
     try:
         objects, components = predict_density(
             columns_of_rows(bernoulli),
@@ -82,6 +84,7 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
         check_fitting(density, density.labels)  # names the column
         raise
     kept, mean, covariance, existence, repaired = objects
+    pi = predict_classes(density, kept, dt, table)
     if kept.shape[0] < len(bernoulli):
         bernoulli = bernoulli.take(kept)
         misses = None if misses is None else misses.take(kept)
@@ -104,7 +107,8 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     if kept.shape[0] < len(poisson):
         poisson = poisson.take(kept)
     poisson = Poissons(mean, covariance, weight, poisson.label, poisson.auxiliary, poisson.born_ns)
-    return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses), repaired + repaired_poisson
+    posterior = Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses, pi)
+    return posterior, repaired + repaired_poisson
 
 
 @kernel

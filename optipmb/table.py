@@ -27,6 +27,7 @@ class ClassRow(Protocol):
 
     Attributes:
         group: the first class of the group, the class itself without one.
+        group_size: G, how many classes the group has.
         clutter_intensity: lambda_c = mu_c / A, 1/m^2.
         birth_intensity: mu_b0 / A, 1/m^2.
         acceleration_time: time constant of the acceleration, s, infinite where it is constant.
@@ -79,6 +80,8 @@ class ClassRow(Protocol):
     min_existence: float
     linearisations: int
     group: int
+    group_size: int
+    class_memory: float
     clutter_intensity: float
     birth_intensity: float
     acceleration_time: float
@@ -130,12 +133,14 @@ class ClassTable:
         period: nominal period, s.
         detection_over_time: whether p_d holds per nominal period (`optipmb.detection_probability.over_time`).
         noise_grows: whether the position noise of any class grows with the distance.
+        confusion: (C, C) Lambda of `optipmb.class_posterior`; (0, 0) where no two classes have a group in common.
     """
 
     classes: Sequence[ClassRow]
     period: float
     detection_over_time: bool
     noise_grows: bool
+    confusion: NDArray[np.float64]
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         column: NDArray[Any] = np.asarray(self.classes)[name]
@@ -148,14 +153,27 @@ class ClassTable:
         groups = [(p.group,) if p.group is not None else row for row, p in enumerate(rows)]
         classes: Any = np.zeros(len(rows), CLASS)
         for c, (p, group) in enumerate(zip(rows, groups, strict=True)):
-            for name, value in (_values(p) | {"group": groups.index(group)}).items():
+            shared = {"group": groups.index(group), "group_size": groups.count(group)}
+            for name, value in (_values(p) | shared).items():
                 classes[name][c] = value
         grows = any(p.measurement_noise.position_growth > 0.0 for p in rows)
-        return cls(classes, parameters.nominal_period, parameters.detection_over_time, grows)
+        confusion = _confusion(classes, np.array([p.class_confusion for p in rows]))
+        return cls(classes, parameters.nominal_period, parameters.detection_over_time, grows, confusion)
+
+
+def _confusion(classes: Any, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return Lambda: 1 - kappa_c on the diagonal, kappa_c / (G - 1) for the other classes of the group of c."""
+    group, size = classes["group"], classes["group_size"]
+    if not (size > 1).any():
+        return np.zeros((0, 0))
+    kappa = np.where(size > 1, kappa, 0.0)
+    confusion = np.where(group[:, None] == group, (kappa / np.maximum(size - 1, 1))[:, None], 0.0)
+    np.fill_diagonal(confusion, 1.0 - kappa)
+    return confusion
 
 
 def _values(p: ClassParameters) -> dict[str, Any]:
-    """Return the row of a class but for its group, which depends on the other classes."""
+    """Return the row of a class but for what depends on the other classes of its group."""
     q, noise, birth, sign, told = p.process_noise, p.measurement_noise, p.birth, p.heading_sign, p.calibration
     values = {name: getattr(p, name) for name in ClassRow.__annotations__ if hasattr(p, name)}
     values |= {

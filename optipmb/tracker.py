@@ -9,6 +9,7 @@ import numpy as np
 
 from optipmb.association import associate
 from optipmb.birth import first_detected_states
+from optipmb.class_posterior import UNGROUPED, update_classes
 from optipmb.compiled import kernel
 from optipmb.density import (
     NO_FRAME,
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
 @kernel
 def update(
     objects: Columns,
+    class_probability: Array,
     p_d: Array,
     missed_from_ns: Index,
     components: Columns,
@@ -68,12 +70,14 @@ def update(
     next_id: int,
     adaptive: bool,
     period: float,
+    confusion: Array,
     classes: Sequence[ClassRow],
-) -> tuple[Columns, Columns, Index, Index, int, int, int]:
+) -> tuple[Columns, Array, Columns, Index, Index, int, int, int]:
     """Update the prediction with the measurements: the PMB update of Algorithm 1.
 
     Args:
         objects: predicted objects.
+        class_probability: (N, C) their class posteriors, (0, 0) where no classes have a group in common.
         p_d: (N,) their detection probabilities.
         missed_from_ns: (N,) stamps from which their misses count.
         components: predicted Poisson components, and behind them, without HABM, those of the measurements.
@@ -86,17 +90,20 @@ def update(
         next_id: id of the first new object.
         adaptive: whether HABM is on.
         period: nominal period, s.
+        confusion: (C, C) Lambda of `optipmb.class_posterior`, (0, 0) likewise.
         classes: (C,) parameters.
 
     Returns:
-        The columns of the objects and of the Poisson components of the posterior; the other fields of `Survivors`;
-        how many covariances had to be repaired.
+        The columns of the objects, their class posteriors and the columns of the Poisson components; the other fields
+        of `Survivors`; how many covariances had to be repaired.
     """
     z = Measurements(*measurements)
     objects, components = BernoulliArrays(*objects), PoissonArrays(*components)
 
     # Local hypotheses: missed, detected, first-time detected; HABM
-    hypotheses = local_hypotheses(objects, p_d, components, p_d_poisson, z, dt, period, classes)
+    hypotheses = local_hypotheses(
+        objects, class_probability, p_d, components, p_d_poisson, z, dt, period, confusion, classes
+    )
 
     # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
     row, measurement, cost = hypotheses.row, hypotheses.measurement, hypotheses.detection_cost
@@ -111,14 +118,17 @@ def update(
         kept.measurement[known:], hypotheses, components, z, classes, mean[known:], covariance[known:]
     )
 
-    # Other states: light-weight filter
-    posterior = light_weight_filter(kept, mean, covariance, objects, next_id, z, stamp_ns, before_ns, period, classes)
+    # Other states: class, light-weight filter
+    label, class_probability = update_classes(kept, objects.label, class_probability, z, confusion, classes)
+    posterior = light_weight_filter(
+        kept, label, mean, covariance, objects, next_id, z, stamp_ns, before_ns, period, classes
+    )
 
     # Undetected objects: PPP update, RPP, and the births of HABM
     undetected = update_undetected(
         components, p_d_poisson, n_predicted, hypotheses, z, stamp_ns, period, classes, adaptive
     )
-    return posterior, undetected, kept.row, kept.measurement, known, kept.detected, repaired
+    return posterior, class_probability, undetected, kept.row, kept.measurement, known, kept.detected, repaired
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +194,7 @@ class Tracker:
             │     surviving_objects       r, misses
             │     ukf_updates             eq. UKF Update, for the pairs of the best global hypothesis
             │     first_detected_states   eq. Newborn Hypothesis, First-Time Detection Hypothesis Update 1
+            │     update_classes          class gate; with groups of classes, Bayes
             │     light_weight_filter     eq. Confidence Score
             │     update_undetected       eq. PPP Update; RPP, HABM
             ▼ extract                     eta_ext1, eta_ext2, eta_cnt; calibration
@@ -249,8 +260,10 @@ class Tracker:
 
         # PMB update: hypotheses, association, states, births
         missed_from_ns = predicted.missed_from_ns if looks is None else looks.misses.missed_from_ns
-        columns, undetected, row, hits, known, detected, repaired_now = update(
+        pi = predicted.class_probability
+        columns, class_probability, undetected, row, hits, known, detected, repaired_now = update(
             columns_of_rows(bernoulli),
+            UNGROUPED if pi is None else pi,
             p_d,
             missed_from_ns,
             columns_of_rows(poisson),
@@ -263,6 +276,7 @@ class Tracker:
             predicted.next_id,
             modules.habm,
             table.period,
+            table.confusion,
             table.classes,
         )
         objects, misses = Bernoullis(*columns), None
@@ -271,7 +285,8 @@ class Tracker:
             misses = follow_looks(looks, survivors, bernoulli, objects, measurements, now, table)
         born = len(objects) - known
         poisson = Poissons(*undetected) if modules.rpp else Poissons.empty()
-        posterior = Density(now, predicted.next_id + born, objects, poisson, density.labels, misses)
+        pi = None if pi is None else class_probability
+        posterior = Density(now, predicted.next_id + born, objects, poisson, density.labels, misses, pi)
 
         # Track extraction
         since_ns = posterior.missed_from_ns

@@ -55,6 +55,9 @@ def assert_matches(oracle: Oracle, wanted: OracleTracks, density: Density, track
     for name in BERNOULLI:
         found = getattr(density.bernoulli, name)
         assert_close(found, _stacked(oracle.bernoulli, name, found), f"{when} bernoulli.{name}")
+    if density.class_probability is not None:
+        own = [row[row > 0] for row in density.class_probability]  # those of the group
+        assert_close(np.concatenate([*own, []]), np.concatenate([*[b.pi for b in oracle.bernoulli], []]), f"{when} pi")
     for name in POISSON:
         found = getattr(density.poisson, name)
         assert_close(found, _stacked(oracle.poisson, name, found), f"{when} poisson.{name}")

@@ -51,6 +51,7 @@ class Bernoulli:
     confirmed: bool = False
     detection: int = -1
     measurement: Measurement | None = None
+    pi: Array = field(default_factory=lambda: np.ones(1))  # over the classes of its group, in their order
 
 
 @dataclass
@@ -159,6 +160,8 @@ class Oracle:
             survival = c.survival ** (dt / self.nominal)
             if isinstance(component, Bernoulli):
                 component.existence *= survival
+                memory = c.class_memory ** (dt / self.nominal)
+                component.pi = memory * component.pi + (1 - memory) / len(component.pi)
             else:
                 component.weight *= survival
 
@@ -205,17 +208,41 @@ class Oracle:
         return float(1 - (1 - p_d) ** max(share, 0.02)) if self.over_time and share < 1 else p_d
 
     def _in_gate(self, component: Bernoulli | Poisson, z: Measurement) -> bool:
-        """Class gate and distance gate."""
-        if component.label != z.label:
+        """Class gate, open to the group of a detected object, and distance gate."""
+        known = self._group(component.label) if isinstance(component, Bernoulli) else [component.label]
+        if z.label not in known:
             return False
-        distance, c = math.hypot(*(component.mean[:2] - z.xy)), self.classes[z.label]
+        distance, c = math.hypot(*(component.mean[:2] - z.xy)), self.classes[component.label]
         eta = c.gate * (1 + c.gate_growth * max(0.0, self.dt / self.nominal - 1))
         spread = math.sqrt(component.covariance[2, 2])
         return distance <= max(eta, c.gate_deviations * spread * self.dt)
 
     def _log_likelihood(self, component: Bernoulli | Poisson, z: Measurement) -> float:
         position = self.classes[z.label].measurement_noise.position
-        return log_likelihood(z.xy, component.mean, component.covariance, position)
+        value = log_likelihood(z.xy, component.mean, component.covariance, position)
+        return value + (math.log(component.pi @ self._called(z)) if isinstance(component, Bernoulli) else 0.0)
+
+    def _group(self, label: int) -> list[int]:
+        """The classes that share the group of a class, itself among them."""
+        group = self.classes[label].group
+        return [c for c, one in enumerate(self.classes) if c == label or one.group == group is not None]
+
+    def _called(self, z: Measurement) -> Array:
+        """p(d | c) of the classes c of the group of a measurement: s Lambda_cd + (1 - s) / G."""
+        group = self._group(z.label)
+        if len(group) == 1:
+            return np.ones(1)
+        kappa = np.array([self.classes[c].class_confusion for c in group])
+        meant = np.where([c == z.label for c in group], 1 - kappa, kappa / (len(group) - 1))
+        return z.score * meant + (1 - z.score) / len(group)
+
+    def _follow_class(self, b: Bernoulli, z: Measurement) -> None:
+        """Bayes; the class reported changes to one that is three times as probable."""
+        likely, group = b.pi * self._called(z), self._group(z.label)
+        b.pi = likely / likely.sum()
+        best = int(np.argmax(b.pi))
+        if b.pi[best] >= 3 * b.pi[group.index(b.label)]:
+            b.label = group[best]
 
     def _association_probability(self, z: Measurement) -> float:
         """Eq. (Association Probability)."""
@@ -265,8 +292,10 @@ class Oracle:
             c = self.classes[b.label]
             if i in chosen:
                 z = zs[chosen[i]]
-                b.mean, b.covariance = update(b.mean, b.covariance, z, c)
+                b.mean, b.covariance = update(b.mean, b.covariance, z, self.classes[z.label])
                 b.existence = 1.0
+                self._follow_class(b, z)
+                c = self.classes[b.label]
                 b.auxiliary = (1 - z.score) * b.auxiliary + z.score * z.auxiliary
                 length = 1 + (now - b.born_ns) * 1e-9 / self.nominal
                 b.score = (1 - math.exp(-length)) * z.score  # eq. (Confidence Score)
@@ -295,6 +324,7 @@ class Oracle:
             b.evidence = follow_evidence(self.classes[z.label], 0.0, 1.0, z.score)
             b.heading_odds, b.mean, b.covariance = follow_sign(self.classes[z.label], 0.0, 1.0, z, b.mean, b.covariance)
             b.id, b.detection, b.measurement = self.next_id, z.source, z
+            b.pi = self._called(z) / self._called(z).sum()
             self.bernoulli.append(b)
             self.next_id += 1
 

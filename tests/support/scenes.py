@@ -281,8 +281,9 @@ def random_parameters(
 
     classes = {label: one_class() for label in labels}
     if seed % 3 == 1:
-        for values in classes.values():
-            values["group"] = "road users"
+        for values in list(classes.values())[: 2 + seed % 2]:
+            values |= {"group": "road users", "class_confusion": rng.uniform(0.05, 0.4)}
+            values["class_memory"] = rng.uniform(0.5, 0.99)
     if calibrated:
         for values in classes.values():
             values["calibration"] = _calibration(rng)

@@ -45,7 +45,7 @@ def test_the_gate_holds_every_pair_of_a_class_within_the_distance(seed: int, cou
     radius = distance[label] * rng.uniform(0.5, 1.5, count)
     radius[::9] = -1.0  # closed
     classes = class_rows(2, noise_position=noise)
-    found = gate(mean, covariance, label, radius, position, measured, classes)
+    found = gate(mean, covariance, label, radius, position, measured, classes, False)
 
     def pairs(widening: Array) -> list[tuple[int, int]]:
         return [
@@ -86,7 +86,7 @@ def test_the_edge_of_the_gate_is_inside() -> None:
     """A measurement at exactly the gating distance passes, on all sides; one float farther does not."""
     position = np.array([[3.0, 0], [-3, 0], [0, 3], [0, -3], [np.nextafter(3, 4), 0], [-np.nextafter(3, 4), 0]])
     objects = np.zeros((1, 6)), np.eye(6)[None], np.zeros(1, np.int64), np.array([3.0])
-    _, measurement, _ = gate(*objects, position, np.zeros(6, np.int64), class_rows(1, noise_position=[1.0]))
+    _, measurement, _ = gate(*objects, position, np.zeros(6, np.int64), class_rows(1, noise_position=[1.0]), False)
     np.testing.assert_array_equal(measurement, [0, 1, 2, 3])
 
 

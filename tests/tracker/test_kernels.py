@@ -249,9 +249,11 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     for column, name in zip(sign.T, ("memory", "detection", "motion", "speed"), strict=True):
         classes[f"sign_{name}"] = column
     survivors = Survivors(row, measurement, np.ones(6), 4, 2)
-    given = survivors, states, spreads, objects, 77, measurements, NOW, NOW - 150_000_000, PERIOD, classes
+    new = row == NEW
+    named = np.where(new, measured[measurement], label[row])
+    given = survivors, named, states, spreads, objects, 77, measurements, NOW, NOW - 150_000_000, PERIOD, classes
     *out, weighed, facing, flags, shown = light_weight_filter(*given)[3:]
-    old, new = row >= 0, row == NEW
+    old = row >= 0
     m, hit = measurement, measurement >= 0
     np.testing.assert_array_equal(out[0], [*label[row[old]], *measured[m[new]]])
     before = np.concatenate([auxiliary[row[old]], boxes[m[new]]])

@@ -187,7 +187,14 @@ def test_the_likelihood_of_a_pair_has_the_covariance_of_its_detection() -> None:
     columns = np.column_stack((position, spreads[:, [0, 0, 1], [0, 1, 1]] / 0.25))
     zeros = np.zeros(5, np.int64)
     _, measurement, found = gate(
-        mean[None], covariance[None], zeros[:1], np.array([50.0]), columns, zeros, class_rows(1, noise_position=0.5)
+        mean[None],
+        covariance[None],
+        zeros[:1],
+        np.array([50.0]),
+        columns,
+        zeros,
+        class_rows(1, noise_position=0.5),
+        False,
     )
     assert measurement.tolist() == list(range(5))
     for m in range(5):

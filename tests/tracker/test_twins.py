@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from optipmb.calibration import SURE, calibrate_rows, log_odds
+from optipmb.class_posterior import UNGROUPED
 from optipmb.density import BernoulliArrays, Bernoullis, PoissonArrays, Poissons
 from optipmb.errors import FrameError
 from optipmb.frame import MAX_COORDINATE, MAX_SPEED, _refuse, allowed
@@ -30,6 +31,9 @@ TWINS = {
     "birth.first_detected_states": "test_kernels.test_announced_objects_are_matched_mixtures",
     "calibration.calibrate_rows": "test_twins.test_rows_are_calibrated_as_numpy_interpolates",
     "calibration.log_odds": "test_twins.test_log_odds_are_bounded",
+    "class_posterior.label_probability": "test_class_posterior.test_pairs_weigh_by_what_the_detector_calls_them",
+    "class_posterior.update_classes": "test_class_posterior.test_the_posterior_is_bayes_rule",
+    "class_posterior.weigh_by_class": "test_class_posterior.test_pairs_weigh_by_what_the_detector_calls_them",
     "columns.columns_fit": "test_safety.test_columns_fit_as_numpy_says",
     "density.copy_state": "test_update.test_states_without_a_measurement_stay_as_predicted",
     "density.whole_periods": "test_kernels.test_periods_are_counted_to_the_nearest",
@@ -57,6 +61,7 @@ TWINS = {
     "gating.gate": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "gating.gate_widening": "test_hypotheses.test_a_gate_widens_by_what_r_is_above_that_of_the_class",
     "gating.gate_radii": "test_hypotheses.test_gates_widen_with_time_and_with_unknown_speed",
+    "gating.groups": "test_class_posterior.test_pairs_weigh_by_what_the_detector_calls_them",
     "gating.pairs_of_few": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "gating.pairs_of_many": "test_hypotheses.test_the_gate_holds_every_pair_of_a_class_within_the_distance",
     "hypotheses.local_hypotheses": "test_twins.test_hypotheses_are_those_of_their_parts",
@@ -223,12 +228,14 @@ def test_hypotheses_are_those_of_their_parts(seed: int) -> None:
     components = PoissonArrays(**dict(Poissons.empty().columns()) | parts[1] | {"weight": weight[new]})
     empty = np.empty(15)
     measurements = Measurements(position, empty, np.empty((15, 2)), np.empty((15, 4)), score, measured, measured)
-    found = local_hypotheses(objects, p_d[old], components, p_d[new], measurements, 0.15, 0.1, classes)
+    found = local_hypotheses(
+        objects, UNGROUPED, p_d[old], components, p_d[new], measurements, 0.15, 0.1, UNGROUPED, classes
+    )
     radius = gate_radii(covariance, label, 0.15, 0.1, classes)
-    row, measurement, likelihood = gate(*parts[0].values(), radius[old], position, measured, classes)
+    row, measurement, likelihood = gate(*parts[0].values(), radius[old], position, measured, classes, False)
     association = np.empty(15)
     cost = detection_costs(row, measurement, likelihood, weight[old], p_d[old], association)
-    component, announced, log_e = gate(*parts[1].values(), radius[new], position, measured, classes)
+    component, announced, log_e = gate(*parts[1].values(), radius[new], position, measured, classes, False)
     log_e = np.log((weight * p_d)[new][component]) + log_e
     first = first_detections(announced, log_e, score, association, measured, classes)
     wanted = row, measurement, cost, component, announced, log_e, *first, association

@@ -1,0 +1,161 @@
+"""What an object of a group of classes is, as a posterior over the classes of the group.
+
+Detectors call one object a car in one frame and a truck in the next. An object of a class with a `group` therefore has
+probabilities pi over the G classes of the group. What it is stays; what a detector calls it depends on how it is seen,
+so the labels of neighbouring frames err together, and old ones lose weight by lambda per nominal period T:
+
+    predicted               pi_+ = lambda^(dt/T) pi + (1 - lambda^(dt/T)) / G
+    detected as d, score s  p(d | c) = s Lambda_cd + (1 - s) / G
+                            p(d) = sum_c pi_+c p(d | c),    pi_c = pi_+c p(d | c) / p(d)
+    missed                  pi = pi_+
+    first detected as d     pi_c = p(d | c) / sum_c' p(d | c')
+
+Lambda_cd is the probability that the label of an object of class c is d: 1 - kappa_c for d = c, kappa_c / (G - 1) for
+the others of the group. A score of s says that with probability s the label is of the object, and else of chance. p(d)
+is the factor of the class in the likelihood of a detection hypothesis, beside that of the position. The paper's class
+gate is the case of a group of one: pi = p(d) = 1.
+
+The class that a track reports, and whose parameters it has, is its last one until another of the group is
+`CHANGE_ODDS` times as probable: alternating labels do not make it alternate.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from optipmb.compiled import kernel
+from optipmb.errors import DensityError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from optipmb.density import Density
+    from optipmb.preprocess import Measurements
+    from optipmb.prune import Survivors
+    from optipmb.table import ClassRow, ClassTable
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+CHANGE_ODDS: Final = 3.0
+"""How many times as probable as the reported class another must be to be reported."""
+
+UNGROUPED: Final = np.zeros((0, 0))
+"""Posteriors, and Lambda, where the profile has no groups."""
+
+
+def predict_classes(density: Density, kept: Index | None, dt: float, table: ClassTable) -> Array | None:
+    """Return pi_+ of the objects of a density that stay; None where the profile has no groups.
+
+    Objects whose density has none, of a profile without groups or of an earlier version, begin as if first detected as
+    their class with a score of 1.
+
+    Args:
+        density: posterior of the last frame.
+        kept: (K,) objects that stay; None: all.
+        dt: s since then.
+        table: parameters as a table.
+
+    Raises:
+        DensityError: the probabilities are not those of the classes of a group.
+    """
+    confusion = table.confusion
+    if not len(confusion):
+        return None
+    label, posterior = density.bernoulli.label, density.class_probability
+    likely = confusion.T[label]
+    if posterior is None:
+        posterior = likely / likely.sum(axis=1, keepdims=True)
+    elif posterior.shape != likely.shape or not np.allclose(np.where(likely > 0.0, posterior, 0.0).sum(axis=1), 1.0):
+        raise DensityError("classes.probability", "probabilities of the classes of each object's group", "others")
+    memory = table["class_memory"][label, None] ** (dt / table.period)
+    predicted = np.where(likely > 0.0, memory * posterior + (1.0 - memory) / table["group_size"][label, None], 0.0)
+    return predicted if kept is None else predicted[kept]
+
+
+@kernel
+def label_probability(pi: Array, d: int, s: float, confusion: Array, classes: Sequence[ClassRow]) -> float:
+    """Compute p(d) of an object with posterior `pi` (C,) and a label `d` of its group with score `s`."""
+    meant = 0.0
+    for c in range(pi.shape[0]):
+        meant += pi[c] * confusion[c, d]
+    return s * meant + (1.0 - s) / classes[d].group_size
+
+
+@kernel
+def weigh_by_class(
+    row: Index,
+    measurement: Index,
+    log_likelihood: Array,
+    class_probability: Array,
+    measurements: Measurements,
+    confusion: Array,
+    classes: Sequence[ClassRow],
+) -> None:
+    """Add ln p(d) to the log-likelihoods of pairs; classes without a group stay as they are.
+
+    Args:
+        row: (K,) object of each pair.
+        measurement: (K,) measurement of each pair.
+        log_likelihood: (K,) is written.
+        class_probability: (N, C) pi_+.
+        measurements: Z_k.
+        confusion: (C, C) Lambda.
+        classes: (C,) parameters: G.
+    """
+    for k in range(row.shape[0]):
+        m = measurement[k]
+        d = measurements.label[m]
+        if classes[d].group_size > 1:
+            p = label_probability(class_probability[row[k]], d, measurements.score[m], confusion, classes)
+            log_likelihood[k] += np.log(p)
+
+
+@kernel
+def update_classes(
+    survivors: Survivors,
+    label: Index,
+    class_probability: Array,
+    measurements: Measurements,
+    confusion: Array,
+    classes: Sequence[ClassRow],
+) -> tuple[Index, Array]:
+    """Compute the class that each object of the posterior reports, and its posterior over the classes.
+
+    Args:
+        survivors: which objects the posterior has; a row below zero is a first-time detection.
+        label: (N,) classes of the predicted objects.
+        class_probability: (N, C) pi_+; `UNGROUPED` where the profile has no groups.
+        measurements: Z_k.
+        confusion: (C, C) Lambda, or `UNGROUPED`.
+        classes: (C,) parameters: G.
+
+    Returns:
+        (K,) classes and (K, C) pi, (K, 0) where the profile has no groups.
+    """
+    count, grouped = survivors.row.shape[0], confusion.shape[0]
+    label_out, pi = np.empty(count, np.int64), np.zeros((count, grouped))
+    for k in range(count):
+        n, m = survivors.row[k], survivors.measurement[k]
+        label_out[k] = measurements.label[m] if n < 0 else label[n]
+        if grouped == 0:
+            continue
+        own, size = label_out[k], classes[label_out[k]].group_size
+        for c in range(grouped):
+            if confusion[own, c] > 0.0:
+                pi[k, c] = 1.0 / size if n < 0 else class_probability[n, c]
+        if m < 0 or size == 1:
+            continue
+        d, s = measurements.label[m], measurements.score[m]
+        p = label_probability(pi[k], d, s, confusion, classes)
+        for c in range(grouped):
+            if pi[k, c] > 0.0:
+                pi[k, c] *= (s * confusion[c, d] + (1.0 - s) / size) / p
+        likeliest = np.argmax(pi[k])
+        if pi[k, likeliest] >= CHANGE_ODDS * pi[k, own] and n >= 0:
+            label_out[k] = likeliest
+    return label_out, pi
