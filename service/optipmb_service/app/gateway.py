@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import sys
 from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from optipmb_service import __version__
-from optipmb_service.app.edges import monitoring
-from optipmb_service.app.loops import StopRequest, beat, settle, unless
+from optipmb_service.app import process
+from optipmb_service.app.loops import settle, unless
 from optipmb_service.grpc.server import Server
-from optipmb_service.observability.health import ProcessHealth
-from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
+    from optipmb_service.app.loops import StopRequest
+    from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
@@ -41,38 +39,26 @@ class _Gateway:
 
 
 async def run(settings: Settings) -> int:
-    """Serve until SIGINT or SIGTERM.
+    """Serve until SIGINT or SIGTERM; returns the exit status, as `process.run` does."""
 
-    Returns:
-        The exit status: 0, or 1 when the network or an address cannot be used.
-    """
-    asked = StopRequest()
-    log.info("starting", instance=settings.instance, version=__version__)
-    health = ProcessHealth(settings.instance)
-    beating = asyncio.create_task(beat(health))
-    try:
-        with monitoring(settings, health):
-            log.info("connecting", endpoints=settings.connect)
-            client = await unless(asked, lambda: Client.opened(settings))
-            if client is None:
-                return 0
-            try:
-                server = Server(settings, client)
-                health.metrics.add(server.metrics.figures)
-                await server.start()
-                health.report(_Gateway(client))
-                settle()
-                print(f"ready grpc={server.address} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
-                log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)
-                await asked.wait()
-                health.ends()
-                await server.stop()
-            finally:
-                await asyncio.to_thread(client.close)
-    except (TransportError, EdgeError) as error:
-        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
-        return 1
-    finally:
-        beating.cancel()
-    log.info("stopped", drained=True)
-    return 0
+    async def serve(asked: StopRequest, health: ProcessHealth) -> bool | None:
+        log.info("connecting", endpoints=settings.connect)
+        client = await unless(asked, lambda: Client.opened(settings))
+        if client is None:
+            return None
+        try:
+            server = Server(settings, client)
+            health.metrics.add(server.metrics.figures)
+            await server.start()
+            health.report(_Gateway(client))
+            settle()
+            print(f"ready grpc={server.address} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
+            log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)
+            await asked.wait()
+            health.ends()
+            await server.stop()
+        finally:
+            await asyncio.to_thread(client.close)
+        return True
+
+    return await process.run(settings, serve)

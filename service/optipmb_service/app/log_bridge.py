@@ -8,30 +8,28 @@ with it what a successor needs.
 from __future__ import annotations
 
 import asyncio
-import sys
 import time
 from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 import structlog
 
-from optipmb_service import __version__
+from optipmb_service.app import process
 from optipmb_service.app.clustering import nats_access
-from optipmb_service.app.edges import monitoring
-from optipmb_service.app.loops import StopRequest, beat, settle, unless
+from optipmb_service.app.loops import settle, unless
 from optipmb_service.cluster.log_writer import LogWriter
 from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
-from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.kept_tracks import order_of
-from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.session.problems import problem_of
 from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from optipmb_service.app.loops import StopRequest
     from optipmb_service.cluster.message_log import Topic
+    from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.observability.metrics import Value
     from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Message
@@ -139,39 +137,27 @@ class LogBridge:
 
 
 async def run(settings: Settings) -> int:
-    """Serve until SIGINT or SIGTERM.
+    """Write until SIGINT or SIGTERM; returns the exit status, as `process.run` does."""
 
-    Returns:
-        The exit status: 0, or 1 when the network or an address cannot be used.
-    """
-    asked = StopRequest()
-    log.info("starting", instance=settings.instance, version=__version__)
-    health = ProcessHealth(settings.instance)
-    beating = asyncio.create_task(beat(health))
-    try:
-        with monitoring(settings, health):
-            log.info("connecting", endpoints=settings.connect)
-            client = await unless(asked, lambda: Client.opened(settings))
-            if client is None:
-                return 0
-            try:
-                bridge = LogBridge(settings, client)
-                health.metrics.add(bridge.figures)
-                health.report(bridge)
-                settle()
-                print(f"ready log={settings.instance} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
-                log.info("ready", instance=settings.instance, connect=settings.connect)
-                while not asked.is_set():
-                    await asked.wait(HOUSEKEEPING_S)
-                    bridge.housekeeping()
-                health.ends()
-                await asyncio.to_thread(bridge.close)
-            finally:
-                await asyncio.to_thread(client.close)
-    except (TransportError, EdgeError) as error:
-        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
-        return 1
-    finally:
-        beating.cancel()
-    log.info("stopped", drained=True)
-    return 0
+    async def serve(asked: StopRequest, health: ProcessHealth) -> bool | None:
+        log.info("connecting", endpoints=settings.connect)
+        client = await unless(asked, lambda: Client.opened(settings))
+        if client is None:
+            return None
+        try:
+            bridge = LogBridge(settings, client)
+            health.metrics.add(bridge.figures)
+            health.report(bridge)
+            settle()
+            print(f"ready log={settings.instance} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
+            log.info("ready", instance=settings.instance, connect=settings.connect)
+            while not asked.is_set():
+                await asked.wait(HOUSEKEEPING_S)
+                bridge.housekeeping()
+            health.ends()
+            await asyncio.to_thread(bridge.close)
+        finally:
+            await asyncio.to_thread(client.close)
+        return True
+
+    return await process.run(settings, serve)

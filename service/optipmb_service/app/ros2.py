@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import collections
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -19,20 +18,21 @@ from optipmb_schemas.ros2.arrays import CLOUD
 from optipmb_schemas.ros2.tracks import TOPICS
 from optipmb_schemas.ros2.types import own_types
 
-from optipmb_service import __version__
-from optipmb_service.app.edges import monitoring
-from optipmb_service.app.loops import StopRequest, beat, unless
-from optipmb_service.observability.health import BEAT_S, ProcessHealth
+from optipmb_service.app import process
+from optipmb_service.app.loops import unless
+from optipmb_service.observability.health import BEAT_S, STUCK_S
 from optipmb_service.ros2 import graph
 from optipmb_service.ros2.bridge import Bridge
 from optipmb_service.ros2.diagnostics import DIAGNOSTICS, diagnostics
 from optipmb_service.ros2.matching import Matching, Wanted
-from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.ros2 import Ros2Node
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from optipmb_service.app.loops import StopRequest
+    from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Message, Outgoing
     from optipmb_service.zenoh.subscription import Subscription
@@ -59,26 +59,10 @@ ODOMETRY: Final = "nav_msgs/msg/Odometry"
 log = structlog.get_logger("optipmb_service")
 
 
-class _Reporting:
-    """What the process reports: ready while it has a router."""
+class _Work:
+    """The node, the bridge and what wires them; what the process reports."""
 
-    stuck: Final = False
     failure: Final = ""
-
-    def __init__(self, node: Ros2Node) -> None:
-        self._node = node
-
-    @property
-    def state(self) -> str:
-        """Whether it can be used."""
-        return "ready" if self._node.client.linked() else "unlinked"
-
-    def status(self) -> None:
-        """Return nothing: the bridge tracks no streams."""
-
-
-class _Process:
-    """The node, the bridge and what wires them."""
 
     def __init__(self, settings: Settings, node: Ros2Node) -> None:
         self._settings = settings
@@ -97,9 +81,23 @@ class _Process:
         self._told_shed = 0
         self._told_problems: dict[str, int] = {}
         self._next_diagnostics = 0.0
+        self._turned = time.monotonic()
         self._topics = tuple(self._wanted())
         single = frozenset(stream.detections for stream in settings.ros2.streams.values())
         self._matching = Matching(tuple(wanted for wanted, _ in self._topics), single)
+
+    @property
+    def state(self) -> str:
+        """Ready while it has a router."""
+        return "ready" if self._node.client.linked() else "unlinked"
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the working thread has been at one piece of work for too long."""
+        return time.monotonic() - self._turned > STUCK_S
+
+    def status(self) -> None:
+        """Return nothing: the bridge tracks no streams."""
 
     def open(self) -> None:
         """Declare everything."""
@@ -134,7 +132,9 @@ class _Process:
             self._filled.wait(min(left, TICK_S))
             self._filled.clear()
             while (work := self._next()) is not None:
+                self._turned = time.monotonic()
                 work()
+            self._turned = time.monotonic()
             self._bridge.go_on()
             if time.monotonic() >= self._next_diagnostics:
                 self._next_diagnostics = time.monotonic() + DIAGNOSTICS_S
@@ -297,37 +297,25 @@ class _Process:
 
 
 async def run(settings: Settings) -> int:
-    """Bridge until SIGINT or SIGTERM.
+    """Bridge until SIGINT or SIGTERM; returns the exit status, as `process.run` does."""
 
-    Returns:
-        The exit status: 0, or 1 when the network cannot be used.
-    """
-    asked = StopRequest()
-    health = ProcessHealth(settings.instance)
-    log.info("starting", instance=settings.instance, version=__version__)
-    try:
-        with monitoring(settings, health):
-            log.info("connecting", endpoints=settings.connect)
-            connecting = asyncio.create_task(beat(health))
-            node = await unless(asked, lambda: Ros2Node(settings))
-            connecting.cancel()
-            if node is None:
-                return 0
-            process = _Process(settings, node)
-            try:
-                process.open()
-                health.report(_Reporting(node))
-                streams = ",".join(settings.ros2.streams)
-                print(f"ready ros2={streams} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
-                log.info("ready", instance=settings.instance, streams=streams, connect=settings.connect)
-                while not asked.is_set():
-                    health.beat()  # while the work goes on, and not while it does not
-                    await asyncio.to_thread(process.work, BEAT_S)
-                health.ends()
-            finally:
-                await asyncio.to_thread(process.close)
-    except (TransportError, EdgeError) as error:
-        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
-        return 1
-    log.info("stopped", drained=True)
-    return 0
+    async def serve(asked: StopRequest, health: ProcessHealth) -> bool | None:
+        log.info("connecting", endpoints=settings.connect)
+        node = await unless(asked, lambda: Ros2Node(settings))
+        if node is None:
+            return None
+        work = _Work(settings, node)
+        try:
+            work.open()
+            health.report(work)
+            streams = ",".join(settings.ros2.streams)
+            print(f"ready ros2={streams} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
+            log.info("ready", instance=settings.instance, streams=streams, connect=settings.connect)
+            while not asked.is_set():
+                await asyncio.to_thread(work.work, BEAT_S)
+            health.ends()
+        finally:
+            await asyncio.to_thread(work.close)
+        return True
+
+    return await process.run(settings, serve)

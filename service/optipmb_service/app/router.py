@@ -6,21 +6,17 @@ the Zenoh configuration file. Health and readiness are those of the service.
 
 from __future__ import annotations
 
-import asyncio
-import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import structlog
 
-from optipmb_service import __version__
-from optipmb_service.app.edges import monitoring
-from optipmb_service.app.loops import StopRequest, beat
-from optipmb_service.observability.health import ProcessHealth
-from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.app import process
 from optipmb_service.zenoh import Router
 
 if TYPE_CHECKING:
+    from optipmb_service.app.loops import StopRequest
+    from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
@@ -39,28 +35,16 @@ class _Routing:
 
 
 async def run(settings: Settings) -> int:
-    """Route until SIGINT or SIGTERM.
+    """Route until SIGINT or SIGTERM; returns the exit status, as `process.run` does."""
 
-    Returns:
-        The exit status: 0, or 1 when an address or the configuration cannot be used.
-    """
-    asked = StopRequest()
-    health = ProcessHealth(settings.instance)
-    log.info("starting", instance=settings.instance, version=__version__)
-    beating = asyncio.create_task(beat(health))
-    try:
-        with monitoring(settings, health):
-            router = Router(settings)
-            health.report(_Routing())
-            print(f"ready router={settings.instance} endpoints={','.join(settings.endpoints)}", flush=True)  # noqa: T201 - what starters wait for
-            log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
-            await asked.wait()
-            health.ends()
-            router.close()
-    except (TransportError, EdgeError) as error:
-        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
-        return 1
-    finally:
-        beating.cancel()
-    log.info("stopped", drained=True)
-    return 0
+    async def serve(asked: StopRequest, health: ProcessHealth) -> bool:
+        router = Router(settings)
+        health.report(_Routing())
+        print(f"ready router={settings.instance} endpoints={','.join(settings.endpoints)}", flush=True)  # noqa: T201 - what starters wait for
+        log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
+        await asked.wait()
+        health.ends()
+        router.close()
+        return True
+
+    return await process.run(settings, serve)

@@ -12,7 +12,6 @@ received as long as the grace lasts, close.
 from __future__ import annotations
 
 import asyncio
-import sys
 import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -22,20 +21,19 @@ import structlog
 
 import optipmb
 from optipmb_service import __version__
+from optipmb_service.app import process
 from optipmb_service.app.clustering import open_log, open_store
-from optipmb_service.app.edges import grpc_edge, monitoring
+from optipmb_service.app.edges import grpc_edge
 from optipmb_service.app.kernels import warm_up
-from optipmb_service.app.loops import HANDOVER_S, StopRequest, beat, say_ready, settle, unless
+from optipmb_service.app.loops import HANDOVER_S, say_ready, settle, unless
 from optipmb_service.cluster.member import Member
-from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import collectors
-from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.intake import Intake
 from optipmb_service.runtime.kept_tracks import RecentTracks
 from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter, NoPersistence
-from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.runtime.ports import TransportError
 from optipmb_service.runtime.queries import Queries, members_of
 from optipmb_service.runtime.registry import Registry
 from optipmb_service.runtime.scheduler import Scheduler
@@ -47,6 +45,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+    from optipmb_service.app.loops import StopRequest
+    from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.observability.metrics import Value
     from optipmb_service.runtime.context import Actor
     from optipmb_service.runtime.persistence import Persistence
@@ -351,33 +351,20 @@ async def run(settings: Settings, profiles: Profiles, parent: Parent | None = No
         The exit status: 0, or 1 when the network or the store could not be used.
     """
     parent = parent or NoParent(settings)
-    loop = asyncio.get_running_loop()
-    asked = StopRequest()
-    parent.begin(asked)
-    log.info("starting", instance=settings.instance, version=__version__, profiles=profiles.names)
-    health = ProcessHealth(settings.instance)
-    try:
-        with monitoring(settings, health):
-            beating = loop.create_task(beat(health))
-            try:
-                return await _serve(settings, profiles, asked, health, parent)
-            finally:
-                beating.cancel()
-    except (TransportError, EdgeError, StoreError) as error:
-        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
-        return 1
+    return await process.run(settings, partial(_serve, settings, profiles, parent), profiles=profiles.names)
 
 
 async def _serve(
-    settings: Settings, profiles: Profiles, asked: StopRequest, health: ProcessHealth, parent: Parent
-) -> int:
-    """Run the service until the end is asked for.
+    settings: Settings, profiles: Profiles, parent: Parent, asked: StopRequest, health: ProcessHealth
+) -> bool | None:
+    """Run the service until the end is asked for; return whether it ended in order, None when it never began.
 
     Raises:
         TransportError: the network cannot be used.
         StoreError: the store cannot be used, and others use it.
     """
     loop = asyncio.get_running_loop()
+    parent.begin(asked)
 
     def arm(actor: Actor, at_ns: int) -> None:
         # The loop's time and the deadlines are one clock, the monotonic one.
@@ -385,14 +372,14 @@ async def _serve(
 
     await unless(asked, parent.warm_up)
     if asked.is_set():
-        return 0
+        return None
     if not settings.is_router:
         log.info("connecting", endpoints=settings.connect)
     service = await unless(
         asked, lambda: Service(settings, profiles, arm, private=parent.private, metrics=health.metrics)
     )
     if service is None:
-        return 0
+        return None
     service.start(announce=parent.announces)
     health.report(service)
     settle()
@@ -405,6 +392,4 @@ async def _serve(
             service.housekeeping()
             parent.beat()
         health.ends()
-    ended = await asyncio.to_thread(service.stop)
-    log.info("stopped", drained=ended)
-    return 0
+    return await asyncio.to_thread(service.stop)

@@ -1,0 +1,53 @@
+"""What every process of the service has around its own work: signals, monitoring, log lines and exit status."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from typing import TYPE_CHECKING, Any
+
+import structlog
+
+from optipmb_service import __version__
+from optipmb_service.app.edges import monitoring
+from optipmb_service.app.loops import StopRequest, beat
+from optipmb_service.cluster.store import StoreError
+from optipmb_service.observability.health import ProcessHealth
+from optipmb_service.runtime.ports import EdgeError, TransportError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from optipmb_service.settings import Settings
+
+log = structlog.get_logger("optipmb_service")
+
+
+async def run(
+    settings: Settings, serve: Callable[[StopRequest, ProcessHealth], Awaitable[bool | None]], **about: Any
+) -> int:
+    """Work until SIGINT or SIGTERM.
+
+    Args:
+        settings: what is in force.
+        serve: does the work until the end is asked for; returns whether it ended in order, None when it never began.
+        about: more for the first line of the log.
+
+    Returns:
+        The exit status: 0, or 1 when the network, an address or the store cannot be used.
+    """
+    asked = StopRequest()
+    log.info("starting", instance=settings.instance, version=__version__, **about)
+    health = ProcessHealth(settings.instance)
+    beating = asyncio.create_task(beat(health))
+    try:
+        with monitoring(settings, health):
+            ended = await serve(asked, health)
+    except (TransportError, EdgeError, StoreError) as error:
+        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+        return 1
+    finally:
+        beating.cancel()
+    if ended is not None:
+        log.info("stopped", drained=ended)
+    return 0
