@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import math
 import os
 import signal
 import sys
 import threading
+import time
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 import structlog
@@ -26,9 +28,27 @@ SWITCH_S: Final = 0.0005
 HANDOVER_S: Final = 4.0
 """At the end, how long other members may take to have the streams; it takes a second."""
 
+CLOSE_S: Final = 3.0
+"""At the end, how long a process may take to close, beyond handover and grace."""
+
 log = structlog.get_logger("optipmb_service")
 
 _T = TypeVar("_T")
+
+
+class Deadline:
+    """A time by which several stages end, each of which may take what those before it have left.
+
+    Args:
+        seconds: from now on.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._ends = time.monotonic() + seconds
+
+    def left(self, most: float = math.inf) -> float:
+        """Return the seconds that are left, at most so many."""
+        return max(0.0, min(most, self._ends - time.monotonic()))
 
 
 class StopRequest:

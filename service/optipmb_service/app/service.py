@@ -25,7 +25,7 @@ from optipmb_service.app import process
 from optipmb_service.app.clustering import open_log, open_store
 from optipmb_service.app.edges import grpc_edge
 from optipmb_service.app.kernels import warm_up
-from optipmb_service.app.loops import HANDOVER_S, say_ready, settle, unless
+from optipmb_service.app.loops import CLOSE_S, HANDOVER_S, Deadline, say_ready, settle, unless
 from optipmb_service.cluster.member import Member
 from optipmb_service.observability import collectors
 from optipmb_service.observability.metrics import Metrics
@@ -59,8 +59,8 @@ log = structlog.get_logger("optipmb_service")
 HOUSEKEEPING_S: Final = 0.5
 DRAIN_POLL_S: Final = 0.01
 JOIN_S: Final = 0.3
-STORE_S: Final = 3.0
-"""How long a slow store is waited for at the end, for what is to be kept and to say that the leases are free."""
+LEASES_S: Final = 1.0
+"""What is left at the end to say that the leases are free, however long the checkpoints take."""
 
 
 class Service:
@@ -161,24 +161,28 @@ class Service:
         self._reporter.flush(now_ns)
 
     def stop(self) -> bool:
-        """Let others go on, track what was received, within the grace, and close; False when a step would not end."""
+        """Let others go on, track what was received, within the grace, and close; False when a step would not end.
+
+        All of it takes a bounded time, so that whoever waits for the end kills nothing that is still being kept.
+        """
         self._state = "stopping"
+        ends = Deadline(HANDOVER_S + self._settings.grace_s + CLOSE_S)
         self._transport.leave()
         self._member.drain()
         self._member.drained(HANDOVER_S)
         self._intake.handed_over(JOIN_S)
-        ends = time.monotonic() + self._settings.grace_s
-        self._intake.close()
+        grace = Deadline(self._settings.grace_s)
+        self._intake.close(JOIN_S)
         self._transport.stop(JOIN_S)
         if not self._persistence.durable:
             self._registry.finish()  # else what waits for its cloud comes again from the publishers' caches
-        while self._registry.busy and time.monotonic() < ends:
+        while self._registry.busy and grace.left():
             time.sleep(DRAIN_POLL_S)
         ended = self._scheduler.close(JOIN_S)
         if ended:
             self._registry.keep_now()
-        self._persistence.close(STORE_S)
-        self._member.close(STORE_S)
+        self._persistence.close(max(0.0, ends.left() - LEASES_S))
+        self._member.close(ends.left())
         self._missed.close(JOIN_S)
         self._reporter.flush(time.monotonic_ns())
         self._transport.close()

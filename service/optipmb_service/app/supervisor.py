@@ -21,7 +21,7 @@ import structlog
 from optipmb_service import __version__
 from optipmb_service.app.aggregate import QUERIES, AggregateView
 from optipmb_service.app.edges import grpc_edge, monitoring
-from optipmb_service.app.loops import HANDOVER_S, StopRequest, beat, say_ready, unless
+from optipmb_service.app.loops import CLOSE_S, HANDOVER_S, StopRequest, beat, say_ready, unless
 from optipmb_service.app.private_folder import private_folder
 from optipmb_service.app.worker_process import WorkerProcess
 from optipmb_service.observability.health import BEAT_S
@@ -43,7 +43,7 @@ STEADY_S: Final = 60.0
 LATE_S: Final = 2.0
 """A control loop that turns so late was frozen, or starved, and knows nothing of its workers."""
 
-END_S: Final = 3.0
+END_S: Final = CLOSE_S + 1.0
 """Beyond grace and handover, how long workers may take to end before they are killed."""
 
 State = Literal["starting", "ready", "down"]

@@ -183,7 +183,7 @@ class Member:
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join(timeout)
-        self._store.close(timeout)
+        self._store.close(max(0.0, (self._ends_ns - self._clock()) / SECOND))
 
     # The member's thread
 

@@ -125,12 +125,16 @@ class Database:
             else:
                 return
 
-    def close(self) -> None:
-        """Close the file; may be called twice."""
-        with self._lock:
+    def close(self, timeout: float = 1.0) -> None:
+        """Close the file, unless it is in use for so long (s); may be called twice."""
+        if not self._lock.acquire(timeout=timeout):
+            return  # it hangs, and the process ends
+        try:
             if self.connection is not None:
                 self.connection.close()
                 self.connection = None
+        finally:
+            self._lock.release()
 
     @contextlib.contextmanager
     def use(self) -> Iterator[sqlite3.Connection]:
@@ -302,11 +306,10 @@ class SqliteStore:
             rows = connection.execute("SELECT stream, reason, data FROM aside ORDER BY number").fetchall()
         return [(stream, reason, bytes(data)) for stream, reason, data in rows]
 
-    def close(self, timeout: float = 0.0) -> None:
+    def close(self, timeout: float = 1.0) -> None:
         """Close the files; may be called twice."""
-        del timeout
-        self._checkpoints.close()
-        self._leases.close()
+        self._checkpoints.close(timeout / 2)
+        self._leases.close(timeout / 2)
         if self._lock_file is not None:
             self._lock_file.close()
 

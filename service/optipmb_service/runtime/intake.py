@@ -48,7 +48,6 @@ DRAIN_S: Final = 0.5
 """How long who is asked for what came lately waits for what is still on its way through this process."""
 
 DRAIN_POLL_S: Final = 0.005
-END_S: Final = 5.0
 
 NEW_STREAMS: Final = 128
 """New streams without a cache that are taken in at once; what they sent is asked for before the next are taken in."""
@@ -158,13 +157,13 @@ class Intake:
         self._step()
         self._thread.start()
 
-    def close(self) -> None:
-        """Change nothing any more."""
+    def close(self, timeout: float) -> None:
+        """Change nothing any more; a step that takes longer (s) is left to itself."""
         self._ending = True
         self._hurry.set()
         self._wake.set()
         if self._thread.is_alive():
-            self._thread.join(END_S)
+            self._thread.join(timeout)
 
     def changed(self, partition: int, change: Change) -> None:
         """Take in what has become of a partition."""

@@ -258,13 +258,14 @@ class CheckpointWriter:
                     return None
 
     def close(self, timeout: float) -> None:
-        """Write what is pending and end; to be called when nothing is tracked any more."""
+        """Write what is pending and end, within so long (s); to be called when nothing is tracked any more."""
         self._ended.set()
         self._hurry.set()
         self._reading.shutdown(wait=False, cancel_futures=True)
         if self._thread.is_alive():
             self._thread.join(timeout)
-        self._write()
+            if self._thread.is_alive():
+                self._failed(StoreError(f"what is to be kept at the end is not written after {timeout:.1f} s"))
 
     def _run(self) -> None:
         while self._serve(max(0.0, self._interval_s - SETTLE_S)):
@@ -272,6 +273,7 @@ class CheckpointWriter:
             self._gather()
             if self._serve(SETTLE_S):
                 self._write()
+        self._write()
 
     def _serve(self, seconds: float) -> bool:
         """For so long write at once what somebody waits for, and nothing else; False at the end."""

@@ -16,6 +16,8 @@ import zenoh.ext
 from lease_log import Alone
 from optipmb_schemas import Keys, ServiceStatus, SessionState, encode
 from optipmb_service.app.clustering import STORE_FILE
+from optipmb_service.app.loops import HANDOVER_S
+from optipmb_service.app.supervisor import END_S
 from optipmb_service.cluster.leases import ALIVE, member_key
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import StoreError, Write
@@ -62,6 +64,27 @@ def test_an_idle_session_is_kept_and_goes_on(start: Callable[..., Any], tmp_path
     assert set(after.id) == set(before.id)
     assert (asked.received, asked.frames, asked.duplicates) == (7, 6, 1)
     assert digest not in {"", asked.digest}
+
+
+def test_a_store_that_hangs_keeps_no_end_waiting(start: Callable[..., Any], tmp_path: Path) -> None:
+    """Whatever is waited for at the end, all of it takes less than whoever starts a process waits before a kill."""
+    service, endpoint = start(store=str(tmp_path))
+    with Node(endpoint) as node:
+        node.send(*(SENSOR.detections(seq) for seq in range(5)))
+        node.tracks(SENSOR.stream, 5)
+        files = service._member._store._leases, service._member._store._checkpoints
+        for file in files:
+            file._lock.acquire()  # as by a call that does not return
+        began = time.monotonic()
+        ending = threading.Thread(target=service.stop)
+        ending.start()
+        ending.join(60.0)
+        took_s, hangs = time.monotonic() - began, ending.is_alive()
+        for file in files:
+            file._lock.release()
+        ending.join()
+    assert not hangs
+    assert took_s < HANDOVER_S + service._settings.grace_s + END_S
 
 
 def test_a_closed_stream_that_moves_stays_closed(start: Callable[..., Any], tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def run(network: Network, intake: Intake, done: Callable[[], bool]) -> None:
             assert time.monotonic() < ends, network.subscribed[-1:]
             time.sleep(0.01)
     finally:
-        intake.close()
+        intake.close(WAIT_S)
 
 
 def test_new_streams_are_asked_for_a_few_at_a_time() -> None:
@@ -151,7 +151,7 @@ def test_a_step_that_fails_is_done_again(monkeypatch: pytest.MonkeyPatch, fails:
         own = {stream for stream in STREAMS[:10] if partition_of(stream)}
         until(lambda: failed == [fails] and taken == own and not kept, "all are taken up", WAIT_S)
     finally:
-        intake.close()
+        intake.close(WAIT_S)
 
 
 @pytest.mark.parametrize("new", [True, False], ids=["new", "known"])
