@@ -34,7 +34,7 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CHANNEL = 1024  # samples between Zenoh and the draining thread; larger than any publisher's history
 _Message = TypeVar("_Message", bound=Message)
 
-HEARTBEAT_S = 0.2  # how long the loss of a newest message may stay unnoticed
+HEARTBEAT_S = 1.0  # how long the loss of a newest message may stay unnoticed, when no other one follows
 WAIT_BEFORE_DROP_US = 50_000  # with the defaults (1 ms) large messages are lost whenever the machine is busy
 WAIT_BEFORE_DROP_FRAGMENTS_US = 500_000
 CLOUD_BATCHES = 16  # of 64 kB on the way to the network: with the default of 2 sending a cloud takes four times as long

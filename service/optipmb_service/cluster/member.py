@@ -43,6 +43,9 @@ SHORT_LOOK_S: Final = 0.02
 """While partitions change hands: each is held by nobody for as long."""
 
 RENEWALS_PER_LEASE: Final = 10
+STRAINED: Final = 4
+"""Part of a lease without a renewal from which on it is late; half a lease is the end of the write lease."""
+
 WRITE_LEASES_PER_LEASE: Final = 2
 RETRY_S: Final = 0.1
 """At the end, between two tries to say so."""
@@ -115,6 +118,11 @@ class Member:
     def failure(self) -> str:
         """Why nothing may be published at present; empty while it may."""
         return "" if self._write_lease.valid(self._clock()) else f"leases: {self._error}"
+
+    @property
+    def strained(self) -> bool:
+        """Whether its record is renewed late: what can wait is not to begin now, for it would delay that more."""
+        return self._clock() - self._renewed_ns > self._lease_ns // STRAINED
 
     @property
     def partitions(self) -> set[int]:

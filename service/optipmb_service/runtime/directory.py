@@ -28,14 +28,14 @@ TOKEN_NS: Final = SECOND
 BACK_NS: Final = 5 * SECOND
 """How long a token may come after the start of this process, or back: who lost its router tries every 4 s at least."""
 
-MAX_UNPROVEN: Final = 1024
+MAX_UNPROVEN: Final = 256
 """Streams without a session that this instance announces at once: each costs members a token and subscriptions."""
 
 UNPROVEN_NS: Final = 10 * SECOND
-"""How long a stream is announced that gets no session; after that others may be, and it again with its next message."""
+"""How long a stream is announced that gets no session; after that others have their turn before it is again."""
 
 QUEUED_NS: Final = 120 * SECOND
-"""How long a stream beyond them waits for its turn after its last message: as long as first frames are kept."""
+"""How long after its last message a stream waits for its turns: as long as first frames are kept."""
 
 
 @dataclass(slots=True)
@@ -199,12 +199,14 @@ class StreamDirectory:
                 del self._unproven[stream]
                 known.announced = False
                 self._settled(known, now_ns)
+                if len(self._queued) < MAX_STREAMS:
+                    self._queued.setdefault(stream, known.seen_ns)
         while self._queued and len(self._unproven) < MAX_UNPROVEN:
             stream = next(iter(self._queued))
             seen_ns = self._queued.pop(stream)
             if now_ns - seen_ns <= QUEUED_NS and (known := self._found(stream)) is not None and not known.tokens:
                 self._unproven[stream] = now_ns
-                known.announced, known.left_ns, known.seen_ns = True, None, now_ns
+                known.announced, known.left_ns, known.seen_ns = True, None, seen_ns
 
     def _found(self, stream: str) -> _Known | None:
         known = self._streams.get(stream)

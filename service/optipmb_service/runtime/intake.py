@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import threading
 import time
+from itertools import islice
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol
 
 import optipmb_schemas as schemas
@@ -50,7 +51,10 @@ DRAIN_S: Final = 0.5
 DRAIN_POLL_S: Final = 0.005
 
 NEW_STREAMS: Final = 128
-"""New streams without a cache that are taken in at once; what they sent is asked for before the next are taken in."""
+"""New streams that are taken in at once, and announced at once, and none while the lease is renewed late.
+
+What those without a cache sent is asked for before the next are taken in.
+"""
 
 REST: Final = 2.0
 """How many times as long as a step took of the processor the thread rests before the next one."""
@@ -135,6 +139,7 @@ class Intake:
         registry.caches = self
         self._subscribed: set[Input] = set()
         self._known: set[str] = set()
+        self._announced: set[str] = set()
         self._lock = threading.Lock()
         self._came: set[int] = set()
         self._left: dict[int, int] = {}
@@ -324,10 +329,14 @@ class Intake:
         new = [
             stream
             for stream, cached in streams.items()
-            if not cached and stream not in self._known and partition_of(session_of(stream)) in held
+            if stream not in self._known
+            and (partition := partition_of(session_of(stream))) in held
+            and not (cached and (everything or partition in came))
         ]
-        for stream in new[NEW_STREAMS:]:
-            del streams[stream]  # in the next step
+        strained = self._member.strained
+        for stream in new[0 if strained else NEW_STREAMS :]:
+            del streams[stream]  # in a later step
+        if len(new) > NEW_STREAMS and not strained:
             self._wake.set()
         coming = self._coming(streams, came, held)
         for session in coming:
@@ -338,10 +347,17 @@ class Intake:
             self._subscribed.add(one)
         self._inputs.unsubscribe((one.kind, one.stream, one.cached) for one in sorted(self._subscribed - wanted))
         self._subscribed &= wanted
-        self._inputs.discover(self._directory.announced())
+        self._announce(self._directory.announced(), strained=strained)
         self._known = set(streams)
         if coming:
             self._take_up(coming)
+
+    def _announce(self, streams: set[str], *, strained: bool) -> None:
+        new = streams - self._announced
+        self._announced = (streams & self._announced) | set(islice(new, 0 if strained else NEW_STREAMS))
+        self._inputs.discover(self._announced)
+        if len(new) > NEW_STREAMS and not strained:
+            self._wake.set()
 
     def _wanted(
         self, streams: dict[str, bool], received: set[int], *, everything: bool, discovering: bool

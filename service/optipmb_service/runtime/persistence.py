@@ -54,6 +54,9 @@ LEAVE_SETTLE_S: Final = 0.03
 RETRY_S: Final = 0.1
 """Between two tries to read from a store that cannot be reached."""
 
+READ_AT_ONCE: Final = 8
+"""Checkpoints read at once from a store elsewhere: each waits for an answer."""
+
 PAUSE_S: Final = 0.003
 """Between two checkpoints that are encoded; less where there are so many that it would take half the interval."""
 
@@ -172,7 +175,7 @@ class CheckpointWriter:
         self._lock = threading.Lock()
         self._pending: dict[str, tuple[Checkpoint, int | None]] = {}
         self._thens: list[tuple[str, Callable[[], None]]] = []
-        self._reading = ThreadPoolExecutor(1, "restore")
+        self._reading = ThreadPoolExecutor(READ_AT_ONCE if store.remote else 1, "restore")
         self._hurry = threading.Event()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="checkpoints", daemon=True)
@@ -211,7 +214,7 @@ class CheckpointWriter:
             self._hurry.set()
 
     def recall(self, stream: str, restore: Callable[[Checkpoint], _T], then: Callable[[_T | None], None]) -> None:
-        """Read the newest checkpoint of a stream on the thread that does so, and go on there with `then`."""
+        """Read the newest checkpoint of a stream on a thread that does so, and go on there with `then`."""
 
         def read() -> None:
             restored = None

@@ -229,7 +229,8 @@ class Registry:
 
     def _hand(self, stream: str, packet: Packet, *, frame: bool) -> None:
         offered = Mailbox.offer_frame if frame else Mailbox.offer_cloud
-        if not self._offer(stream, lambda actor: offered(actor.mailbox, packet)):
+        waits = self._member.strained and stream not in self._actors
+        if waits or not self._offer(stream, lambda actor: offered(actor.mailbox, packet)):
             self._put_off(stream, packet, frame=frame)
 
     def _kept_for_takeover(self, stream: str, packet: Packet, *, frame: bool) -> bool:
@@ -530,7 +531,7 @@ class Registry:
 
     def _let_in(self) -> None:
         """Hand over what was put off, as far as there is room."""
-        while self._newcomers:
+        while self._newcomers and not self._member.strained:
             with self._lock:
                 if self._crowded():
                     return

@@ -17,8 +17,12 @@ from optipmb_service.zenoh.connection import line
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-HEARTBEAT_S: Final = 0.2
-"""How long the loss of the newest message of a cached publisher may stay unnoticed."""
+HEARTBEAT_S: Final = 1.0
+"""How long the loss of a newest message of a cached publisher may stay unnoticed when no other one follows.
+
+Heartbeats go on in silence: one that is sent once alone could be lost with the message, as when a router is started
+again. For that they are not often: thousands of silent publishers cost little.
+"""
 
 log = structlog.get_logger("optipmb_service")
 

@@ -79,3 +79,11 @@ def test_a_stream_with_a_session_is_announced_at_once() -> None:
     one.sessions |= set(fleet)
     one.hear(0, *names(2 * MAX_UNPROVEN, "other"))
     assert set(fleet) <= one.hear(1, *fleet)
+
+
+def test_a_stream_that_got_no_session_in_its_time_has_another_turn() -> None:
+    """Where members are slow, a stream that sent one message is announced again after others have had their turn."""
+    one, fleet = Discoverer(), names(2 * MAX_UNPROVEN)
+    assert one.hear(0, *fleet) == set(fleet[:MAX_UNPROVEN])
+    assert one.hear(UNPROVEN_NS + 1) == set(fleet[MAX_UNPROVEN:])
+    assert one.hear(2 * (UNPROVEN_NS + 1)) == set(fleet[:MAX_UNPROVEN])

@@ -34,7 +34,6 @@ from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.missed_frames import NoLog
 from optipmb_service.runtime.persistence import CheckpointWriter
 from optipmb_service.runtime.ports import PACKET_BYTES, Packet
-from optipmb_service.runtime.registry import MAX_UNPROVEN
 from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import MAX_COUNT, SECOND
@@ -457,9 +456,12 @@ def test_messages_that_wait_are_bounded_in_bytes(start: Callable[..., Any]) -> N
     assert service.status().shed > 0
 
 
-def test_the_first_frames_of_many_new_streams_wait_for_room(start: Callable[..., Any]) -> None:
+def test_the_first_frames_of_many_new_streams_wait_for_room(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Three times as many streams as may be new at once begin while a step does not end: each is tracked afterwards."""
-    gate, entered = threading.Event(), threading.Event()
+    gate, entered, most = threading.Event(), threading.Event(), 16
+    monkeypatch.setattr("optipmb_service.runtime.registry.MAX_UNPROVEN", most)
 
     class Waits:
         def __init__(self, parameters: optipmb.Parameters) -> None:
@@ -467,20 +469,20 @@ def test_the_first_frames_of_many_new_streams_wait_for_room(start: Callable[...,
 
         def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
             entered.set()
-            gate.wait(20)
+            gate.wait(60)
             return self._tracker.step(density, frame)
 
-    service, _ = start(tracker=Waits, max_sessions=4 * MAX_UNPROVEN)
+    service, _ = start(tracker=Waits)
     registry = service._registry
-    for sensor in [CARELESS, *(Sensor(f"s{number}/node/lidar") for number in range(3 * MAX_UNPROVEN))]:
+    for sensor in [CARELESS, *(Sensor(f"s{number}/node/lidar") for number in range(3 * most))]:
         now_ns, payload = time.monotonic_ns(), encode(sensor.detections(0))
         key = KEYS.detections(sensor.stream)
         registry.frame(Packet(key, payload, len(payload), encoding_of(Detections), time.time_ns(), now_ns))
-        assert entered.wait(20)
+        assert entered.wait(60)
     gate.set()
-    until(lambda: service.status().frames == 1 + 3 * MAX_UNPROVEN, "all are tracked")
+    until(lambda: service.status().frames == 1 + 3 * most, "all are tracked")
     status = service.status()
-    assert (status.refused, status.shed, len(registry.actors())) == (0, 0, 1 + 3 * MAX_UNPROVEN)
+    assert (status.refused, status.shed, len(registry.actors())) == (0, 0, 1 + 3 * most)
 
 
 def test_a_mailbox_gives_back_what_it_took() -> None:

@@ -84,9 +84,26 @@ def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
         take_up=lambda *_: None,
         changed=lambda *_: None,
     )
-    member = SimpleNamespace(partitions=held, holds=lambda stream: partition_of(stream) in held)
+    member = SimpleNamespace(partitions=held, strained=False, holds=lambda stream: partition_of(stream) in held)
     untyped: Any = registry, member, network
     return Intake(*untyped, standby=False, linger_s=10.0, idle_s=3600.0), registry
+
+
+class Turning:
+    """A member that is asked for its partitions once in each step."""
+
+    def __init__(self, held: Callable[[], set[int]], member: Any) -> None:
+        self._held, self._member = held, member
+
+    @property
+    def partitions(self) -> set[int]:
+        """Return them."""
+        return self._held()
+
+    @property
+    def strained(self) -> bool:
+        """Whether it renews its lease late."""
+        return bool(self._member.strained)
 
 
 def run(network: Network, intake: Intake, done: Callable[[], bool]) -> None:
@@ -112,6 +129,25 @@ def test_new_streams_are_asked_for_a_few_at_a_time() -> None:
     assert Counter(network.subscribed) == Counter(
         (kind, stream, False) for stream in own for kind in ("detections", "points")
     )
+
+
+@pytest.mark.parametrize("cached", [True, False], ids=["cached", "plain"])
+def test_new_streams_wait_while_the_lease_is_renewed_late(cached: bool) -> None:  # noqa: FBT001 - a parameter
+    """A member that renews its lease late subscribes to no new stream before it is in time again."""
+    network = Network(**{"published" if cached else "announced": STREAMS})
+    intake, _ = member_of(network, set(range(1, PARTITIONS)))
+    own = {stream for stream in STREAMS if partition_of(stream)}
+    steps: list[int] = []
+    late: Any = intake._member
+
+    def held() -> set[int]:
+        steps.append(len(network.subscribed))
+        late.strained = len(steps) < 3
+        return set(range(1, PARTITIONS))
+
+    intake._member = Turning(held, late)  # type: ignore[assignment]  # what is used of it
+    run(network, intake, lambda: {stream for _, stream, _ in network.subscribed} == own)
+    assert steps[:3] == [0, 0, 0]
 
 
 def test_only_publishers_with_a_cache_are_subscribed_to_with_recovery() -> None:
