@@ -55,6 +55,7 @@ class OnlineTracks:
             gives none.
         left_out: detections of classes that the profile lacks.
         paths: where the tracks will be at the `horizons` of the profile; None where it has none.
+        class_probability: (N, C) probability of each class of the profile; None where it has no groups of classes.
     """
 
     stamp_ns: int
@@ -63,6 +64,7 @@ class OnlineTracks:
     velocity: Array
     left_out: int
     paths: PredictedPaths | None = None
+    class_probability: Array | None = None
 
     def __len__(self) -> int:
         return len(self.tracks)
@@ -211,6 +213,7 @@ class OnlineTracker:
             velocity=np.where(once[:, None], np.nan, tracks.velocity),
             left_out=max(left_out, missing),
             paths=result.paths,
+            class_probability=result.class_probability,
         )
 
     def _classes(self, values: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.int64], int]:

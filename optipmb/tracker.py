@@ -174,12 +174,21 @@ class Diagnostics:
 
 @record
 class StepResult:
-    """Posterior density, extracted tracks and diagnostics of one step; paths where the profile has horizons."""
+    """What a step gives.
+
+    Attributes:
+        density: the posterior.
+        tracks: the extracted tracks.
+        diagnostics: what happened.
+        paths: predicted paths of the tracks, where the profile has horizons.
+        class_probability: (N, C) of each track and class, where classes have a group in common.
+    """
 
     density: Density
     tracks: Tracks
     diagnostics: Diagnostics
     paths: PredictedPaths | None = None
+    class_probability: Array | None = None
 
 
 class Tracker:
@@ -302,7 +311,8 @@ class Tracker:
             born,
             repaired + repaired_now,
         )
-        return StepResult(posterior, tracks, diagnostics, paths)
+        told = None if pi is None else pi[np.searchsorted(objects.id, tracks.id)]
+        return StepResult(posterior, tracks, diagnostics, paths, told)
 
     def _check(self, density: Density, frame: Frame) -> None:
         """Refuse other classes, which kernels would read out of bounds for, and frames of the past."""

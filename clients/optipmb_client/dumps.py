@@ -10,7 +10,18 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Pose, Tracks, decode_dump, path_fields
+from optipmb_schemas import (
+    Detections,
+    Dump,
+    DumpedFrame,
+    MessageError,
+    Points,
+    Pose,
+    Tracks,
+    class_fields,
+    decode_dump,
+    path_fields,
+)
 
 import optipmb
 from optipmb_client.errors import UsageError
@@ -115,6 +126,8 @@ def _step(
     columns = {column.name: getattr(found.tracks, column.name) for column in fields(found.tracks)}
     if (paths := found.paths) is not None:
         columns |= path_fields(paths.horizons, paths.mean, paths.covariance)
+    if found.class_probability is not None:
+        columns |= class_fields(found.class_probability)
     Tracks(
         stream=message.stream,
         epoch=message.epoch,

@@ -74,6 +74,7 @@ class NamedTracks:
     tracks: Tracks
     labels: tuple[str, ...]
     paths: PredictedPaths | None = None
+    class_probability: Floats | None = None
 
     @functools.cached_property
     def _path_fields(self) -> dict[str, NDArray[Any]]:
@@ -321,7 +322,7 @@ def track_sequence(
     """
     names = tuple(parameters.classes)
     for given, result, left_out, took in _steps(parameters, sequence, classes, modules):
-        yield given, NamedTracks(result.tracks, names, result.paths), left_out, took
+        yield given, NamedTracks(result.tracks, names, result.paths, result.class_probability), left_out, took
 
 
 def _steps(
@@ -384,7 +385,7 @@ def track_whole(
     names = tuple(parameters.classes)
     smoother = Smoother(parameters) if smooth else None
     for frame, result, missed, took in _steps(parameters, sequence, classes, modules):
-        found[frame.index] = NamedTracks(result.tracks, names, result.paths)
+        found[frame.index] = NamedTracks(result.tracks, names, result.paths, result.class_probability)
         if smoother is not None:
             smoother.add(frame.index, result.density, result.tracks)
         steps.append(took)

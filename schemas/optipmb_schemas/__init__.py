@@ -33,6 +33,7 @@ from optipmb_schemas.messages import (
     Points,
     Pose,
     Tracks,
+    class_fields,
     path_fields,
 )
 from optipmb_schemas.model import Message
@@ -71,6 +72,7 @@ __all__ = [
     "Topic",
     "Tracks",
     "TracksRequest",
+    "class_fields",
     "decode",
     "decode_dump",
     "encode",

@@ -29,9 +29,9 @@ class Limits:
     max_horizons: int = _limit(100, "horizons of predicted paths (H)")
 
     def rows(self, dimension: str) -> int:
-        """Return the limit of a symbolic dimension: M detections, N tracks or components, P points, H horizons."""
-        most = {"M": self.max_detections, "N": self.max_tracks, "P": self.max_points, "H": self.max_horizons}
-        return most[dimension]
+        """Return the limit of a dimension: M detections, N tracks or components, P points, H horizons, C classes."""
+        most = {"M": self.max_detections, "N": self.max_tracks, "P": self.max_points}
+        return (most | {"H": self.max_horizons, "C": self.max_labels})[dimension]
 
     def described(self) -> list[tuple[str, int, str]]:
         """Return name, value and meaning of every limit, for people."""

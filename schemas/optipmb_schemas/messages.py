@@ -7,13 +7,14 @@ described here and nowhere else: the JSON Schemas and the tables of the document
 
 import math
 import sys
+from collections.abc import Mapping
 from itertools import chain
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field
 
 from optipmb_schemas.arrays import Array, Integers, Numeric, Reals, Singles, first_descent, numeric, unit_quaternion
-from optipmb_schemas.errors import MessageError, invalid, show
+from optipmb_schemas.errors import MessageError, invalid, shape_text, show
 from optipmb_schemas.fields import Count, Epoch, Flag, Horizons, Labels, Name, NonNegative, SessionId, Stamp, Stream
 from optipmb_schemas.model import Message
 
@@ -232,6 +233,11 @@ class Tracks(Header):
         description="1: the existence reached a threshold of the profile and has not fallen below a lower one since; "
         "0: the track may be of nothing.",
     )
+    class_probability: Annotated[Singles, Array("f4", ("N", "C"), 0, 1)] | None = Field(
+        default=None,
+        description="Probability of each class of `labels`; `label` changes with it. Absent: the profile has no groups "
+        "of classes, and a track keeps its class.",
+    )
     horizons: Horizons | None = Field(
         default=None,
         description="Times of the predicted paths after `stamp_ns`, s, ascending. Absent, as are the next three: the "
@@ -249,9 +255,18 @@ class Tracks(Header):
     delivery: Delivery | None = Field(default=None, description="How this publication came about.")
 
     def check(self) -> None:
-        """Labels must be in the list, ids ascending, the fields of paths there together."""
+        """Labels must be in the list, ids ascending, the fields of paths there together, C classes in `labels`."""
         super().check()
         _check_labels(self.label, self.labels)
+        probability, classes = self.class_probability, len(self.labels)
+        if probability is not None and probability.shape[1] != classes:
+            if len(probability):
+                expected = f"{classes} columns, as many as `labels`"
+                raise MessageError(
+                    "invalid_value", "class_probability", expected, f"shape {shape_text(probability.shape)}"
+                )
+            # Lists of no rows cannot say how long they are.
+            self.__dict__["class_probability"] = probability.reshape((0, classes))
         if at := first_descent(self.id):
             raise invalid(f"id[{at}]", f"an id above {self.id[at - 1]}, in ascending order", self.id[at])
         absent = [name for name in PATHS if getattr(self, name) is None]
@@ -275,8 +290,21 @@ def path_fields(horizons: Reals, mean: Reals, covariance: Reals) -> dict[str, Nu
         MessageError: they hold numbers that no message may.
     """
     values = (horizons, mean[:, :, :2], mean[:, :, 3], covariance[:, :, :2, :2])
+    return _validated(dict(zip(PATHS, values, strict=True)))
+
+
+def class_fields(class_probability: Reals) -> dict[str, Numeric]:
+    """Return the field of `Tracks` with the probabilities (N, C) of the classes.
+
+    Raises:
+        MessageError: they are none.
+    """
+    return _validated({"class_probability": class_probability})
+
+
+def _validated(values: Mapping[str, Numeric]) -> dict[str, Numeric]:
     fields = {}
-    for name, value in zip(PATHS, values, strict=True):
+    for name, value in values.items():
         try:
             fields[name] = Tracks.arrays[name].validate(value)
         except MessageError as error:

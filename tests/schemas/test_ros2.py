@@ -366,6 +366,30 @@ def test_predicted_objects_have_the_paths_of_tracks(more: tuple[float, ...]) -> 
         assert [one.kinematics.predicted_paths for one in made["/predicted"].objects] == [[], []]
 
 
+def test_objects_have_the_probabilities_of_their_classes() -> None:
+    """One class with probability 1, or each that is possible, the most probable first; equal numbers are added up."""
+    columns = {name: np.zeros(2) for name in ("yaw", "yaw_rate", "acceleration", "existence", "score")}
+    tracks = SimpleNamespace(
+        id=np.array([4, 9]),
+        labels=("car", "truck", "van"),
+        label=np.array([0, 1]),
+        center=np.zeros((2, 3)),
+        size=np.ones((2, 3)),
+        velocity=np.zeros((2, 2)),
+        covariance=np.zeros((2, 6, 6)),
+        horizons=None,
+        **columns,
+    )
+
+    def classes() -> list[list[tuple[int, float]]]:
+        made = dict(messages(own_types(), cast("TrackColumns", tracks), 5, "map", "a/b/c"))
+        return [[(one.label, one.probability) for one in row.classification] for row in made[""].objects]
+
+    assert classes() == [[(1, 1.0)], [(2, 1.0)]]
+    tracks.class_probability = np.array([[0.25, 0.375, 0.375], [0.0, 1.0, 0.0]])
+    assert classes() == [[(1, 0.625), (2, 0.375)], [(2, 1.0)]]
+
+
 def test_damaged_bytes_raise_nothing_else() -> None:
     """A message cut anywhere, or with any byte changed, is read or refused by the one error of the package."""
     types = own_types()

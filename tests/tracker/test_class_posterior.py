@@ -142,8 +142,22 @@ def test_a_truck_once_called_car_becomes_a_truck_under_its_id() -> None:
     assert reported == ["car"] * change + ["truck"] * (len(calls) - change)
     for one in results:
         assert one.density.class_probability is not None
+        np.testing.assert_array_equal(one.class_probability, one.density.class_probability)
         np.testing.assert_allclose(one.density.class_probability.sum(axis=1), 1.0)
         assert one.density.class_probability[0, 1] == 0.0
+
+
+def test_probabilities_are_those_of_the_tracks() -> None:
+    """An object that is not extracted has no row; the rows follow the ids of the tracks."""
+    parameters = motor(extract_new=0.9, extract_known=0.99, survival=0.95, max_misses=5, min_existence=0.01)
+    frames = [("bus", 20.0, 0.8), ("truck", 60.0, 0.9)], [("truck", 60.0, 0.9)]
+    results = run(parameters, [seen(parameters, 0.1 * k, *objects) for k, objects in enumerate(frames)])
+    last = results[-1]
+    assert last.class_probability is not None
+    assert last.density.class_probability is not None
+    rows = np.isin(last.density.bernoulli.id, last.tracks.id)
+    assert len(last.class_probability) == len(last.tracks) < len(rows)
+    np.testing.assert_array_equal(last.class_probability, last.density.class_probability[rows])
 
 
 def test_a_walker_is_no_truck() -> None:

@@ -105,7 +105,7 @@ def _tracks(fields: Any, limits: Limits) -> EncodedTracks | None:
     if type(horizons) is not int or not 0 <= horizons <= limits.max_horizons:
         return None
     parts: list[bytes] = []
-    for name, dtype, shape, size, prefix in _columns(rows, horizons):
+    for name, dtype, shape, size, prefix in _columns(rows, horizons, len(fields["labels"])):
         block = fields.get(name)
         if block is not None:
             data = block["data"]
@@ -117,9 +117,9 @@ def _tracks(fields: Any, limits: Limits) -> EncodedTracks | None:
 
 
 @lru_cache(512)
-def _columns(rows: int, horizons: int) -> list[tuple[str, str, list[int], int, bytes]]:
+def _columns(rows: int, horizons: int, classes: int) -> list[tuple[str, str, list[int], int, bytes]]:
     """Return of each column name, number type, shape, bytes, and what stands before them in the serialized message."""
-    sizes, columns = {"N": rows, "H": horizons}, []
+    sizes, columns = {"N": rows, "H": horizons, "C": classes}, []
     for name, one in Tracks.arrays.items():
         shape = [length if isinstance(length, int) else sizes[length] for length in one.shape]
         size = prod(shape) * DTYPES[one.dtype]

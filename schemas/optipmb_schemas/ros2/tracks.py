@@ -7,8 +7,9 @@ All in the world frame, under the name that the caller gives it. What the messag
 - twist and acceleration: in the frame of the object, x forward, as Autoware has them; covariance of the speed along x
   and of the turn rate about z, and of the acceleration along x.
 - predicted paths, in `PredictedObjects` alone: the box now and at the `HORIZONS`, of tracks that have paths at these.
-- existence probability, class (probability 1: a track keeps its class), box, and a UUID whose last eight bytes are the
-  track's id, big endian, and whose first eight are a digest of the stream's name.
+- existence probability, box, and a UUID whose last eight bytes are the track's id, big endian, and whose first eight
+  are a digest of the stream's name.
+- the class with probability 1; where tracks have probabilities of classes, those above 0, the most probable first.
 """
 
 import hashlib
@@ -165,6 +166,7 @@ class _Objects:
         self._at = np.flatnonzero(np.isin(at, HORIZONS)) if has_paths(tracks) else None
         self._package = TRACKED.rpartition("/")[0]
         confidence = getattr(tracks, "heading_confidence", None)
+        self._pi: Floats | None = getattr(tracks, "class_probability", None)
         self._faces = np.ones(len(tracks.id), dtype=np.bool_) if confidence is None else confidence >= FACES
 
     def tracked(self, row: int) -> Any:
@@ -206,12 +208,14 @@ class _Objects:
     def _what(self, row: int) -> dict[str, Any]:
         """Return the fields that say what it is."""
         tracks, types = self._tracks, self._types
-        number = _CLASSES.get(tracks.labels[int(tracks.label[row])].lower(), UNKNOWN_CLASS)
         uuid = np.frombuffer(self._key + int(tracks.id[row]).to_bytes(8, "big"), dtype=np.uint8)
         return {
             "object_id": types.new("unique_identifier_msgs/msg/UUID", uuid=uuid),
             "existence_probability": float(tracks.existence[row]),
-            "classification": [types.new(f"{self._package}/ObjectClassification", label=number, probability=1.0)],
+            "classification": [
+                types.new(f"{self._package}/ObjectClassification", label=number, probability=probability)
+                for number, probability in self._classes(row)
+            ],
             "shape": types.new(
                 f"{self._package}/Shape",
                 type=0,
@@ -219,6 +223,17 @@ class _Objects:
                 dimensions=_vector(types, *tracks.size[row].tolist()),
             ),
         }
+
+    def _classes(self, row: int) -> list[tuple[int, float]]:
+        """Return Autoware's number and the probability of each class that the object may be of, likeliest first."""
+        names, pi = self._tracks.labels, self._pi
+        likely = [(int(self._tracks.label[row]), 1.0)] if pi is None else enumerate(pi[row].tolist())
+        found: dict[int, float] = {}
+        for c, probability in likely:
+            if probability > 0.0:
+                number = _CLASSES.get(names[c].lower(), UNKNOWN_CLASS)
+                found[number] = found.get(number, 0.0) + probability
+        return sorted(found.items(), key=lambda one: -one[1])
 
     def _motion(self, row: int) -> tuple[Any, Any, Any]:
         """Return pose, twist and acceleration with their covariances."""

@@ -16,6 +16,8 @@ import optipmb_schemas as schemas
 import optipmb
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from optipmb_service.session.timeline import FrameId
 
 IDENTITY = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
@@ -116,6 +118,7 @@ def density_of(
 def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
     tracks: optipmb.Tracks,
     paths: optipmb.PredictedPaths | None,
+    class_probability: NDArray[np.float64] | None = None,
     *,
     stream: str,
     frame_id: FrameId,
@@ -126,7 +129,7 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
     gap: int,
     ignored: int,
 ) -> schemas.Tracks:
-    """Return the message for the tracks of a frame, and for their paths if there are any, without its delivery part.
+    """Return the message for the tracks of a frame, with paths and classes if there are any, without its delivery part.
 
     What the tracker made of checked detections needs one look, not the checks of a message from elsewhere; where that
     look finds something odd, those checks say what it is.
@@ -137,6 +140,7 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
     make = schemas.Tracks.trusted if optipmb.sound(tracks) else schemas.Tracks
     for name in _COLUMNS:
         getattr(tracks, name).setflags(write=False)  # they are the message's now, which so needs no views of them
+    class_fields = {} if class_probability is None else schemas.class_fields(class_probability)
     path_fields = {} if paths is None else schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
     return make(
         stream=stream,
@@ -167,6 +171,7 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
         time_since_detection=tracks.time_since_detection,
         detection=tracks.detection,
         confirmed=tracks.confirmed.astype(np.int64),
+        **class_fields,
         **path_fields,
         delivery=None,
     )

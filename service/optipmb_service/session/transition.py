@@ -162,6 +162,7 @@ class Transition:
         tracks = convert.tracks_of(
             result.tracks,
             result.paths,
+            result.class_probability,
             stream=self.stream,
             frame_id=frame_id,
             session=before.session,
