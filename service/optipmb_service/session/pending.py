@@ -7,9 +7,10 @@ that of the past with the frames held: a frame is judged by it when it arrives, 
 from __future__ import annotations
 
 from bisect import insort
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
+from optipmb.records import record
 from optipmb_service.session.cloud_buffer import CloudBuffer
 from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.state import size_of
@@ -35,7 +36,7 @@ MAX_RECOVERING: Final = 1024
 """Frames held for missed ones at once; beyond it they go on with a gap."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Held:
     """A frame that arrived.
 
@@ -60,7 +61,7 @@ class Held:
     judged: Judged
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Ready:
     """A frame whose turn it is, with its cloud; `missed` says that it waited for one in vain."""
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
+from optipmb.records import record
 from optipmb_service.session.timeline import Cursor, FrameId, Order, Placement
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ class PoseHistory:
     astray_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class SensorState:
     """What the frames of one sensor so far mean for its next.
 
@@ -85,7 +86,7 @@ class SensorState:
 _UNKNOWN: Final = SensorState()
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class FilterState:
     """A session between two frames.
 
@@ -126,7 +127,7 @@ class FilterState:
         return replace(self, density=density, session=session, starts=starts, sensors=sensors, tracks=0)
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Entry:
     """A frame that is or was processed.
 

@@ -18,9 +18,11 @@ Behind the window nothing moves any more. What is later than that is `Verdict.LA
 from __future__ import annotations
 
 from bisect import bisect
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum, unique
 from typing import TYPE_CHECKING, Final
+
+from optipmb.records import record
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -90,7 +92,7 @@ Order = tuple[int, int, str, int, int]
 """The key by which frames are processed: generation, stamp, sensor, era, sequence number."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Placement:
     """Where a frame belongs among the others.
 
@@ -120,7 +122,7 @@ class Placement:
         return self.generation, self.time_ns(frame_id), frame_id.sensor, self.era, frame_id.seq
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Cursor:
     """What frames up to some point mean for the one that follows them.
 
@@ -175,7 +177,7 @@ class Cursor:
         return self.jumped + 1 if agrees else 1
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class SeenNumbers:
     """Which frames of an epoch came.
 
@@ -228,7 +230,7 @@ def complete_until(epochs: Sequence[SeenNumbers], frame_id: FrameId, processed: 
     return all(epochs[number].has(seq) for seq in range(first, frame_id.seq))
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Decision:
     """The verdict on one frame.
 
@@ -243,7 +245,7 @@ class Decision:
     last: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Timeline:
     """What is remembered of the frames of a stream.
 
@@ -258,10 +260,10 @@ class Timeline:
 
     gap_limit_ns: int
     epochs: tuple[SeenNumbers, ...] = ()
-    base: Cursor = Cursor()
+    base: Cursor = field(default_factory=Cursor)
     floor: FrameId | None = None
     frame_ids: tuple[FrameId, ...] = ()
-    tip: Cursor = Cursor()
+    tip: Cursor = field(default_factory=Cursor)
 
     def judge(self, frame_id: FrameId) -> tuple[Decision, Timeline]:
         """Decide on a frame that arrived; the second result replaces this timeline."""

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 import optipmb
+from optipmb.records import record
 from optipmb_service.session import convert
 from optipmb_service.session.pose_check import judge, position_of
 from optipmb_service.session.state import Entry, FilterState, FrameCounts, PoseHistory, SensorState
@@ -48,7 +49,7 @@ class SessionStart:
     jump_ns: int
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Outcome:
     """What became of a frame.
 
