@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 TRIES = 5
+NODES = 100
+"""Of each site."""
+
 SETTLED = 10
 """Looks half a second apart after which no more streams come."""
 
@@ -178,8 +181,16 @@ class Owners:
         return [name for name in names if name not in known]
 
     def streams(self, site: str) -> int:
-        """Return how many streams of a site have an owner."""
-        return len({KEYS.stream_of(key) for key in tuple(self._tokens) if f"/{site}/" in key})
+        """Return how many streams have an owner whose sites begin so."""
+        return len({KEYS.stream_of(key) for key in tuple(self._tokens) if f"/{site}" in key})
+
+
+def named(kind: str, number: int) -> str:
+    """Return the name of a stream.
+
+    A site has a hundred nodes: what Zenoh takes to declare something grows with the names beside it on each level.
+    """
+    return f"{kind}{number // NODES:04}/n{number % NODES:02}/lidar"
 
 
 def wait(what: str, reached: Callable[[], bool], step: Callable[[], None] = lambda: None) -> float:
@@ -252,7 +263,7 @@ class Measurement:
 
     def _live(self, connection: Connection, alone: Phase) -> None:
         arguments, figures, count, came = self._arguments, self.figures, self._arguments.streams, [0]
-        sensors = [Sensor(f"live/n{number:05}/lidar", objects=arguments.objects) for number in range(count)]
+        sensors = [Sensor(named("live", number), objects=arguments.objects) for number in range(count)]
         keys = [KEYS.detections(sensor.stream) for sensor in sensors]
         senders = [
             connection.plain_sender(key, DETECTIONS)
@@ -315,7 +326,7 @@ class Measurement:
     def _idle(self) -> None:
         arguments, cluster, figures, count = self._arguments, self._cluster, self.figures, self._arguments.idle
         still, began = cluster.sample(), time.monotonic()
-        names = [f"idle/n{number:05}/lidar" for number in range(count)]
+        names = [named("idle", number) for number in range(count)]
         left, tries = names, 0
         while left:  # a publisher without a cache loses messages where the network is busy
             tries += 1

@@ -31,7 +31,7 @@ BACK_NS: Final = 5 * SECOND
 MAX_UNPROVEN: Final = 256
 """Streams without a session that this instance announces at once: each costs members a token and subscriptions."""
 
-UNPROVEN_NS: Final = 10 * SECOND
+UNPROVEN_NS: Final = 30 * SECOND
 """How long a stream is announced that gets no session; after that others have their turn before it is again."""
 
 QUEUED_NS: Final = 120 * SECOND

@@ -427,7 +427,8 @@ class Registry:
     def keep(self) -> None:
         """Have every session that changed give its state to the checkpoint writer."""
         for actor in self.actors():
-            actor.tell(StreamActor.keep)
+            if actor.changed:  # thousands may be silent
+                actor.tell(StreamActor.keep)
 
     def keep_now(self) -> None:
         """Do the same in the calling thread, when the workers have ended."""

@@ -129,6 +129,11 @@ class StreamActor:
         return self.session is not None or self._opening is not None or self._closing
 
     @property
+    def changed(self) -> bool:
+        """Whether the session has a state that was not given to the checkpoint writer; may be called by any thread."""
+        return self._changed and self.session is not None
+
+    @property
     def elsewhere(self) -> bool:
         """Whether another instance tracks the stream, and answers for it."""
         return self.session is None and not self._context.member.holds(self.stream)
@@ -551,7 +556,7 @@ class StreamActor:
 
     def keep(self) -> None:
         """Give the state to the checkpoint writer, if it changed."""
-        if self.session is not None and self._changed:
+        if self.changed and self.session is not None:
             self._changed = False
             self._context.persistence.put(self.session.snapshot(), self._fence)
 
