@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 from fleet import Fleet
+from gateway import GatewayProcess
 from log_process import LogProcess
 from nats_process import NatsProcess
 from optipmb_client import Connection, kept_tracks
 from optipmb_schemas import Tracks, decode
+from optipmb_schemas.protobuf import convert
+from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_service.cluster.message_log import MessageLog
 from optipmb_service.cluster.store import StoreError
+from optipmb_service.zenoh.transport import TRACKS_CACHE
 from router import Node, Sensor, plain, until
 from takeovers import KEYS, check, expected
 
@@ -126,6 +130,15 @@ def test_a_successor_reads_what_nobody_tracked(logged: Logged) -> None:
     for sensor in SENSORS:
         tracks, _ = expected(frames, sensor)
         until(lambda stream=sensor.stream, tracks=tracks: kept(stream) == tracks, "all tracks are in the log")
+
+    # Over gRPC as well.
+    with GatewayProcess(logged.endpoint) as gateway:
+        gateway.wait_ready()
+        asked = pb.QueryTracksRequest(pattern=SENSORS[0].stream)
+        answers = list(gateway.stub().QueryTracks(asked))
+        assert len(answers) > TRACKS_CACHE
+        assert [plain(convert.from_proto(one.tracks, Tracks)) for one in answers] == kept(SENSORS[0].stream)
+        gateway.end()
 
 
 @pytest.mark.timeout(600)

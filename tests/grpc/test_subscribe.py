@@ -150,6 +150,14 @@ def test_query_by_time(stub: Any, stream: str) -> None:
     assert [one.tracks.seq for one in everything] == list(range(30, 80))
 
 
+def test_a_range_that_cannot_be_answered_ends_the_call(stub: Any, stream: str) -> None:
+    """One that ends before it begins names the field, as over Zenoh."""
+    with pytest.raises(grpc.RpcError) as raised:
+        list(stub.QueryTracks(pb.QueryTracksRequest(pattern=stream, from_ns=5, to_ns=4)))
+    assert raised.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+    assert "to_ns" in raised.value.details()
+
+
 @pytest.mark.parametrize(
     ("asked", "path"),
     [

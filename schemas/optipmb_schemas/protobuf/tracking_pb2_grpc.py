@@ -135,7 +135,8 @@ class TrackingServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def QueryTracks(self, request, context):
-        """Recent tracks: what the services keep of each stream, 50 frames (5 s at 10 Hz). Ends when all have been sent.
+        """Tracks of a range of stamps. Of one stream: all that is kept, in the log where there is one, else 50 frames (5 s at
+        10 Hz). Of a pattern: 50 frames of each stream that is tracked now. Ends when all have been sent.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

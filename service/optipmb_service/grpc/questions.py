@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 QUERY_S: Final = 2.0
 """Longest wait for an answer; a caller's own deadline may be shorter."""
 
+NOBODY: Final = "no tracking service answers"
+
 T = TypeVar("T", bound=schemas.Message)
 
 
@@ -91,12 +93,12 @@ async def _asked(call: Call, key: str, message: schemas.Message | None, kind: ty
         if answer.good:
             return schemas.decode(answer.payload, kind, encoding=answer.encoding)
     if not answers:
-        raise EndCall(grpc.StatusCode.UNAVAILABLE, "no tracking service answers")
+        raise EndCall(grpc.StatusCode.UNAVAILABLE, NOBODY)
     problem = schemas.decode(answers[0].payload, schemas.Problem, encoding=answers[0].encoding)
-    raise _refusal(problem)
+    raise refusal(problem)
 
 
-def _refusal(problem: schemas.Problem) -> EndCall:
+def refusal(problem: schemas.Problem) -> EndCall:
     """Return the end of a call that a service refused."""
     code: Any = problem.code if problem.code in schemas.CODES else "invalid_value"
     error = schemas.MessageError(code, problem.path, problem.expected, problem.received)
