@@ -48,12 +48,20 @@ def fitting(density: Density, classes: int) -> bool:
     misses, objects, pi = density.misses, density.bernoulli, density.class_probability
     if pi is not None and not (isinstance(pi, np.ndarray) and pi.shape == (len(objects.label), classes)):
         return False
+    columns = columns_of_rows(objects), columns_of_rows(density.poisson)
     try:
-        return bool(columns_fit(columns_of_rows(objects), columns_of_rows(density.poisson), classes)) and (
-            misses is None or misses.missed_from_ns.shape == misses.looked_ns.shape == objects.label.shape
+        return (
+            only_arrays(*columns)
+            and bool(columns_fit(*columns, classes))
+            and (misses is None or misses.missed_from_ns.shape == misses.looked_ns.shape == objects.label.shape)
         )
-    except (AttributeError, TypeError, NumbaError, NumbaWarning):  # it warns of lists
+    except (AttributeError, TypeError, NumbaError, NumbaWarning):
         return False
+
+
+def only_arrays(objects: Columns, components: Columns) -> bool:
+    """Tell whether all columns are arrays: a kernel would first be compiled for seconds for a list."""
+    return set(map(type, objects + components)) == {np.ndarray}
 
 
 @kernel

@@ -8,7 +8,7 @@ import numpy as np
 from numba.core.errors import NumbaError, NumbaWarning
 
 from optipmb.class_posterior import predict_classes
-from optipmb.columns import check_fitting, columns_fit
+from optipmb.columns import check_fitting, columns_fit, only_arrays
 from optipmb.compiled import kernel
 from optipmb.density import (
     NO_FRAME,
@@ -64,16 +64,17 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     bernoulli, poisson, misses = density.bernoulli, density.poisson, density.misses
     before_ns = density.stamp_ns
     dt = 0.0 if before_ns == NO_FRAME else (stamp_ns - before_ns) * 1e-9
-    if dt == 0.0 or misses is not None or len(table.confusion):
+    given, undetected = columns_of_rows(bernoulli), columns_of_rows(poisson)
+    if dt == 0.0 or misses is not None or len(table.confusion) or not only_arrays(given, undetected):
         check_fitting(density, density.labels)
     if dt == 0.0:
         pi = predict_classes(density, None, dt, table)
         return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses, pi), 0
     try:
         objects, components = predict_density(
-            columns_of_rows(bernoulli),
+            given,
             density.missed_from_ns,
-            columns_of_rows(poisson),
+            undetected,
             dt,
             before_ns,
             stamp_ns,

@@ -173,9 +173,7 @@ def sort_canonically(order: Index, score: Array, center: Array, size: Array, yaw
 
 
 @kernel
-def non_maximum_suppression(
-    boxes: Array, label: Index, classes: Sequence[ClassRow], most: int = UNLIMITED
-) -> NDArray[np.bool_]:
+def non_maximum_suppression(boxes: Array, label: Index, classes: Sequence[ClassRow], most: int) -> NDArray[np.bool_]:
     """Keep each box unless a kept box of its group before it overlaps it by more than the threshold of its class.
 
     Args:

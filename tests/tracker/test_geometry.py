@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import optipmb
+from optipmb.effort import UNLIMITED
 from optipmb.geometry import intersection_area
 from optipmb.preprocess import non_maximum_suppression
 
@@ -108,7 +109,7 @@ def test_suppression_is_the_greedy_one_per_group(seed: int, *, mixed: bool, grou
         rivals = [k for k in wanted if group[label[k]] == group[label[i]]]
         if all(textbook.iou(boxes[i], boxes[k]) <= thresholds[label[i]] for k in rivals):
             wanted.append(i)
-    found = non_maximum_suppression(boxes, label, class_rows(3, nms_iou=thresholds, group=group))
+    found = non_maximum_suppression(boxes, label, class_rows(3, nms_iou=thresholds, group=group), UNLIMITED)
     np.testing.assert_array_equal(np.flatnonzero(found), wanted)
     assert 0 < len(wanted) < 60
 
@@ -117,14 +118,14 @@ def test_nothing_to_suppress() -> None:
     """No boxes, no result; one box stays."""
     one = np.array([[0.0, 0, 4, 2, 0]])
     label, classes = np.zeros(1, np.int64), class_rows(1, nms_iou=0.1)
-    assert non_maximum_suppression(one[:0], label[:0], classes).shape == (0,)
-    np.testing.assert_array_equal(non_maximum_suppression(one, label, classes), [True])
+    assert non_maximum_suppression(one[:0], label[:0], classes, UNLIMITED).shape == (0,)
+    np.testing.assert_array_equal(non_maximum_suppression(one, label, classes, UNLIMITED), [True])
 
 
 def test_what_was_suppressed_suppresses_nothing() -> None:
     """A chain of boxes, each overlapping the next: the first and the third stay."""
     boxes = np.array([[0.0, 0, 4, 2, 0], [2.5, 0, 4, 2, 0], [5.0, 0, 4, 2, 0]])
-    keep = non_maximum_suppression(boxes, np.zeros(3, np.int64), class_rows(1, nms_iou=0.1))
+    keep = non_maximum_suppression(boxes, np.zeros(3, np.int64), class_rows(1, nms_iou=0.1), UNLIMITED)
     np.testing.assert_array_equal(keep, [True, False, True])
 
 

@@ -173,7 +173,7 @@ def test_first_detections_hold_over_all_magnitudes(log_e: list[float]) -> None:
 
 def hypotheses(cost: Array, first: Array) -> Hypotheses:
     """The hypotheses of a cost matrix (N, M), infinite where the gate is closed."""
-    row, measurement = np.nonzero(np.isfinite(cost))
+    row, measurement = (np.ascontiguousarray(one) for one in np.nonzero(np.isfinite(cost)))  # as kernels know them
     kind = np.full(first.size, CLUTTER)
     return Hypotheses(
         row,

@@ -12,6 +12,7 @@ from class_rows import class_rows
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from read_only import read_only
 
 from optipmb.association import UNASSIGNED
 from optipmb.birth import birth_states, first_detected_states, moment_match
@@ -92,7 +93,7 @@ def test_the_canonical_order_is_a_lexicographic_one(seed: int, count: int, kinds
     center, size = rng.integers(0, kinds, (count, 3)) - 0.5, rng.integers(0, kinds, (count, 3)) + 0.5
     source = rng.permutation(count)
     order = rng.permutation(count)
-    sort_canonically(order, score, center, size, yaw, source)
+    sort_canonically(order, *read_only(score, center, size, yaw, source))
     keys = (source, yaw, size[:, 2], size[:, 1], size[:, 0], center[:, 2], center[:, 1], center[:, 0], -score)
     np.testing.assert_array_equal(order, np.lexsort(keys))
 
@@ -105,7 +106,7 @@ def test_only_scores_from_the_filter_on_are_chosen(seed: int) -> None:
     center = np.column_stack([np.arange(40) * 100.0, np.zeros((40, 2))])
     thresholds = np.array([0.3, 0.5])
     classes = class_rows(2, score_filter=thresholds, nms_iou=0.1, group=[0, 1])
-    given = center, np.ones((40, 3)), np.zeros(40), np.zeros((40, 2)), score, label, np.arange(40)
+    given = read_only(center, np.ones((40, 3)), np.zeros(40), np.zeros((40, 2)), score, label, np.arange(40))
     above, chosen, columns = select(*given, 2, classes, 10**6)
     wanted = np.flatnonzero(score >= thresholds[label])
     assert above == wanted.size

@@ -16,6 +16,7 @@ from scenes import boxes
 import optipmb
 from optipmb.columns import columns_fit, fitting
 from optipmb.density import columns_of_rows
+from optipmb.warm import compilations
 
 KITTI, NUSCENES = optipmb.load_profile("kitti"), optipmb.load_profile("nuscenes")
 HERE = Path(__file__).parent
@@ -46,9 +47,11 @@ def test_a_density_of_other_classes_is_refused() -> None:
 
 @pytest.mark.parametrize("part", ["bernoulli", "poisson"])
 def test_a_density_whose_columns_do_not_fit_is_refused(part: str) -> None:
-    """Every column of another length, a label that is none, a wrong shape: each is named."""
+    """Every column of another length, a label that is none, a list: each is named, and no kernel compiled for it."""
     density = settled()
     rows = getattr(density, part)
+    optipmb.warm_up()
+    before = compilations()
     for name, column in rows.columns():
         broken = [np.concatenate([column, column]), column[:0], column.tolist()]
         if name == "label":
@@ -57,6 +60,7 @@ def test_a_density_whose_columns_do_not_fit_is_refused(part: str) -> None:
             changed = replace(density, **{part: replace(rows, **{name: values})})
             with pytest.raises(optipmb.DensityError, match=part):
                 optipmb.Tracker(KITTI).step(changed, boxes(KITTI, 0.1, (0, 0)))
+    assert compilations() == before
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -11,6 +11,7 @@ from class_rows import class_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from read_only import read_only
 
 from optipmb.calibration import SURE, calibrate_rows, log_odds
 from optipmb.class_posterior import UNGROUPED
@@ -203,7 +204,7 @@ def test_measurements_are_the_chosen_rows(seed: int) -> None:
         rng.permutation(40)[:20],
     )
     chosen = rng.permutation(20)[:12]
-    out = gather(chosen, center, size, yaw, velocity, score, label, source, 2)
+    out = gather(chosen, *read_only(center, size, yaw, velocity, score, label, source), 2)
     wanted = center[:, :2], yaw, velocity, np.column_stack([size, center[:, 2]]), score, label, source
     for found, column in zip(out, wanted, strict=True):
         np.testing.assert_array_equal(found, column[chosen])
