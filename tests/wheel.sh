@@ -11,8 +11,8 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT INT TERM
 
 "$bin/python" -m build --wheel --outdir "$work/dist" "$root" >"$work/build.log" 2>&1 || { cat "$work/build.log"; exit 1; }
-"$python" -m venv "$work/venv"
-"$work/venv/bin/python" -m pip install --quiet --no-compile --disable-pip-version-check \
+"$python" -m venv --without-pip "$work/venv"
+"$bin/python" -m pip --python "$work/venv/bin/python" install --quiet --no-compile --disable-pip-version-check \
   --constraint "$root/requirements.lock" "$(echo "$work"/dist/optipmb-*.whl)[service]"
 
 # Machine code is kept by the digest of the package's sources. These are the same, so what was compiled from the source
@@ -43,5 +43,5 @@ PYTHON
 "$work/venv/bin/optipmb-service" --help >/dev/null
 "$work/venv/bin/optipmb" track --dataset scene --option frames=5 --out "$work/out" >/dev/null
 test -s "$work/out/0000.txt"
-"$work/venv/bin/python" -m pip check --disable-pip-version-check
+"$bin/python" -m pip --python "$work/venv/bin/python" check --disable-pip-version-check
 echo "the wheel $(basename "$work"/dist/optipmb-*.whl) works by itself"
