@@ -264,6 +264,11 @@ class ClassParameters(_Table):
         description="true: a detection from eta_score on is born unless a Poisson component explains it better than "
         "clutter; false: any component in its gate forbids the birth (the paper)",
     )
+    birth_overlap: Probability = Field(
+        default=1.0,
+        description="overlap with the predicted box of a missed object from which a detection starts no second track "
+        "(`optipmb.births_beside`); 1: it always may (the paper)",
+    )
     ground_clearance: NonNegative = Field(
         default=0.0,
         description="points so far above the bottom of a box, m, are of the ground and do not count in PTS; the "

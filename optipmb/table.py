@@ -68,6 +68,7 @@ class ClassRow(Protocol):
     ground_clearance: float
     birth_score: float
     birth_over_clutter: bool
+    birth_overlap: float
     birth_heading_speed: float
     adaptive_birth_rate: float
     poisson_steps: int

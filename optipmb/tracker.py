@@ -9,6 +9,7 @@ import numpy as np
 
 from optipmb.association import associate
 from optipmb.birth import first_detected_states
+from optipmb.births_beside import forbid_births
 from optipmb.class_posterior import UNGROUPED, update_classes
 from optipmb.compiled import kernel
 from optipmb.density import (
@@ -108,6 +109,7 @@ def update(
     # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
     row, measurement, cost = hypotheses.row, hypotheses.measurement, hypotheses.detection_cost
     assigned = associate(row, measurement, cost, hypotheses.first_cost, p_d.shape[0])
+    forbid_births(objects, assigned, hypotheses, z, missed_from_ns, stamp_ns, period, classes)
     kept = surviving_objects(objects, p_d, assigned, hypotheses, z.label, missed_from_ns, stamp_ns, period, classes)
 
     # Motion states: detected and missed objects by the UKF, then the births of first-time detections
@@ -200,6 +202,7 @@ class Tracker:
             │ update
             │     local_hypotheses        eq. Misdetect, Detection, First-Time Detection Hypothesis Update; HABM
             │     associate               shortest augmenting paths
+            │     forbid_births           no second track on a missed object
             │     surviving_objects       r, misses
             │     ukf_updates             eq. UKF Update, for the pairs of the best global hypothesis
             │     first_detected_states   eq. Newborn Hypothesis, First-Time Detection Hypothesis Update 1

@@ -125,6 +125,7 @@ class Oracle:
         p_a = [self._association_probability(z) for z in measurements]
         new = [self._first_detection(z, gates[m], p_du, p_a[m]) for m, z in enumerate(measurements)]
         chosen = self._associate(measurements, p_d, new)
+        self._forbid_births(measurements, chosen, new, now)
         newborn = self._newborn_poisson(measurements, new, p_a, now)
         self._update_bernoulli(measurements, chosen, p_d, now, since)
         self._append_new(measurements, new, set(chosen.values()), now)
@@ -283,6 +284,17 @@ class Oracle:
         rows, columns = linear_sum_assignment(W)
         return {int(i): int(m) for m, i in zip(rows, columns, strict=True) if i < n}
 
+    def _forbid_births(self, zs: list[Measurement], chosen: dict[int, int], new: list[NewObject], now: int) -> None:
+        """No second track on the predicted box of a track that is missed, and was not the frame before."""
+        for i, b in enumerate(self.bernoulli):
+            c = self.classes[b.label]
+            if c.birth_overlap < 1 and b.extracted and i not in chosen and periods(b.seen_ns, now, self.nominal) <= 1:
+                box = np.array([*b.mean[:2], *b.auxiliary[:2], b.mean[3]])
+                for m, z in enumerate(zs):
+                    other = np.array([*z.xy, *z.auxiliary[:2], z.yaw])
+                    if self._in_gate(b, z) and iou(box, other) > c.birth_overlap:
+                        new[m] = NewObject(new[m].w, 0.0, low=True)
+
     def _update_bernoulli(
         self, zs: list[Measurement], chosen: dict[int, int], p_d: list[float], now: int, since: float
     ) -> None:
@@ -335,7 +347,7 @@ class Oracle:
         newborn = []
         for z, h, probability in zip(zs, new, p_a, strict=True):
             weight = self.classes[z.label].adaptive_birth_rate * (1 - probability)
-            if h.low and weight > 0:
+            if self.modules.habm and h.low and weight > 0:
                 newborn.append(Poisson(*birth(z, self.classes[z.label]), weight, z.label, z.auxiliary.copy(), now))
         return newborn
 

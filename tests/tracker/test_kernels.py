@@ -16,10 +16,11 @@ from read_only import read_only
 
 from optipmb.association import UNASSIGNED
 from optipmb.birth import birth_states, first_detected_states, moment_match
+from optipmb.births_beside import forbid_births
 from optipmb.calibration import SURE, calibrate_rows
 from optipmb.density import BernoulliArrays, Bernoullis, PoissonArrays, Poissons, columns_of_rows, whole_periods
 from optipmb.extract import extract_tracks, select_tracks
-from optipmb.geometry import box_iou, iou_exceeds
+from optipmb.geometry import bev_iou, box_iou, iou_exceeds
 from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN, Hypotheses
 from optipmb.lightweight import light_weight_filter
 from optipmb.motion import predict_state
@@ -216,6 +217,34 @@ def test_objects_survive_by_existence_and_misses(seed: int) -> None:
     np.testing.assert_array_equal(measurement, [*assigned[alive], *np.flatnonzero(free)])
     np.testing.assert_array_equal(existence, [*posterior[alive], *first[free]])
     assert (known, hits) == (alive.sum(), detected.sum())
+
+
+@SEEDS
+def test_births_are_forbidden_as_set_logic_says(seed: int) -> None:
+    """A first-time detection is clutter if its box overlaps that of a gated, extracted, newly missed object enough."""
+    rng = np.random.default_rng(seed)
+    n, m = 25, 20
+    label, extracted, seen = rng.integers(0, 2, n), rng.random(n) < 0.7, NOW - rng.integers(0, 5, n) * 50_000_000
+    mean, auxiliary = rng.normal(0, 2, (n, 6)), rng.uniform(1, 5, (n, 4))
+    assigned = np.where(rng.random(n) < 0.4, rng.integers(0, m, n), UNASSIGNED)
+    z = random_measurements(rng, m)
+    row, measurement = np.nonzero(rng.random((n, m)) < 0.5)
+    kind, first = rng.choice([FROM_POISSON, CLUTTER, NEWBORN], m), rng.uniform(0.1, 1, m)
+    objects = objects_of(label=label, extracted=extracted, mean=mean, auxiliary=auxiliary)
+    limit = np.array([0.1, 1.0])
+    overlap = bev_iou(
+        np.column_stack([mean[:, :2], auxiliary[:, :2], mean[:, 3]]),
+        np.column_stack([z.position, z.auxiliary[:, :2], z.yaw]),
+    )
+    active = (assigned == UNASSIGNED) & extracted & (periods(seen) <= 1)
+    taken = active[row] & (overlap[row, measurement] > limit[label[row]])
+    forbidden = np.isin(np.arange(m), measurement[taken])
+    assert 0 < forbidden.sum() < m
+    hypotheses = hypotheses_of(row=row, measurement=measurement, first_kind=kind.copy(), first_existence=first.copy())
+    forbid_births(objects, assigned, hypotheses, z, seen, NOW, PERIOD, class_rows(2, birth_overlap=limit))
+    np.testing.assert_array_equal(hypotheses.first_kind, np.where(forbidden, CLUTTER, kind))
+    forgotten = forbidden & (kind != CLUTTER)
+    np.testing.assert_array_equal(hypotheses.first_existence, np.where(forgotten, 0.0, first))
 
 
 @SEEDS

@@ -30,6 +30,7 @@ TWINS = {
     "association.associate": "test_hypotheses.test_the_total_is_that_of_the_hungarian_algorithm",
     "birth.birth_states": "test_update.test_a_birth_is_the_textbook_birth",
     "birth.first_detected_states": "test_kernels.test_announced_objects_are_matched_mixtures",
+    "births_beside.forbid_births": "test_kernels.test_births_are_forbidden_as_set_logic_says",
     "calibration.calibrate_rows": "test_twins.test_rows_are_calibrated_as_numpy_interpolates",
     "calibration.log_odds": "test_twins.test_log_odds_are_bounded",
     "class_posterior.label_probability": "test_class_posterior.test_pairs_weigh_by_what_the_detector_calls_them",
