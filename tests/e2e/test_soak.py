@@ -53,7 +53,7 @@ class Sample:
         )
 
 
-@pytest.mark.timeout(SECONDS + 300)
+@pytest.mark.timeout(SECONDS + 900)  # with the compilation on a busy machine
 def test_nothing_grows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Nothing grows or is lost: memory within 5 %, queues below a second, every frame tracked, each message counted.
 
