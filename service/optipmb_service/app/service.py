@@ -120,7 +120,7 @@ class Service:
             missed=self._missed,
             arm=arm,
             metrics=self._metrics,
-            tracker=tracker or partial(optipmb.Tracker, max_pairs=settings.max_pairs),
+            tracker=tracker or profiles.trackers(partial(optipmb.Tracker, max_pairs=settings.max_pairs)),
         )
         self._intake = Intake(
             self._registry,

@@ -11,6 +11,7 @@ that neither the clocks of machines nor those of sensors are compared with each 
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
@@ -40,6 +41,9 @@ NEAR_S: Final = 2.0
 
 BATCH: Final = 128
 BATCH_BYTES: Final = 2**21
+MISSING_S: Final = 0.1
+"""How long a log that is not there is not looked for again: without one, every new session would ask for it."""
+
 NO_LOG: Final = 10059
 TOO_LARGE: Final = 10054
 ID: Final = "Nats-Msg-Id"
@@ -121,6 +125,7 @@ class MessageLog:
         self._names = {topic: f"OPTIPMB-{topic.upper()}_{token(prefix)}" for topic in ("detections", "tracks")}
         self.connection = NatsConnection(servers, self.look_again, access)
         self._there: set[str] = set()
+        self._missing_until: dict[Topic, float] = {}
 
     def look_again(self) -> None:
         """Have `ready` ask the servers again: they may have come back without their files."""
@@ -242,9 +247,12 @@ class MessageLog:
         return next(iter(await self._found(topic, request)), None)
 
     async def _found(self, topic: Topic, request: Mapping[str, object]) -> list[_Found]:
+        if time.monotonic() < self._missing_until.get(topic, 0.0):
+            return []
         try:
             messages = await self.connection.read(self._names[topic], request)
         except NobodyAnswersError:  # nobody has put anything into such a log
+            self._missing_until[topic] = time.monotonic() + MISSING_S
             return []
         return [_found(topic, one) for one in messages]
 

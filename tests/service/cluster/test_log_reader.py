@@ -136,3 +136,27 @@ def test_what_was_closed_does_not_come_back(filled: MessageLog) -> None:
         frames.fetch("a/b/fused", checkpoint, take, lambda _: None)
         assert came.wait(60.0)
     assert [len(one) for one in found] == [FRAMES, 0]
+
+
+def test_a_log_that_is_not_there_is_asked_for_once_in_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand sessions that begin without a log cost the servers one question, and find the log when it is made."""
+    monkeypatch.setattr("optipmb_service.cluster.message_log.MISSING_S", 3600.0)
+    with NatsProcess(tmp_path) as nats:
+        one = MessageLog([nats.url], "optipmb/v1")
+        asking = AsyncMock(wraps=one.connection.read)
+        monkeypatch.setattr(one.connection, "read", asking)
+
+        async def look() -> list[object]:
+            return [await one.since("detections", f"a/b/{number}", lambda _: False) for number in range(1000)]
+
+        async def put() -> None:
+            await one.ready("detections", Retention(600, 2**24))
+            await one.put(LogMessage("detections", STREAM, EPOCH, 0, 0, "", (0, 0), b"1", ""))
+
+        until(lambda: not one.connection.failure, "it is connected")
+        assert one.connection.call(look(), 60.0) == [None] * 1000
+        assert asking.await_count == 1
+        one.connection.call(put(), 60.0)
+        one._missing_until.clear()  # the time has passed
+        assert one.connection.call(one.since("detections", STREAM, lambda _: False), 60.0) is not None
+        one.connection.close(10.0)

@@ -325,3 +325,14 @@ def test_every_setting_is_described() -> None:
     """No setting without a word on what it does."""
     for model in (Settings, LimitSettings):
         assert all(field.description for field in model.model_fields.values())
+
+
+def test_streams_of_a_profile_share_a_tracker() -> None:
+    """A tracker keeps nothing of a stream: those of one profile have the same, other parameters have their own."""
+    profiles = Profiles.read("kitti", {})
+    tracker = profiles.trackers(optipmb.Tracker)
+    known = profiles.of("a/b/c")
+    equal, other = known.model_copy(deep=True), known.model_copy(update={"nominal_period": 0.5})
+    assert tracker(known) is tracker(equal)
+    assert tracker(other) is not tracker(known)
+    assert tracker(other).parameters.nominal_period == 0.5
