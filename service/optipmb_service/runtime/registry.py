@@ -331,18 +331,25 @@ class Registry:
     def take_up(self, session: str, packets: list[tuple[Packet, bool]]) -> None:
         """Go on with a session that has come here: with what others received of it, then with what was kept here."""
         with self._foreign_lock:
-            buffer = self._foreign.get(session)
-            self._newcomers.pop(session, None)
-            if buffer is None:
+            self._offer_kept(session, packets)
+
+    def _offer_kept(self, session: str, packets: list[tuple[Packet, bool]]) -> None:
+        """Do so, called with the lock of what is kept; without a buffer it has been taken up before."""
+        buffer = self._foreign.get(session)
+        self._newcomers.pop(session, None)
+        if buffer is None:
+            if not packets:
                 return
-            if not self._member.holds(session):  # it has gone again
-                for packet, frame in packets:
-                    buffer.add(packet, frame=frame)
-                return
-            known = {(packet.key, packet.payload) for packet, _ in packets}
-            packets = packets + [one for one in buffer.take() if (one[0].key, one[0].payload) not in known]
-            self._offer(session, partial(_take_up, packets=packets, answered=buffer.answered.copy()), limited=False)
-            del self._foreign[session]  # from now on readers hand over newer ones
+            buffer = self._foreign[session] = self._context.buffer()
+            buffer.seen_ns = time.monotonic_ns()
+        if not self._member.holds(session):  # it has gone again
+            for packet, frame in packets:
+                buffer.add(packet, frame=frame)
+            return
+        known = {(packet.key, packet.payload) for packet, _ in packets}
+        packets = packets + [one for one in buffer.take() if (one[0].key, one[0].payload) not in known]
+        self._offer(session, partial(_take_up, packets=packets, answered=buffer.answered.copy()), limited=False)
+        del self._foreign[session]  # from now on readers hand over newer ones
 
     def tracked(self, session: str) -> bool:
         """Whether a session is there, here or elsewhere: something valid has come of it."""
@@ -537,9 +544,10 @@ class Registry:
                 if self._crowded():
                     return
             with self._foreign_lock:
+                # At once: a session that the intake holds meanwhile it takes up itself, with what others received.
                 session = next(iter(self._newcomers), None)
-            if session is not None:
-                self.take_up(session, [])
+                if session is not None:
+                    self._offer_kept(session, [])
 
     def _discard(self, actor: Actor) -> None:
         with self._lock:

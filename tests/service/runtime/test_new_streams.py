@@ -17,7 +17,7 @@ from optipmb_service.runtime.intake import NEW_STREAMS, Intake
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.registry import Registry
 from optipmb_service.runtime.takeover_buffer import UNASKED_NS, TakeoverBuffer
-from optipmb_service.session.values import SECOND
+from optipmb_service.session.values import SECOND, MessageCounters
 from router import until
 
 if TYPE_CHECKING:
@@ -207,3 +207,76 @@ def test_the_first_frame_of_a_new_stream_is_kept_until_it_is_asked_for(new: bool
     assert len(registry.recent([stream])) == new
     buffer.trim(keep_ns + 1)
     assert not buffer
+
+
+class Kept:
+    """The registry of a member, with what it keeps, and the quotas and counters that this concerns."""
+
+    def __init__(self, standby: int = 1 << 20, keep_ns: int = 10 * SECOND) -> None:
+        registry: Any = Registry.__new__(Registry)
+        budget = ByteBudget(standby)
+        self.registry, self.crowded, self.holds = registry, True, True
+        self.metrics: Counter[str] = Counter()
+        self.problems: list[str] = []
+        self.offered: list[list[Packet]] = []
+        registry._lock, registry._foreign_lock, registry._foreign = threading.Lock(), threading.Lock(), {}
+        registry._actors, registry._newcomers, registry._past = {}, {}, MessageCounters()
+        registry._member = SimpleNamespace(holds=lambda _: self.holds, strained=False)
+        registry._context = SimpleNamespace(buffer=lambda: TakeoverBuffer(keep_ns, budget))
+        registry._settings = SimpleNamespace(idle_s=3600.0)
+        registry._crowded = lambda: self.crowded
+        registry._offer = self._offer
+        registry._over_quota = lambda *_, **__: False
+        registry._report = lambda code, *_: self.problems.append(code)
+        registry._metrics = SimpleNamespace(
+            received=lambda topic, _: self.metrics.update([f"received {topic}"]),
+            foreign=lambda topic, _: self.metrics.update([f"foreign {topic}"]),
+        )
+        registry.parsed = lambda key: (key, key)
+
+    def _offer(self, _: str, offer: Any, *, limited: bool = True) -> bool:
+        if limited and self.crowded:
+            return False
+        self.offered.append([packet for packet, _ in offer.keywords["packets"]])
+        return True
+
+
+def detections(number: int, size: int = 10) -> Packet:
+    """Return a packet of a stream, its own by the number."""
+    return Packet(STREAMS[0], bytes([number]) * size, size, "", number, time.monotonic_ns())
+
+
+def test_what_others_received_reaches_a_stream_that_was_let_in() -> None:
+    """A stream that is let in while others are asked for what they received of it gets that as well."""
+    kept = Kept()
+    kept.registry.frame(detections(0))
+    kept.crowded = False
+    kept.registry._let_in()
+    found = [(detections(1), True), (detections(2), True)]
+    kept.registry.take_up(STREAMS[0], found)
+    assert [packet.wall_ns for offered in kept.offered for packet in offered] == [0, 1, 2]
+
+
+def test_a_stream_that_the_intake_holds_is_not_let_in() -> None:
+    """A stream that the intake holds while room is made stays held until the intake has asked the others."""
+    kept = Kept()
+    kept.registry.frame(detections(0))
+    kept.crowded = False
+    free = kept.registry._foreign_lock
+
+    class Held:
+        """The lock: the intake holds the stream as soon as it has been let go."""
+
+        def __enter__(self) -> None:
+            free.acquire()
+
+        def __exit__(self, *_: object) -> None:
+            free.release()
+            kept.registry._foreign_lock = free
+            kept.registry.hold(STREAMS[0])
+
+    kept.registry._foreign_lock = Held()
+    kept.registry._let_in()
+    kept.registry.take_up(STREAMS[0], [(detections(1), True)])
+    assert [packet.wall_ns for offered in kept.offered for packet in offered] == [0, 1]
+    assert not kept.registry._foreign
