@@ -12,6 +12,7 @@ It takes Zenoh's samples and imports no Zenoh.
 
 import threading
 from collections.abc import Callable, Container
+from dataclasses import dataclass
 from typing import Final, Generic, Protocol, TypeVar
 
 __all__ = ["ANSWER_S", "LateJoin"]
@@ -60,6 +61,15 @@ _S = TypeVar("_S", bound=_Sample)
 _Source = tuple[str, int]
 
 
+@dataclass(frozen=True)
+class _Gap(Generic[_S]):
+    """Numbers that are missing, first to last, and the samples that wait behind them."""
+
+    first: int
+    last: int
+    behind: list[_S]
+
+
 class LateJoin(Generic[_S]):
     """Hands over the samples of one subscription, those of a publisher in order, from the oldest in its cache on.
 
@@ -105,14 +115,14 @@ class LateJoin(Generic[_S]):
                 self._due[source] = 0
             waiting = self._sources[source]
             if waiting is None:
-                missing = self._follow(source, [sample])
+                gap = self._follow(source, [sample])
             else:
-                missing = None
+                gap = None
                 waiting.append(sample)
                 self._waiting_bytes += len(sample.payload)
-                if len(waiting) >= MAX_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
-                    self._release(source)
-        self._ask_for(source, str(sample.key_expr), missing)
+            if len(waiting or ()) >= MAX_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
+                self._release(source)
+        self._ask_for(source, str(sample.key_expr), gap)
 
     def keep(self, keys: Container[str]) -> None:
         """Forget the publishers of all other keys: when they are heard again, their caches are asked once more."""
@@ -141,14 +151,14 @@ class LateJoin(Generic[_S]):
     def _forget(self, source: _Source) -> None:
         del self._sources[source], self._keys[source], self._due[source]
 
-    def _follow(self, source: _Source, samples: list[_S]) -> tuple[int, int] | None:
-        """Hand over samples of a publisher up to a gap, behind which they wait; return the first and last missing."""
+    def _follow(self, source: _Source, samples: list[_S]) -> "_Gap[_S] | None":
+        """Hand over samples of a publisher up to a gap, behind which they wait; return the gap."""
         for index, sample in enumerate(samples):
             due, number = self._due[source], self._number(sample)
             if number > due:
-                self._sources[source] = samples[index:]
-                self._waiting_bytes += sum(len(one.payload) for one in samples[index:])
-                return due, number - 1
+                behind = self._sources[source] = samples[index:]
+                self._waiting_bytes += sum(len(one.payload) for one in behind)
+                return _Gap(due, number - 1, behind)
             self._hand_over(source, sample)
         return None
 
@@ -162,29 +172,30 @@ class LateJoin(Generic[_S]):
         info = sample.source_info
         return 0 if info is None else info.source_sn
 
-    def _ask_for(self, source: _Source, key: str, missing: tuple[int, int] | None) -> None:
-        """Ask the cache for what is missing, first to last; what it no longer has is not waited for any longer."""
-        if missing is None:
+    def _ask_for(self, source: _Source, key: str, gap: "_Gap[_S] | None") -> None:
+        """Ask the cache for what is missing; what it no longer has is not waited for any longer."""
+        if gap is None:
             return
         early: list[_S] = []
-        (zid, eid), (first, last) = source, missing
-        selector = f"{key}/@adv/pub/{zid}/{eid}/**?_sn={first}..{last}"
-        self._ask(selector, early.append, lambda: self._answered(source, key, early))
+        zid, eid = source
+        selector = f"{key}/@adv/pub/{zid}/{eid}/**?_sn={gap.first}..{gap.last}"
+        self._ask(selector, early.append, lambda: self._answered(source, key, gap, early))
 
-    def _answered(self, source: _Source, key: str, early: list[_S]) -> None:
-        missing = None
+    def _answered(self, source: _Source, key: str, gap: "_Gap[_S]", early: list[_S]) -> None:
+        further = None
         with self._lock:
             if self._closed:
                 return
             for sample in sorted((one for one in early if one.source_info is not None), key=self._number):
                 self._hand_over(source, sample)
-            waiting = self._taken(source)
-            if waiting:
+            waits = self._sources.get(source)
+            if waits is gap.behind:
+                waiting = self._taken(source)
                 self._hand_over(source, waiting[0])
-                missing = self._follow(source, waiting[1:])
-            if missing is None:
+                further = self._follow(source, waiting[1:])
+            if further is None and (waits is gap.behind or waits is None):  # else a later gap is still asked for
                 self._told(key)
-        self._ask_for(source, key, missing)
+        self._ask_for(source, key, further)
 
     def _taken(self, source: _Source) -> list[_S]:
         """Take what waits of a publisher; nothing waits any longer."""

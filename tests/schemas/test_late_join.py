@@ -161,3 +161,14 @@ def test_bytes_that_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert one.received == [3, 4, 5]
     one.take(11, source=other)
     assert one.received == [3, 4, 5, 8, 9, 10, 11]
+
+
+def test_an_answer_lets_go_what_waits_behind_its_own_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """When too much waited for one answer, what waits for a later one goes on waiting for it."""
+    monkeypatch.setattr(optipmb_schemas.late_join, "MAX_WAITING", 3)
+    one = Joined()
+    one.take(0, 2, 3, 4, 7)
+    one.answer(1)
+    assert one.received == [0, 2, 3, 4, 1]
+    one.answer(5, 6)
+    assert one.received == [0, 2, 3, 4, 1, 5, 6, 7, "a/b"]

@@ -59,6 +59,9 @@ log = structlog.get_logger("optipmb_service")
 HOUSEKEEPING_S: Final = 0.5
 DRAIN_POLL_S: Final = 0.01
 JOIN_S: Final = 0.3
+SAVE_S: Final = 0.5
+"""The last checkpoints have so long even where the readers took all the time."""
+
 LEASES_S: Final = 1.0
 """What is left at the end to say that the leases are free, however long the checkpoints take."""
 
@@ -181,7 +184,7 @@ class Service:
         ended = self._scheduler.close(JOIN_S)
         if ended:
             self._registry.keep_now()
-        self._persistence.close(max(0.0, ends.left() - LEASES_S))
+        self._persistence.close(max(SAVE_S, ends.left() - LEASES_S))
         self._member.close(ends.left())
         self._missed.close(JOIN_S)
         self._reporter.flush(time.monotonic_ns())

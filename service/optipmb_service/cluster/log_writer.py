@@ -65,6 +65,7 @@ class LogWriter:
         """Bytes that wait, nearly."""
         self._at_once = AT_ONCE
         self._tries = 0
+        self._tried: LogMessage | None = None
         self._failure = "the log was not reached yet"
         self.written = 0
         """Messages that are in the log by this writer."""
@@ -170,7 +171,9 @@ class LogWriter:
                 self.repeated += not result
         if failed:
             self._log.look_again()
-            self._tries = self._tries + 1 if len(batch) == 1 else 0
+            alone = batch[0] if len(batch) == 1 else None
+            self._tries = 0 if alone is None else 1 if alone is not self._tried else self._tries + 1
+            self._tried = alone
             self._at_once = 1
         else:
             self._tries = 0

@@ -38,6 +38,11 @@ QUEUED_NS: Final = 120 * SECOND
 """How long after its last message a stream waits for its turns: as long as first frames are kept."""
 
 
+def node_of(stream: str) -> str:
+    """Return the node of a stream, `site/node`."""
+    return stream.rpartition("/")[0]
+
+
 @dataclass(slots=True)
 class _Known:
     tokens: set[str] = field(default_factory=set)
@@ -71,6 +76,8 @@ class StreamDirectory:
         self._queued: dict[str, int] = {}
         self._lock = threading.Lock()
         self._streams: dict[str, _Known] = {}
+        self._nodes: dict[str, dict[str, None]] = {}
+        """The streams of each node, in the order in which they came."""
         self._awaited: dict[str, int] = {}
 
     def published(self, stream: str, token: str, now_ns: int, *, present: bool) -> bool:
@@ -138,7 +145,7 @@ class StreamDirectory:
                     known.announced = False
                     self._settled(known, now_ns)
                 if known.left_ns is not None and now_ns - known.left_ns > FORGET_NS:
-                    del self._streams[stream]
+                    self._forget(stream)
             self._awaited = {one: since for one, since in self._awaited.items() if now_ns - since < self._idle_ns}
         self.admit(now_ns)
 
@@ -147,16 +154,20 @@ class StreamDirectory:
         with self._lock:
             return {stream: bool(known.tokens) for stream, known in self._streams.items()}
 
-    def awaited(self, belongs: Callable[[str], bool], sensors: Iterable[str], now_ns: int) -> dict[str, bool]:
+    def awaited(
+        self, node: str, belongs: Callable[[str], bool], sensors: Iterable[str], now_ns: int
+    ) -> dict[str, bool]:
         """Return the streams whose caches may hold something: True where a publisher is there, False: it may come back.
 
         Args:
-            belongs: whether a stream is among those that are asked about.
+            node: `site/node`.
+            belongs: whether a stream of the node is among those that are asked about.
             sensors: those of them that were there before.
             now_ns: monotonic time.
         """
         with self._lock:
-            found = {stream: True for stream, known in self._streams.items() if known.tokens and belongs(stream)}
+            there = (stream for stream in self._nodes.get(node, ()) if self._streams[stream].tokens)
+            found = {stream: True for stream in there if belongs(stream)}
             for stream in sensors:
                 known = self._streams.get(stream, _Known(left_ns=self._began_ns))
                 if known.left_ns is not None and now_ns - known.left_ns < BACK_NS:
@@ -212,7 +223,15 @@ class StreamDirectory:
         known = self._streams.get(stream)
         if known is None and len(self._streams) < MAX_STREAMS:
             known = self._streams[stream] = _Known()
+            self._nodes.setdefault(node_of(stream), {})[stream] = None
         return known
+
+    def _forget(self, stream: str) -> None:
+        del self._streams[stream]
+        streams = self._nodes[node_of(stream)]
+        del streams[stream]
+        if not streams:
+            del self._nodes[node_of(stream)]
 
     @staticmethod
     def _settled(known: _Known, now_ns: int) -> bool:

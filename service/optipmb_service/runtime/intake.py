@@ -25,7 +25,7 @@ import optipmb_schemas as schemas
 import structlog
 
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
-from optipmb_service.runtime.directory import StreamDirectory
+from optipmb_service.runtime.directory import StreamDirectory, node_of
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.values import SECOND
 
@@ -234,7 +234,8 @@ class Intake:
             sensors: streams that were there before; their publishers may come back.
         """
         session_of = self._registry.fusion.session_of
-        return self._directory.awaited(lambda one: session_of(one) == session, sensors, time.monotonic_ns())
+        node = node_of(session)
+        return self._directory.awaited(node, lambda one: session_of(one) == session, sensors, time.monotonic_ns())
 
     def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]]], None]) -> None:
         """Call `then` soon, on a thread that it must not keep, with what the caches of a stream hold, all frames."""
@@ -299,9 +300,11 @@ class Intake:
 
     def _step(self) -> None:
         """See what is held and known now, and act on it; the next step does again what failed in this one."""
-        now_ns, held = time.monotonic_ns(), self._member.partitions
+        now_ns = time.monotonic_ns()
         with self._lock:
             came, self._came = self._came, set()
+        held = self._member.partitions  # afterwards: what came is held, or lost again
+        with self._lock:
             self._left = {partition: until for partition, until in self._left.items() if until > now_ns}
             received = self._received = held | self._left.keys()
         known = self._known
@@ -309,7 +312,7 @@ class Intake:
             self._align(came, held, received, now_ns)
         except Exception:
             with self._lock:
-                self._came |= came
+                self._came |= came & self._member.partitions
             self._known = known
             raise
 

@@ -271,12 +271,14 @@ class CheckpointWriter:
                 self._failed(StoreError(f"what is to be kept at the end is not written after {timeout:.1f} s"))
 
     def _run(self) -> None:
-        while self._serve(max(0.0, self._interval_s - SETTLE_S)):
-            self._expire()
-            self._gather()
-            if self._serve(SETTLE_S):
-                self._write()
-        self._write()
+        try:
+            while self._serve(max(0.0, self._interval_s - SETTLE_S)):
+                self._expire()
+                self._gather()
+                if self._serve(SETTLE_S):
+                    self._write()
+        finally:
+            self._write()
 
     def _serve(self, seconds: float) -> bool:
         """For so long write at once what somebody waits for, and nothing else; False at the end."""

@@ -380,14 +380,15 @@ class Registry:
             if self._member.fence(actor.stream) is None:
                 # It began at the very moment in which its partition was left.
                 self.command(actor.stream, StreamActor.on_lost, urgent=True)
-            if actor.fused and actor.session is not None and actor.session.awaits_caches:
+            session = actor.session  # the worker may end it at any moment
+            if actor.fused and session is not None and session.awaits_caches and actor.mailbox.idle:
                 self.command(actor.stream, StreamActor.on_caches_answered, urgent=False)  # or a publisher may be gone
             for stream, meter in tuple(actor.sensors.items()):
                 age_s = meter.age_s(now_ns)
                 if age_s is not None and age_s > self._settings.stale_s and stream not in actor.stale:
                     actor.stale.add(stream)
                     log.warning("stream_stale", stream=stream, age_s=round(age_s, 3))
-            if now_ns - actor.meter.active_ns > self._settings.idle_s * SECOND:
+            if now_ns - actor.meter.active_ns > self._settings.idle_s * SECOND and actor.mailbox.idle:
                 self.command(actor.stream, self._close_idle, urgent=False)
         for stream, other in self._rivals.contested([actor.stream for actor in self.actors()], now_ns):
             self._report("contested", stream, "one `store`, or `cluster`, for all instances", f"{other} tracks it too")

@@ -29,6 +29,7 @@ WAIT_BEFORE_DROP_FRAGMENTS_US: Final = 500_000
 
 RETRY_MS: Final = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2}
 
+RUNTIME_VARIABLE: Final = "ZENOH_RUNTIME"
 RUNTIME: Final = "(rx: (worker_threads: 1))"
 """A client has one link, which one thread reads. Of two, Zenoh's default, each message wakes the other as well."""
 
@@ -49,8 +50,10 @@ def opened(settings: Settings) -> zenoh.Session:
         TransportError: an endpoint is in use or unusable, or the file of the settings is.
     """
     config = _configuration(settings)
-    if not settings.is_router:
-        os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)  # read when the first session of a process opens
+    # Read when the first session of a process opens; neither a later router nor a child is to find it.
+    sets_runtime = not settings.is_router and RUNTIME_VARIABLE not in os.environ
+    if sets_runtime:
+        os.environ[RUNTIME_VARIABLE] = RUNTIME
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
@@ -60,6 +63,9 @@ def opened(settings: Settings) -> zenoh.Session:
         else:
             reason = f"cannot open {where}: {line(error)}"
         raise TransportError(reason) from error
+    finally:
+        if sets_runtime:
+            del os.environ[RUNTIME_VARIABLE]
 
 
 def close(session: zenoh.Session) -> None:

@@ -29,7 +29,7 @@ def test_caches_are_awaited_of_publishers_that_are_there_or_may_come_back() -> N
     one = StreamDirectory("a", IDLE_NS, lambda _: True, SECOND)
 
     def awaited(now_ns: int, *sensors: str) -> dict[str, bool]:
-        return one.awaited(lambda stream: stream.startswith("site/node/"), sensors, now_ns)
+        return one.awaited("site/node", lambda stream: stream.startswith("site/node/"), sensors, now_ns)
 
     assert awaited(SECOND + BACK_NS - 1, front) == {front: False}
     assert awaited(SECOND + BACK_NS, front) == {}
