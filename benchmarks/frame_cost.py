@@ -94,6 +94,8 @@ class Parts:
 class Network:
     """Everything around the streams: it grants them all, takes what they publish, and runs their actors."""
 
+    strained = False
+
     def __init__(self) -> None:
         self.waiting: list[Any] = []
         self.published = 0
