@@ -110,11 +110,11 @@ def test_without_a_certificate_of_the_authority_there_is_no_connection(
 ) -> None:
     """Plain text, and a certificate of another authority, get no answer."""
     plain = rpc.TrackingServiceStub(grpc.insecure_channel(secured.address))
-    assert denied(lambda: plain.GetState(pb.GetStateRequest(stream=LIDAR), timeout=5)) == grpc.StatusCode.UNAVAILABLE
+    assert denied(lambda: plain.GetState(pb.GetStateRequest(stream=LIDAR), timeout=60)) == grpc.StatusCode.UNAVAILABLE
     assert make(tmp_path, *network.options).returncode == 0
     shutil.copy(network.folder / NODE / "ca.pem", tmp_path / NODE / "ca.pem")
     foreign = rpc.TrackingServiceStub(channel(tmp_path / NODE, secured))
-    assert denied(lambda: foreign.GetState(pb.GetStateRequest(stream=LIDAR), timeout=5)) == grpc.StatusCode.UNAVAILABLE
+    assert denied(lambda: foreign.GetState(pb.GetStateRequest(stream=LIDAR), timeout=60)) == grpc.StatusCode.UNAVAILABLE
 
 
 def test_the_client_library_with_certificates(network: Network, secured: GatewayProcess) -> None:
@@ -123,7 +123,7 @@ def test_the_client_library_with_certificates(network: Network, secured: Gateway
     car: dict[str, Any] = {"center": [[1, 2, 0.8]], "size": [[4.5, 1.9, 1.6]], "yaw": [0.5], "score": [0.9]}
     stream = f"{ROBOT}/camera"
     with (
-        Subscriber(stream, address, config=network.folder / VIEWER, timeout=10.0) as tracks,
+        Subscriber(stream, address, config=network.folder / VIEWER, timeout=60.0) as tracks,
         Publisher(stream, address, config=network.config(NODE), frame="world") as publisher,
     ):
         for k in range(5):
@@ -157,5 +157,5 @@ def test_renewed_certificates_are_taken(network: Network, secured: GatewayProces
     time.sleep(0.01)  # the files' times tell them apart
     network.make("--renew")
     assert (folder / "cert.pem").read_bytes() != before
-    responses = stub(network, VIEWER, secured).ListStreams(pb.ListStreamsRequest(), timeout=10)
+    responses = stub(network, VIEWER, secured).ListStreams(pb.ListStreamsRequest(), timeout=60)
     assert responses is not None

@@ -210,13 +210,13 @@ def test_the_wall_clock_may_jump(start: Callable[..., Any], monkeypatch: pytest.
                 received = node.tracks(SENSOR.stream, seq + 1)
             return [plain(message) for message in received]
 
-    expected = tracks(start(store=str(tmp_path / "a"))[1], lambda _: None)
+    expected = tracks(start(store=str(tmp_path / "a"), cloud_wait_s=60.0)[1], lambda _: None)
     true_ns = time.time_ns
 
     def jump(seq: int) -> None:
         monkeypatch.setattr(time, "time_ns", lambda: true_ns() + (-1) ** seq * seq * 3600 * 10**9)
 
-    assert tracks(start(store=str(tmp_path / "b"))[1], jump) == expected
+    assert tracks(start(store=str(tmp_path / "b"), cloud_wait_s=60.0)[1], jump) == expected
 
 
 def test_nothing_is_published_while_the_write_lease_has_lapsed(
