@@ -204,12 +204,13 @@ class Registry:
             self._count_refused()
             self._report("invalid_value", "", error.expected, error.received)
             return
-        if self._kept_for_takeover(session, packet, frame=frame):
+        own = self._member.holds(session)
+        if not own and self._kept_for_takeover(session, packet, frame=frame):
             self._metrics.foreign("detections" if frame else "points", packet.size)
         else:
             self._metrics.received("detections" if frame else "points", packet.size)
             if not self._over_quota(stream, packet, frame=frame):
-                self._hand(session, packet, frame=frame)
+                self._keep(session, packet, frame)
 
     def caches_answered(self, key: str) -> None:
         """Tell a session that all has come which the cache of its publisher held."""
@@ -233,10 +234,11 @@ class Registry:
         if waits or not self._offer(stream, lambda actor: offered(actor.mailbox, packet)):
             self._put_off(stream, packet, frame=frame)
 
-    def _kept_for_takeover(self, stream: str, packet: Packet, *, frame: bool) -> bool:
+    def _kept_for_takeover(self, stream: str, packet: Packet, *, frame: bool, own: bool = False) -> bool:
         """Keep a packet of a stream that is not tracked here; False where the stream is to be tracked here.
 
-        Once the stream is, what was kept goes first, so packets are kept until that has been handed over.
+        Once the stream is, what was kept goes first, so packets are kept until that has been handed over. Those that
+        were received to be tracked here (`own`) are kept until somebody asks for them, and counted when dropped.
         """
         if self._member.holds(stream) and stream not in self._foreign:
             return False
@@ -246,13 +248,15 @@ class Registry:
                 if self._member.holds(stream):
                     return False
                 buffer = self._foreign[stream] = self._context.buffer()
-            buffer.add(packet, frame=frame)
+            buffer.unasked |= own
+            lost = buffer.add(packet, frame=frame, own=own)
             buffer.seen_ns = packet.now_ns
+        self._lose(stream, lost)
         return True
 
     def _keep(self, stream: str, packet: Packet, frame: bool) -> None:  # noqa: FBT001 - as a field of the context
-        """Keep a packet that an actor has no use for, unless the stream has come here again."""
-        if not self._kept_for_takeover(stream, packet, frame=frame):
+        """Keep a packet that was received to be tracked here until its stream is, here or by who asks for it."""
+        if not self._kept_for_takeover(stream, packet, frame=frame, own=True):
             self._hand(stream, packet, frame=frame)
 
     def command(self, stream: str, command: Callable[[StreamActor], None], *, urgent: bool) -> bool:
@@ -310,9 +314,7 @@ class Registry:
         """Return what is kept of sessions, the oldest first."""
         with self._foreign_lock:
             buffers = [self._foreign[session] for session in sessions if session in self._foreign]
-            kept = [one for buffer in buffers for one in buffer.kept()]
-            for buffer in buffers:
-                buffer.unasked = False
+            kept = [one for buffer in buffers for one in buffer.asked()]
         return sorted((packet for packet, _ in kept if packet.payload is not None), key=lambda one: one.now_ns)
 
     def expect(self, session: str) -> None:
@@ -394,13 +396,20 @@ class Registry:
             self._report("contested", stream, "one `store`, or `cluster`, for all instances", f"{other} tracks it too")
         self._evict()
         self._let_in()
+        self._trim(now_ns)
+
+    def _trim(self, now_ns: int) -> None:
+        """Drop what has been kept for too long."""
+        lost: dict[str, list[bool]] = {}
         with self._foreign_lock:
             for stream, buffer in tuple(self._foreign.items()):
-                buffer.trim(now_ns)
+                lost[stream] = buffer.trim(now_ns)
                 forgotten = len(self._foreign) > MAX_LIVES or now_ns - buffer.seen_ns > self._settings.idle_s * SECOND
                 if not buffer and forgotten:
                     del self._foreign[stream]
                     self._newcomers.pop(stream, None)
+        for stream, dropped in lost.items():
+            self._lose(stream, dropped)
 
     def _evict(self) -> None:
         """Close sessions, the least recently used first, while all together keep more than the process may."""
@@ -424,7 +433,8 @@ class Registry:
         for actor in actors:
             with self._foreign_lock:  # before the session ends: what comes from then on is kept for who asks
                 if actor.session is not None and not self._member.holds(actor.stream):
-                    self._foreign.setdefault(actor.stream, self._context.buffer()).seen_ns = now_ns
+                    buffer = self._foreign.setdefault(actor.stream, self._context.buffer())
+                    buffer.seen_ns, buffer.unasked = now_ns, buffer.unasked or change is Change.RECALLED
             actor.tell(told)
 
     def resume(self) -> None:
@@ -529,14 +539,13 @@ class Registry:
                 buffer = self._foreign[session] = self._context.buffer()
                 buffer.unasked = True
                 self._newcomers[session] = None
+            lost = [frame]
             if buffer is not None:
-                buffer.add(packet, frame=frame)
+                lost = buffer.add(packet, frame=frame, own=True)
                 buffer.seen_ns = packet.now_ns
-                if len(buffer):
-                    return
-                del self._foreign[session]
-                self._newcomers.pop(session, None)
-        self._refuse(session)
+                if not buffer and session in self._newcomers:
+                    del self._foreign[session], self._newcomers[session]
+        self._lose(session, lost)
 
     def _let_in(self) -> None:
         """Hand over what was put off, as far as there is room."""
@@ -577,7 +586,18 @@ class Registry:
 
     def _refuse(self, stream: str) -> None:
         self._count_refused()
-        self._report("shed", stream, f"fewer than {MAX_UNPROVEN} new streams at once", "another one")
+        self._report_shed(stream)
+
+    def _lose(self, stream: str, lost: list[bool]) -> None:
+        """Count messages that were dropped before their stream was tracked, each True: a frame."""
+        if lost:
+            frames = sum(lost)
+            with self._lock:
+                self._past += MessageCounters(received=frames, refused=frames, clouds_refused=len(lost) - frames)
+            self._report_shed(stream)
+
+    def _report_shed(self, stream: str) -> None:
+        self._report("shed", stream, f"fewer than {MAX_UNPROVEN} new streams at once", "more than can wait")
 
     def _count_refused(self) -> None:
         with self._lock:

@@ -226,7 +226,10 @@ class Kept:
         registry._settings = SimpleNamespace(idle_s=3600.0)
         registry._crowded = lambda: self.crowded
         registry._offer = self._offer
-        registry._over_quota = lambda *_, **__: False
+        registry._rivals = SimpleNamespace(contested=lambda *_: [])
+        registry._evict = lambda: None
+        registry._quotas = SimpleNamespace(exceeded=lambda *_: self.exceeded)
+        self.exceeded = ""
         registry._report = lambda code, *_: self.problems.append(code)
         registry._metrics = SimpleNamespace(
             received=lambda topic, _: self.metrics.update([f"received {topic}"]),
@@ -280,3 +283,56 @@ def test_a_stream_that_the_intake_holds_is_not_let_in() -> None:
     kept.registry.take_up(STREAMS[0], [(detections(1), True)])
     assert [packet.wall_ns for offered in kept.offered for packet in offered] == [0, 1]
     assert not kept.registry._foreign
+
+
+def test_what_is_put_off_counts_as_received() -> None:
+    """Each message of a stream that waits for room counts as received once, and none as another member's."""
+    kept = Kept()
+    for number in range(5):
+        kept.registry.frame(detections(number))
+    assert kept.metrics == {"received detections": 5}
+    kept.crowded = False
+    kept.registry._let_in()
+    assert [len(offered) for offered in kept.offered] == [5]
+
+
+def test_what_is_put_off_and_dropped_is_refused() -> None:
+    """What the buffers have no room for, and what has waited for too long, counts as refused, with a problem."""
+    kept = Kept(standby=3 * detections(0, 1000).held)
+    registry = kept.registry
+    for number in range(50):
+        registry.frame(detections(number, 1000))
+    assert (len(registry._foreign[STREAMS[0]]), registry._past.refused) == (3, 47)
+    registry.cloud(detections(50, 1000))
+    assert registry._past.clouds_refused == 1
+    registry.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
+    assert (registry._past.received, registry._past.refused) == (50, 50)
+    assert set(kept.problems) == {"shed"}
+
+
+def test_what_is_put_off_is_within_the_quota() -> None:
+    """The quotas of a node and a site hold for a stream that waits for room as for any other."""
+    kept = Kept()
+    kept.registry.frame(detections(0))
+    kept.exceeded = "a message"
+    kept.registry.frame(detections(1))
+    assert (len(kept.registry._foreign[STREAMS[0]]), kept.registry._past.refused) == (1, 1)
+    assert kept.problems == ["quota"]
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_what_a_session_passes_on_is_kept_until_it_is_asked_for(asked: bool) -> None:  # noqa: FBT001 - a parameter
+    """Frames of a session that leaves are kept also where `standby_s` is 0, and count as refused if nobody asks."""
+    kept = Kept(keep_ns=0)
+    kept.holds = False
+    registry, passed = kept.registry, [detections(0), detections(1)]
+    for packet in passed:
+        registry._keep(STREAMS[0], packet, True)
+    registry.frame(detections(2))
+    assert registry.foreign(range(PARTITIONS)) == {STREAMS[0]}
+    if asked:
+        assert registry.recent([STREAMS[0]])[:2] == passed
+    registry.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
+    assert not registry._foreign[STREAMS[0]]
+    assert registry._past.refused == (0 if asked else 2)
+    assert kept.metrics == {"foreign detections": 1}
