@@ -70,7 +70,7 @@ def predict_classes(density: Density, kept: Index | None, dt: float, table: Clas
     likely = confusion.T[label]
     if posterior is None:
         posterior = likely / likely.sum(axis=1, keepdims=True)
-    elif posterior.shape != likely.shape or not np.allclose(np.where(likely > 0.0, posterior, 0.0).sum(axis=1), 1.0):
+    elif not np.allclose(np.where(likely > 0.0, posterior, 0.0).sum(axis=1), 1.0) or (posterior < 0.0).any():
         raise DensityError("classes.probability", "probabilities of the classes of each object's group", "others")
     memory = table["class_memory"][label, None] ** (dt / table.period)
     predicted = np.where(likely > 0.0, memory * posterior + (1.0 - memory) / table["group_size"][label, None], 0.0)

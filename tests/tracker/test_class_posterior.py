@@ -205,7 +205,8 @@ def test_probabilities_of_another_group_are_refused() -> None:
     density = run(parameters, [seen(parameters, 0.0, ("bus", 20.0, 0.9))])[0].density
     assert density.class_probability is not None
     tracker = optipmb.Tracker(parameters)
-    for wrong in (np.array([[0.0, 1.0, 0.0, 0.0]]), np.full((2, 4), 0.25), SimpleNamespace(shape=(1, 4))):
+    others = np.full((2, 4), 0.25), SimpleNamespace(shape=(1, 4))
+    for wrong in (np.array([[0.0, 1.0, 0.0, 0.0]]), np.array([[2.0, 0.0, -1.0, 0.0]]), *others):
         other = optipmb.Density(
             density.stamp_ns, density.next_id, density.bernoulli, density.poisson, density.labels, None, wrong
         )  # type: ignore[arg-type]  # on purpose
