@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 import zenoh
 import zenoh.ext
+from optipmb_client import Connection
+from optipmb_client.transport import HEARTBEAT_S
 from optipmb_schemas import (
     Density,
     Detections,
@@ -538,3 +541,21 @@ def test_a_router_that_goes_and_comes_loses_nothing(start: Callable[..., Any]) -
 
             until(caught_up, "all frames are tracked")
             assert node.ask(state, SessionState).gaps == 0
+
+
+def test_what_a_client_sent_last_while_the_router_was_away_is_recovered(start: Callable[..., Any]) -> None:
+    """A last frame that nobody could receive, and silence: the next heartbeat after the router is back tells of it."""
+    endpoint = free_endpoint()
+    router = open_router(endpoint)
+    start(listen=None, connect=[endpoint])
+    with Connection(endpoint) as link, Node(endpoint) as node:
+        sender = link.cached_sender(KEYS.detections(SENSOR.stream), encoding_of(Detections), cache=20)
+        sender.put(encode(SENSOR.detections(0)))
+        node.tracks(SENSOR.stream, 1)
+        router.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
+        sender.put(encode(SENSOR.detections(1)))
+        time.sleep(2 * HEARTBEAT_S)  # a heartbeat that is sent once alone is lost, too
+        with open_router(endpoint):
+            state = KEYS.query(SENSOR.stream, "state")
+            until(lambda: bool(node.query(state, timeout=5.0)), "the service is back")
+            until(lambda: node.ask(state, SessionState).frames == 2, "the last frame is tracked")
