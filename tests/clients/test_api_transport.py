@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 
 import pytest
 import zenoh
+from optipmb_client import transport
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.transport import DEFAULT_ENDPOINT, Arrival, Connection, Inbox, Subscription
 from routers import free_endpoint, open_client, open_router
@@ -50,8 +51,11 @@ def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:
         opened[0].close()
 
 
-def test_what_is_sent_just_before_closing_arrives(endpoint: str) -> None:
+def test_what_is_sent_just_before_closing_arrives(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Closing a connection flushes: the last small and the last large message are both received."""
+    # A large message that finds no room within half a second is dropped, whether or not the connection closes.
+    monkeypatch.setattr(transport, "WAIT_BEFORE_DROP_US", 30_000_000)
+    monkeypatch.setattr(transport, "WAIT_BEFORE_DROP_FRAGMENTS_US", 30_000_000)
     inbox = Inbox(10)
     with Connection(endpoint) as receiver:
         receiver.subscribe("a/*", inbox)
