@@ -46,6 +46,9 @@ RENEWALS_PER_LEASE: Final = 10
 STRAINED: Final = 4
 """Part of a lease without a renewal from which on it is late; half a lease is the end of the write lease."""
 
+SLOW_LEASES: Final = 2
+"""Leases in which no renewal was in time: then it is the store that is slow, and waiting does not help."""
+
 WRITE_LEASES_PER_LEASE: Final = 2
 RETRY_S: Final = 0.1
 """At the end, between two tries to say so."""
@@ -77,6 +80,8 @@ class Member:
         self._table = self._joining()
         self._revision = 0
         self._renewed_ns = 0
+        self._in_time_ns = clock()
+        self._slow = False
         self._error = "not a member yet"
         self._failing = False
         self._unwritable = False
@@ -121,8 +126,13 @@ class Member:
 
     @property
     def strained(self) -> bool:
-        """Whether its record is renewed late: what can wait is not to begin now, for it would delay that more."""
-        return self._clock() - self._renewed_ns > self._lease_ns // STRAINED
+        """Whether its record is renewed late: what can wait is not to begin now, for it would delay that more.
+
+        Where every renewal takes so long, that is so only while nothing may be published.
+        """
+        now_ns = self._clock()
+        late = now_ns - self._renewed_ns > self._lease_ns // STRAINED
+        return late and not (self._slow and self._write_lease.valid(now_ns))
 
     @property
     def partitions(self) -> set[int]:
@@ -258,12 +268,25 @@ class Member:
             self._said = value
         self._revision, self._renewed_ns, self._error = revision, sent_ns, "its lease has lapsed"
         self._write_lease.renew(sent_ns)
+        self._time_renewal(sent_ns)
         if self._failing:
             self._failing = False
             log.info("leases_back")
         if not was:
             self._resumed()
         return not self._unwritable
+
+    def _time_renewal(self, sent_ns: int) -> None:
+        """See whether a renewal that has just been answered was in time."""
+        now_ns = self._clock()
+        if now_ns - sent_ns <= self._lease_ns // STRAINED:
+            self._in_time_ns = now_ns
+            if self._slow:
+                self._slow = False
+                log.info("leases_in_time")
+        elif not self._slow and now_ns - self._in_time_ns > SLOW_LEASES * self._lease_ns:
+            self._slow = True
+            log.warning("leases_slow", took_s=round((now_ns - sent_ns) / SECOND, 3))
 
     def _put_alive(self, key: str, value: str) -> int | None:
         """Renew this member's record; return its revision, None when another one is the newest."""

@@ -53,6 +53,9 @@ EVENTS: Final = {
     "leases_failed": "The servers of `cluster`, or the folder `store`, cannot be used, for `error`: after half of"
     " `lease_s` nothing is published, and the state is `paused`.",
     "leases_back": "They can be used again.",
+    "leases_slow": "Each renewal of the lease has taken more than a quarter of `lease_s`, the last one `took_s`: new"
+    " streams begin late. Look for a slow disk or network, or raise `lease_s`.",
+    "leases_in_time": "A renewal of the lease was in time again.",
     "log_failed": "The log cannot be written, for `error`: the bridge holds 256 MB of messages and tries again.",
     "log_back": "The log can be written.",
     "log_unread": "The log could not be read for the session of `streams`: frames may be missing.",

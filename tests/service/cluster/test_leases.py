@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lease_log import LEASE_S, SECOND, Alone, HandMember, MemoryLeases, Shared
 from nats_process import NatsProcess, NatsTrio
+from optipmb_service.cluster import member as members_module
 from optipmb_service.cluster import nats_connection
 from optipmb_service.cluster.jetstream import JetStream
 from optipmb_service.cluster.leases import LEFT_AT_ONCE, PARTITIONS, Change, WriteLease, partition_key, partition_of
@@ -535,3 +536,41 @@ def test_no_partition_ever_has_two_owners(count: int, seed: int) -> None:
         for one in members:
             one.turn(TICK_S)
     even(*members)
+
+
+def test_a_slow_store_holds_new_streams_up_for_two_leases_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A member whose every renewal takes long takes in new streams after two leases, and says so once."""
+    now_ns, lease_ns, told = [0], round(LEASE_S * SECOND), list[str]()
+
+    class Slow(MemoryLeases):
+        took_ns = lease_ns * 3 // 10
+
+        def put(self, write: Write) -> int | None:
+            now_ns[0] += self.took_ns
+            return super().put(write)
+
+    class Log:
+        def __getattr__(self, _: str) -> Callable[..., None]:
+            return lambda event, **_: told.append(event)
+
+    monkeypatch.setattr(members_module, "log", Log())
+    store = Slow(Shared())
+    member = Member("a", store, LEASE_S, lambda: now_ns[0])
+
+    def strained(leases: int) -> set[bool]:
+        seen, ends_ns = set[bool](), now_ns[0] + leases * lease_ns
+        while now_ns[0] < ends_ns:
+            member._keep()
+            assert not member.failure
+            seen.add(member.strained)
+        return seen
+
+    assert strained(1) == {True}
+    assert True in strained(1)
+    assert strained(3) == {False}
+    now_ns[0] += lease_ns // 2
+    assert member.strained  # nothing may be published
+    assert told == ["leases_slow"]
+    store.took_ns = lease_ns // 10
+    assert strained(1) == {False}
+    assert told == ["leases_slow", "leases_in_time"]
