@@ -51,6 +51,9 @@ MAX_UNPROVEN: Final = 256
 MAX_NEWCOMERS: Final = 16_384
 """Streams beyond them whose first messages wait, within `standby_mb`, until some of these have sent a valid one."""
 
+MAX_UNPROVEN_STRAINED: Final = 16
+"""The same while the lease is renewed late: each of them delays that."""
+
 MAX_LIVES: Final = 65_536
 """Streams without a session whose past is remembered."""
 
@@ -230,8 +233,7 @@ class Registry:
 
     def _hand(self, stream: str, packet: Packet, *, frame: bool) -> None:
         offered = Mailbox.offer_frame if frame else Mailbox.offer_cloud
-        waits = self._member.strained and stream not in self._actors
-        if waits or not self._offer(stream, lambda actor: offered(actor.mailbox, packet)):
+        if not self._offer(stream, lambda actor: offered(actor.mailbox, packet)):
             self._put_off(stream, packet, frame=frame)
 
     def _kept_for_takeover(self, stream: str, packet: Packet, *, frame: bool, own: bool = False) -> bool:
@@ -526,10 +528,11 @@ class Registry:
 
     def _crowded(self) -> bool:
         """Whether too many streams have not sent a valid message yet, as far as is known; called with the lock."""
-        if len(self._unproven) >= MAX_UNPROVEN:
+        most = MAX_UNPROVEN_STRAINED if self._member.strained else MAX_UNPROVEN
+        if len(self._unproven) >= most:
             known = self._actors.get
             self._unproven = {one for one in self._unproven if not one.occupied and known(one.stream) is one}
-        return len(self._unproven) >= MAX_UNPROVEN
+        return len(self._unproven) >= most
 
     def _put_off(self, session: str, packet: Packet, *, frame: bool) -> None:
         """Keep the first messages of a stream until there is room for it among those that are new."""
@@ -549,7 +552,7 @@ class Registry:
 
     def _let_in(self) -> None:
         """Hand over what was put off, as far as there is room."""
-        while self._newcomers and not self._member.strained:
+        while self._newcomers:
             with self._lock:
                 if self._crowded():
                     return

@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     Judged = tuple[Timeline | FusedTimeline, Decision, Timeline | FusedTimeline]
 
 
-MAX_HELD: Final = 64
-"""Frames held for their clouds at once; beyond it the oldest goes on without."""
+MAX_HELD: Final = 1024
+"""Frames held at once: more than come from a publisher's cache before its clouds do.
 
-MAX_RECOVERING: Final = 1024
-"""Frames held for missed ones at once; beyond it they go on with a gap."""
+Beyond it the oldest goes on without its cloud, and behind a gap.
+"""
 
 
 @record
@@ -194,12 +194,11 @@ class PendingFrames:
             return None
         head = self._held[0]
         much = self.held_bytes > self.policy.held_bytes
-        few = len(self._held) <= MAX_RECOVERING and not much
-        if now_ns is not None and few and self._behind_gap(head, complete):
+        many = much or len(self._held) > MAX_HELD
+        if now_ns is not None and not many and self._behind_gap(head, complete):
             return None
         points = self._cloud(head)
         missed = points is None and head.deadline_ns is not None
-        many = much or (len(self._held) > MAX_HELD and self.recovery_ns is None)
         if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not (many or self._crowded(head)):
             return None
         del self._held[0]

@@ -248,6 +248,15 @@ def test_one_lost_cloud_costs_one_frame_its_cloud() -> None:
     assert used == {seq: seq != LOST for seq in range(100)}
 
 
+def test_frames_of_a_cache_wait_for_their_clouds() -> None:
+    """After a restart hundreds of frames come from a publisher's cache before its clouds do: each gets its own."""
+    one = session(policy=Policy(cloud_wait_ns=30 * SECOND))
+    outputs = [one.on_detections(SENSOR.detections(seq, has_points=True), seq) for seq in range(200)]
+    assert not any(tracks(some) for some in outputs)
+    got = [message for seq in range(200) for message in tracks(one.on_points(SENSOR.points(seq), SECOND))]
+    assert [(message.seq, message.cloud_used) for message in got] == [(seq, True) for seq in range(200)]
+
+
 def test_unknown_classes_are_left_out_and_told_once() -> None:
     """Objects of classes the profile lacks are counted in every frame and reported once per session and class."""
     one = session()
