@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 OpenProbability = Annotated[float, Field(gt=0.0, lt=1.0)]
+NonZeroProbability = Annotated[float, Field(gt=0.0, le=1.0)]
 Positive = Annotated[float, Field(ge=1e-9, le=1e9)]
 """Far enough from zero and from infinity that squares and quotients of such numbers stay finite."""
 NonNegative = Annotated[float, Field(ge=0.0, le=1e9)]
@@ -193,15 +194,11 @@ class ClassParameters(_Table):
 
     score_filter: Probability = Field(description="eta_sf: detections with a lower score are removed")
     nms_iou: Probability = Field(description="eta_iou: of two detections that overlap more, the better scored stays")
-    survival: Annotated[float, Field(gt=0.0, le=1.0)] = Field(
-        description="p_s: survival probability per nominal period"
-    )
+    survival: NonZeroProbability = Field(description="p_s: survival probability per nominal period")
     gate: Positive = Field(description="eta_dist: gating distance on the ground plane, m")
     detection: OpenProbability = Field(description="p_d0: baseline detection probability")
     expected_points: Positive = Field(description="PTS_0: number of LiDAR points in the box of an object in full view")
-    detection_floor: Annotated[float, Field(gt=0.0, le=1.0)] = Field(
-        description="s_d: what is left of p_d0 without points"
-    )
+    detection_floor: NonZeroProbability = Field(description="s_d: what is left of p_d0 without points")
     birth_score: Probability = Field(
         description="eta_score: unused detections from this score on start a track at once"
     )

@@ -21,7 +21,7 @@ def message(seq: int, *, content: int, revision: int = 0, run: int = 0, session:
     columns = {
         name: np.zeros((1, *array.shape[1:]), {"f8": np.float64, "i8": np.int64}[array.dtype])
         for name, array in Tracks.arrays.items()
-        if name not in PATHS
+        if name not in {*PATHS, "class_probability"}
     }
     columns |= {"id": np.array([content]), "size": np.ones((1, 3))}
     return Tracks(

@@ -20,6 +20,7 @@ ALLOWED = {
 }  # fmt: skip
 EXCEPTIONS = {
     "compiled": {"logging"},  # to say why a first frame takes a minute
+    "warm": {"gc"},  # to collect less often while a compiler fills the memory
     "online": {"pandas", "pyarrow"},  # to give tracks in the tables that users ask for
 }
 TOUCHES_FILES = {"compiled", "parameters", "prepared"}
