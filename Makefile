@@ -15,7 +15,8 @@ FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
 .PHONY: help kernels docs release demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
-	@echo "make test    lint, types, schemas, tests, wheel"
+	@echo "make test    lint, types, schemas, tests"
+	@echo "make wheel   build the wheel, install it alone into an empty environment, and use it there"
 	@echo "make check   lint, types, and the tests nearest to what changed since SINCE=main, in less than a minute"
 	@echo "make accuracy  hold the figures of accuracy on KITTI and nuScenes, where their data are"
 	@echo "make alone   run the tests that measure memory, latency and outages, one after the other"
@@ -62,7 +63,7 @@ containers: install
 
 # The demonstration is among the tests (tests/e2e/test_demo.py); CI also runs the command, which installs less.
 test: install
-	$(MAKE) --jobs 5 types kernels lint schemas wheel tests
+	$(MAKE) --jobs 4 types kernels lint schemas tests
 
 # For figures, nothing else should run on the machine. SERVICE holds options of the service, SECONDS how long a run takes.
 load: install

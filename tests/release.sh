@@ -8,7 +8,7 @@ version=$("$bin/python" -c 'import optipmb; print(optipmb.__version__)')
 grep -q "^## $version\( \|$\)" CHANGELOG.md || { echo "release: CHANGELOG.md has no section '## $version'"; exit 1; }
 if grep -q "^## $version (unreleased)" CHANGELOG.md; then echo "release: CHANGELOG.md still calls $version unreleased"; exit 1; fi
 if git rev-parse -q --verify "refs/tags/v$version" >/dev/null; then echo "release: the tag v$version is there already"; exit 1; fi
-make test accuracy alone
+make test wheel accuracy alone
 rm -rf dist
 "$bin/python" -m build --outdir dist .
 "$bin/python" -m build --wheel --outdir dist node

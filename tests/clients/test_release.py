@@ -58,7 +58,7 @@ def test_it_tests_builds_checks_and_stops_before_publishing(checkout: Path) -> N
     done, calls = release(checkout)
     assert done.returncode == 0, done.stderr
     assert calls[1:] == [
-        "make test accuracy alone",
+        "make test wheel accuracy alone",
         "python -m build --outdir dist .",
         "python -m build --wheel --outdir dist node",
         "python -m twine check --strict dist/*",
