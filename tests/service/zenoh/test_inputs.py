@@ -126,11 +126,9 @@ def test_zenoh_waits_while_too_many_messages_wait(network: Network) -> None:
 
     sent = [bytes((number,)) for number in range(20)]
     topic = Topic("points", network.session, receive, 2)
+    publishing = threading.Thread(target=lambda: [network.session.put(KEYS.points(STREAM), one) for one in sent])
     try:
         topic.subscribe(ALL, KEYS.all("points"), cached=False)
-        publishing = threading.Thread(
-            target=lambda: [network.session.put(KEYS.points(STREAM), one) for one in sent], daemon=True
-        )
         publishing.start()
         publishing.join(0.5)
         assert publishing.is_alive()
@@ -139,4 +137,5 @@ def test_zenoh_waits_while_too_many_messages_wait(network: Network) -> None:
         assert [payload for _, payload, _ in received.items] == sent
     finally:
         may_go_on.set()
+        publishing.join(CLOSE_S)  # a session is not closed while another thread is in it
         topic.close(CLOSE_S)
