@@ -61,11 +61,15 @@ def forbid_births(
         period: nominal period, s.
         classes: (C,) parameters: `birth_overlap`.
     """
+    used = np.zeros(len(measurements.yaw), np.bool_)
+    for m in assigned:
+        if m != UNASSIGNED:
+            used[m] = True
     predicted, detected = np.empty(5), np.empty(5)
     for k in range(hypotheses.row.shape[0]):
         n, m = hypotheses.row[k], hypotheses.measurement[k]
         overlap = classes[objects.label[n]].birth_overlap
-        if overlap >= EVERYTHING or assigned[n] != UNASSIGNED or hypotheses.first_kind[m] == CLUTTER:
+        if overlap >= EVERYTHING or assigned[n] != UNASSIGNED or used[m] or hypotheses.first_kind[m] == CLUTTER:
             continue
         if not objects.extracted[n] or whole_periods(missed_from_ns[n], stamp_ns, period) > 1:
             continue

@@ -263,8 +263,8 @@ class ClassParameters(_Table):
     )
     birth_overlap: Probability = Field(
         default=1.0,
-        description="overlap with the predicted box of a missed object from which a detection starts no second track "
-        "(`optipmb.births_beside`); 1: it always may (the paper)",
+        exclude_if=(1.0).__eq__,
+        description="overlap with the box of a missed object from which a detection starts no track (the paper: 1)",
     )
     ground_clearance: NonNegative = Field(
         default=0.0,

@@ -292,7 +292,7 @@ class Oracle:
                 box = np.array([*b.mean[:2], *b.auxiliary[:2], b.mean[3]])
                 for m, z in enumerate(zs):
                     other = np.array([*z.xy, *z.auxiliary[:2], z.yaw])
-                    if self._in_gate(b, z) and iou(box, other) > c.birth_overlap:
+                    if m not in chosen.values() and self._in_gate(b, z) and iou(box, other) > c.birth_overlap:
                         new[m] = NewObject(new[m].w, 0.0, low=True)
 
     def _update_bernoulli(

@@ -5,6 +5,7 @@ import math
 import pickle
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,9 @@ def publish_everything(make: Callable[..., Any]) -> None:
 
     cloud = array.array("f", [1, 2, 3, 9, math.nan, 5, 6, 9, 7, 8, 9, 9])
     with make("garage/robot-1/lidar", cache_clouds=1) as publisher:
+        ends = time.monotonic() + 60.0
+        while not publisher.points_wanted and time.monotonic() < ends:
+            time.sleep(0.01)  # with its end its cache is gone, so who subscribes has to be known before
         publisher.publish(
             stamp_ns=5,
             label=["car", "person"],

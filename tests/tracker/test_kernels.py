@@ -221,7 +221,7 @@ def test_objects_survive_by_existence_and_misses(seed: int) -> None:
 
 @SEEDS
 def test_births_are_forbidden_as_set_logic_says(seed: int) -> None:
-    """A first-time detection is clutter if its box overlaps that of a gated, extracted, newly missed object enough."""
+    """A detection without an object is clutter if its box overlaps that of a gated, extracted, newly missed one."""
     rng = np.random.default_rng(seed)
     n, m = 25, 20
     label, extracted, seen = rng.integers(0, 2, n), rng.random(n) < 0.7, NOW - rng.integers(0, 5, n) * 50_000_000
@@ -238,7 +238,7 @@ def test_births_are_forbidden_as_set_logic_says(seed: int) -> None:
     )
     active = (assigned == UNASSIGNED) & extracted & (periods(seen) <= 1)
     taken = active[row] & (overlap[row, measurement] > limit[label[row]])
-    forbidden = np.isin(np.arange(m), measurement[taken])
+    forbidden = np.isin(np.arange(m), measurement[taken]) & ~np.isin(np.arange(m), assigned)
     assert 0 < forbidden.sum() < m
     hypotheses = hypotheses_of(row=row, measurement=measurement, first_kind=kind.copy(), first_existence=first.copy())
     forbid_births(objects, assigned, hypotheses, z, seen, NOW, PERIOD, class_rows(2, birth_overlap=limit))

@@ -130,6 +130,7 @@ class MessageLog:
     def look_again(self) -> None:
         """Have `ready` ask the servers again: they may have come back without their files."""
         self._there.clear()
+        self._missing_until.clear()
 
     async def ready(self, topic: Topic, keep: Retention) -> None:
         """Have a log there that keeps so much.

@@ -68,6 +68,8 @@ class TakeoverBuffer:
         keep_ns = max(self._keep_ns, UNASKED_NS) if self.unasked else self._keep_ns
         while self._packets and now_ns - self._packets[0][0].now_ns > keep_ns:
             self._drop(0, lost)
+        if lost:  # nobody has asked for so long; what comes from others is kept as long as usual
+            self.unasked = any(own for _, _, own in self._packets)
         return lost
 
     def pop(self) -> tuple[Packet, bool]:
