@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -105,6 +106,10 @@ class Stack:
     def restarts(self, container: str) -> int:
         """How often a container was started again by itself."""
         return int(self.engine.inspect(container)["RestartCount"])
+
+    def age_s(self, container: str) -> float:
+        """Seconds since a container started."""
+        return time.time() - _instant(self.engine.inspect(container)["State"]["StartedAt"])
 
     def ready_s(self, service: str) -> float:
         """Seconds from the start of a container to the line in its log that says ready; 0 before that line."""

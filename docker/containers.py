@@ -42,6 +42,8 @@ INTERVALS: Final = {"$__rate_interval": "20s"}
 TERMINATED: Final = 128 + signal.SIGTERM
 STATUSES: Final = {"replay": TERMINATED}
 """Exit statuses after the stop signal that are not 0: the replay is interrupted in what it does."""
+MIDDLE_S: Final = (5.0, 15.0)
+"""Since its start; it takes twenty seconds, and its container then starts anew."""
 CONFINED: Final = """\
 id -u
 sed -n 's/^\\(CapEff\\|CapBnd\\|NoNewPrivs\\|Seccomp\\):\\t*/\\1=/p' /proc/1/status
@@ -239,6 +241,9 @@ class Check:
         for name in sorted(self.stack.services, key=lambda name: (name == "router", name != "replay")):
             container = self.stack.container(name)
             grace = float(str(self.stack.services[name].get("stop_grace_period", "10s")).rstrip("s"))
+            if name in STATUSES:
+                # Neither starting, when it would not heed a signal yet, nor about to end by itself.
+                _wait(lambda: MIDDLE_S[0] < self.stack.age_s(container) < MIDDLE_S[1], "the middle of a replay")  # noqa: B023 - called here
             began = time.monotonic()
             self.engine.run("stop", container)
             ends[name] = time.monotonic() - began
