@@ -242,8 +242,7 @@ class Check:
             container = self.stack.container(name)
             grace = float(str(self.stack.services[name].get("stop_grace_period", "10s")).rstrip("s"))
             if name in STATUSES:
-                # Neither starting, when it would not heed a signal yet, nor about to end by itself.
-                _wait(lambda: MIDDLE_S[0] < self.stack.age_s(container) < MIDDLE_S[1], "the middle of a replay")  # noqa: B023 - called here
+                _wait(partial(self._in_the_middle, container), "the middle of a replay")
             began = time.monotonic()
             self.engine.run("stop", container)
             ends[name] = time.monotonic() - began
@@ -252,6 +251,10 @@ class Check:
                 raise CheckError(f"{name} ended with status {status} after {ends[name]:.1f} s of {grace:g} s")
         what = f"the stop signal ends all with status 0, the replay with {TERMINATED}"
         self.show("stop", what, f"{max(ends.values()):.1f} s at most, of {grace:g} s")
+
+    def _in_the_middle(self, container: str) -> bool:
+        """Whether a replay is neither starting, when it would not heed a signal, nor about to end by itself."""
+        return MIDDLE_S[0] < self.stack.age_s(container) < MIDDLE_S[1]
 
 
 def ask(query: str) -> list[Any]:

@@ -104,7 +104,7 @@ def first_outside(array: NDArray[Any], description: "Array") -> int | None:
 
 def finite(points: Any) -> Any:
     """Return x, y, z of the points whose coordinates are finite; what is no cloud as it is."""
-    if not isinstance(points, np.ndarray) or points.ndim != 2 or points.dtype.kind != "f":  # noqa: PLR2004  rows
+    if not isinstance(points, np.ndarray) or points.ndim != 2 or points.dtype.kind != "f":  # noqa: PLR2004  a table: rows and columns
         return points
     xyz = np.ascontiguousarray(points[:, :3])
     good = np.isfinite(xyz)

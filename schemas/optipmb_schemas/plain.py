@@ -184,7 +184,7 @@ def first_outside(numbers: Numbers, description: "Array") -> int | None:
 
 def finite(points: Any) -> Any:
     """Return x, y, z of the points whose coordinates are finite; what is no cloud as it is."""
-    if not (isinstance(points, Numbers) and len(points.shape) == 2 and points.flat.format in _FLOATS):  # noqa: PLR2004  rows
+    if not (isinstance(points, Numbers) and len(points.shape) == 2 and points.flat.format in _FLOATS):  # noqa: PLR2004  a table: rows and columns
         return points
     xyz = _columns(points, 3)
     flat, width = xyz.flat, xyz.shape[1]

@@ -91,8 +91,11 @@ def test_paths_of_no_tracks_are_a_message(examples: dict[str, Message]) -> None:
     tracks = examples["Tracks"]
     none = type(tracks)(**{name: value[:0] if tracks.arrays.get(name) and name != "horizons" else value
                            for name, value in tracks.present()})  # fmt: skip
-    assert none.path_covariance.shape == (0, 3, 2, 2)  # type: ignore[attr-defined]
-    assert none.class_probability.shape == (0, 2)  # type: ignore[attr-defined]
+    assert isinstance(none, Tracks)
+    assert none.path_covariance is not None
+    assert none.path_covariance.shape == (0, 3, 2, 2)
+    assert none.class_probability is not None
+    assert none.class_probability.shape == (0, 2)
     for payload in (encode(none), encode_json(none)):
         assert decode(payload, Tracks) == none
     fields = plain(tracks)

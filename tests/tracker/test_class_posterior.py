@@ -209,7 +209,7 @@ def test_probabilities_of_another_group_are_refused() -> None:
     for wrong in (np.array([[0.0, 1.0, 0.0, 0.0]]), np.array([[2.0, 0.0, -1.0, 0.0]]), *others):
         other = optipmb.Density(
             density.stamp_ns, density.next_id, density.bernoulli, density.poisson, density.labels, None, wrong
-        )  # type: ignore[arg-type]  # on purpose
+        )  # type: ignore[arg-type]  # one of them is no array, which has to be refused too
         with pytest.raises(optipmb.DensityError):
             tracker.step(other, seen(parameters, 0.1))
 

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import TYPE_CHECKING, Final
 
 import structlog
 
 from optipmb_service.app import process
-from optipmb_service.app.loops import settle, unless
+from optipmb_service.app.loops import say_ready, settle
 from optipmb_service.grpc.server import Server
-from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
     from optipmb_service.app.loops import StopRequest
     from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.settings import Settings
+    from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
 
@@ -41,24 +40,16 @@ class _Gateway:
 async def run(settings: Settings) -> int:
     """Serve until SIGINT or SIGTERM; returns the exit status, as `process.run` does."""
 
-    async def serve(asked: StopRequest, health: ProcessHealth) -> bool | None:
-        log.info("connecting", endpoints=settings.connect)
-        client = await unless(asked, lambda: Client.opened(settings))
-        if client is None:
-            return None
-        try:
-            server = Server(settings, client)
-            health.metrics.add(server.metrics.figures)
-            await server.start()
-            health.report(_Gateway(client))
-            settle()
-            print(f"ready grpc={server.address} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
-            log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)
-            await asked.wait()
-            health.ends()
-            await server.stop()
-        finally:
-            await asyncio.to_thread(client.close)
-        return True
+    async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
+        server = Server(settings, client)
+        health.metrics.add(server.metrics.figures)
+        await server.start()
+        health.report(_Gateway(client))
+        settle()
+        say_ready("grpc", server.address, settings.connect)
+        log.info("ready", instance=settings.instance, grpc=server.address, connect=settings.connect)
+        await asked.wait()
+        health.ends()
+        await server.stop()
 
-    return await process.run(settings, serve)
+    return await process.run_client(settings, serve)

@@ -16,13 +16,12 @@ import structlog
 
 from optipmb_service.app import process
 from optipmb_service.app.clustering import nats_access
-from optipmb_service.app.loops import settle, unless
+from optipmb_service.app.loops import say_ready, settle
 from optipmb_service.cluster.log_writer import LogWriter
 from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.kept_tracks import order_of
 from optipmb_service.session.problems import problem_of
-from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.observability.metrics import Value
     from optipmb_service.settings import Settings
-    from optipmb_service.zenoh.client import Message
+    from optipmb_service.zenoh.client import Client, Message
 
 log = structlog.get_logger("optipmb_service")
 
@@ -139,25 +138,17 @@ class LogBridge:
 async def run(settings: Settings) -> int:
     """Write until SIGINT or SIGTERM; returns the exit status, as `process.run` does."""
 
-    async def serve(asked: StopRequest, health: ProcessHealth) -> bool | None:
-        log.info("connecting", endpoints=settings.connect)
-        client = await unless(asked, lambda: Client.opened(settings))
-        if client is None:
-            return None
-        try:
-            bridge = LogBridge(settings, client)
-            health.metrics.add(bridge.figures)
-            health.report(bridge)
-            settle()
-            print(f"ready log={settings.instance} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
-            log.info("ready", instance=settings.instance, connect=settings.connect)
-            while not asked.is_set():
-                await asked.wait(HOUSEKEEPING_S)
-                bridge.housekeeping()
-            health.ends()
-            await asyncio.to_thread(bridge.close)
-        finally:
-            await asyncio.to_thread(client.close)
-        return True
+    async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
+        bridge = LogBridge(settings, client)
+        health.metrics.add(bridge.figures)
+        health.report(bridge)
+        settle()
+        say_ready("log", settings.instance, settings.connect)
+        log.info("ready", instance=settings.instance, connect=settings.connect)
+        while not asked.is_set():
+            await asked.wait(HOUSEKEEPING_S)
+            bridge.housekeeping()
+        health.ends()
+        await asyncio.to_thread(bridge.close)
 
-    return await process.run(settings, serve)
+    return await process.run_client(settings, serve)

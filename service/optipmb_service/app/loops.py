@@ -18,9 +18,8 @@ import structlog
 from optipmb_service.observability.health import BEAT_S
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
-    from optipmb_service.settings import Settings
 
 SWITCH_S: Final = 0.0005
 """By default it is ten times as long, and a frame that meets two other threads waits 10 ms."""
@@ -87,10 +86,9 @@ class Heartbeat(Protocol):
         """Take it in."""
 
 
-def say_ready(settings: Settings) -> None:
-    """Print the line that starters wait for, the only one on stdout."""
-    endpoints = ",".join((*settings.endpoints, *settings.connect))
-    print(f"ready instance={settings.instance} endpoints={endpoints}", flush=True)  # noqa: T201 - it is the interface
+def say_ready(what: str, name: str, endpoints: Iterable[str]) -> None:
+    """Print the line that starters wait for, the only one on stdout: what is ready, and the endpoints it uses."""
+    print(f"ready {what}={name} endpoints={','.join(endpoints)}", flush=True)  # noqa: T201 - it is the interface
 
 
 def leave(status: int) -> None:

@@ -10,10 +10,11 @@ import structlog
 
 from optipmb_service import __version__
 from optipmb_service.app.edges import monitoring
-from optipmb_service.app.loops import StopRequest, beat
+from optipmb_service.app.loops import StopRequest, beat, unless
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -51,3 +52,20 @@ async def run(
     if ended is not None:
         log.info("stopped", drained=ended)
     return 0
+
+
+async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHealth, Client], Awaitable[None]]) -> int:
+    """Do the same with a connection to a router, which is closed at the end."""
+
+    async def connected(asked: StopRequest, health: ProcessHealth) -> bool | None:
+        log.info("connecting", endpoints=settings.connect)
+        client = await unless(asked, lambda: Client.opened(settings))
+        if client is None:
+            return None
+        try:
+            await serve(asked, health, client)
+        finally:
+            await asyncio.to_thread(client.close)
+        return True
+
+    return await run(settings, connected)

@@ -19,7 +19,7 @@ from optipmb_schemas.ros2.tracks import TOPICS
 from optipmb_schemas.ros2.types import own_types
 
 from optipmb_service.app import process
-from optipmb_service.app.loops import unless
+from optipmb_service.app.loops import say_ready, unless
 from optipmb_service.observability.health import BEAT_S, STUCK_S
 from optipmb_service.ros2 import graph
 from optipmb_service.ros2.bridge import Bridge
@@ -309,7 +309,7 @@ async def run(settings: Settings) -> int:
             work.open()
             health.report(work)
             streams = ",".join(settings.ros2.streams)
-            print(f"ready ros2={streams} endpoints={','.join(settings.connect)}", flush=True)  # noqa: T201 - what starters wait for
+            say_ready("ros2", streams, settings.connect)
             log.info("ready", instance=settings.instance, streams=streams, connect=settings.connect)
             while not asked.is_set():
                 await asyncio.to_thread(work.work, BEAT_S)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import structlog
 
 from optipmb_service.app import process
+from optipmb_service.app.loops import say_ready
 from optipmb_service.zenoh import Router
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ async def run(settings: Settings) -> int:
     async def serve(asked: StopRequest, health: ProcessHealth) -> bool:
         router = Router(settings)
         health.report(_Routing())
-        print(f"ready router={settings.instance} endpoints={','.join(settings.endpoints)}", flush=True)  # noqa: T201 - what starters wait for
+        say_ready("router", settings.instance, settings.endpoints)
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
         await asked.wait()
         health.ends()

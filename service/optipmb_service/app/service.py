@@ -340,7 +340,7 @@ class NoParent:
     def ready(self, service: Service) -> None:
         """Print the line that starters wait for."""
         del service
-        say_ready(self._settings)
+        say_ready("instance", self._settings.instance, (*self._settings.endpoints, *self._settings.connect))
 
     def beat(self) -> None:
         """Do nothing: nobody waits for a sign."""

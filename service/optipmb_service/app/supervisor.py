@@ -213,7 +213,7 @@ async def _supervised(
                 transport.serve_service(view.answer, QUERIES)
                 transport.announce()
                 with grpc_edge(settings, transport.client, view.add):
-                    say_ready(settings)
+                    say_ready("instance", settings.instance, (*settings.endpoints, *settings.connect))
                     log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
                     await asked.wait()
             view.ends()

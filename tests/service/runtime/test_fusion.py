@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,7 +81,8 @@ def test_a_car_keeps_its_id_through_the_service(start: Callable[..., Any]) -> No
 def test_after_a_restart_no_cache_is_waited_for_that_has_answered_or_is_gone(
     start: Callable[..., Any],
     tmp_path: Path,
-    gone: bool,  # noqa: FBT001 - pytest's way
+    *,
+    gone: bool,
 ) -> None:
     """The session goes on with what the caches of all its sensors held, long before `recovery_wait_s`."""
     frames = drive(40)
@@ -98,9 +100,12 @@ def test_after_a_restart_no_cache_is_waited_for_that_has_answered_or_is_gone(
             answers = front.query(KEYS.query(FUSED, "state"))
             return decode(answers[0][2], SessionState) if answers and answers[0][0] else None
 
+        def reached(frames: int) -> bool:
+            return (state := tracked()) is not None and state.frames == frames
+
         for first in range(0, 40, 8):
             send(*frames[first : first + 8])
-            until(lambda: (state := tracked()) is not None and state.frames == first + 8, "they are tracked")  # noqa: B023
+            until(partial(reached, first + 8), "they are tracked")
         assert service.stop()
         if gone:
             nodes.close()
@@ -109,7 +114,7 @@ def test_after_a_restart_no_cache_is_waited_for_that_has_answered_or_is_gone(
         send(*(one for one in frames[40:] if one.stream == FRONT.stream))
         rest = frames[:40] + [one for one in frames[40:] if not gone or one.stream == FRONT.stream]
         service, _ = start(listen=[endpoint], recovery_wait_s=60, **options)
-        until(lambda: (state := tracked()) is not None and state.frames == len(rest), "all are tracked", 50.0)
+        until(partial(reached, len(rest)), "all are tracked", 50.0)
         state = tracked()
     assert state is not None
     assert (state.digest, state.late, state.gaps) == (undisturbed_digest(rest), 0, 0)

@@ -132,7 +132,7 @@ def test_new_streams_are_asked_for_a_few_at_a_time() -> None:
 
 
 @pytest.mark.parametrize("cached", [True, False], ids=["cached", "plain"])
-def test_new_streams_wait_while_the_lease_is_renewed_late(cached: bool) -> None:  # noqa: FBT001 - a parameter
+def test_new_streams_wait_while_the_lease_is_renewed_late(*, cached: bool) -> None:
     """A member that renews its lease late subscribes to no new stream before it is in time again."""
     network = Network(**{"published" if cached else "announced": STREAMS})
     intake, _ = member_of(network, set(range(1, PARTITIONS)))
@@ -191,7 +191,7 @@ def test_a_step_that_fails_is_done_again(monkeypatch: pytest.MonkeyPatch, fails:
 
 
 @pytest.mark.parametrize("new", [True, False], ids=["new", "known"])
-def test_the_first_frame_of_a_new_stream_is_kept_until_it_is_asked_for(new: bool) -> None:  # noqa: FBT001 - a parameter
+def test_the_first_frame_of_a_new_stream_is_kept_until_it_is_asked_for(*, new: bool) -> None:
     """What a new stream sent is kept beyond the usual time until its member has asked; no other stream's is."""
     registry: Any = Registry.__new__(Registry)
     budget, keep_ns = ByteBudget(1 << 20), 10 * SECOND
@@ -321,7 +321,7 @@ def test_what_is_put_off_is_within_the_quota() -> None:
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_what_a_session_passes_on_is_kept_until_it_is_asked_for(asked: bool) -> None:  # noqa: FBT001 - a parameter
+def test_what_a_session_passes_on_is_kept_until_it_is_asked_for(*, asked: bool) -> None:
     """Frames of a session that leaves are kept also where `standby_s` is 0, and count as refused if nobody asks."""
     kept = Kept(keep_ns=0)
     kept.holds = False
