@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 OpenProbability = Annotated[float, Field(gt=0.0, lt=1.0)]
 NonZeroProbability = Annotated[float, Field(gt=0.0, le=1.0)]
+ModerateProbability = Annotated[float, Field(ge=1e-9, le=1.0 - 1e-9)]
+"""Far enough from 0 and 1 that products over frames and classes stay above the smallest number."""
 Positive = Annotated[float, Field(ge=1e-9, le=1e9)]
 """Far enough from zero and from infinity that squares and quotients of such numbers stay finite."""
 NonNegative = Annotated[float, Field(ge=0.0, le=1e9)]
@@ -282,10 +284,10 @@ class ClassParameters(_Table):
         description="eta_iou and the class gate take classes with the same group for one, and a track has a posterior "
         "over them (`optipmb.class_posterior`); none, the paper: the class alone",
     )
-    class_confusion: OpenProbability = Field(
+    class_confusion: ModerateProbability = Field(
         default=0.05, exclude_if=(0.05).__eq__, description="kappa: probability of another label of the group"
     )
-    class_memory: OpenProbability = Field(
+    class_memory: ModerateProbability = Field(
         default=0.95, exclude_if=(0.95).__eq__, description="lambda: what the posterior keeps per nominal period"
     )
     score_calibration: ScoreCalibration | None = Field(
