@@ -29,7 +29,7 @@ Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 OpenProbability = Annotated[float, Field(gt=0.0, lt=1.0)]
 NonZeroProbability = Annotated[float, Field(gt=0.0, le=1.0)]
 ModerateProbability = Annotated[float, Field(ge=1e-9, le=1.0 - 1e-9)]
-"""Far enough from 0 and 1 that products over frames and classes stay above the smallest number."""
+"""Far enough from 0 and 1 that products stay above the smallest number."""
 Positive = Annotated[float, Field(ge=1e-9, le=1e9)]
 """Far enough from zero and from infinity that squares and quotients of such numbers stay finite."""
 NonNegative = Annotated[float, Field(ge=0.0, le=1e9)]
@@ -310,9 +310,7 @@ class ClassParameters(_Table):
 class Parameters(_Table):
     """A profile: the classes to track, in the order of their indices, and the nominal period of the stream."""
 
-    name: Annotated[str, Field(min_length=1, max_length=64)] = Field(
-        description="name of the profile, repeated in results"
-    )
+    name: Annotated[str, Field(min_length=1, max_length=64, description="name of the profile, repeated in results")]
     nominal_period: Positive = Field(
         description="seconds between frames for which p_s and the counted limits hold; with another dt they are scaled"
     )
