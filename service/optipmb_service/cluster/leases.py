@@ -158,7 +158,7 @@ class LeaseTable:
         held: partitions that it holds, each with its fence; may be read by any thread.
         leaving: of these, those that it is about to leave, since when.
         draining: whether others are to have what it holds.
-        wanting: whether it has fewer partitions than it is to have.
+        moving: whether it has fewer partitions than it is to have, or more.
         changed_ns: when something but a renewal was seen last.
     """
 
@@ -168,12 +168,14 @@ class LeaseTable:
     held: dict[int, int] = field(default_factory=dict)
     leaving: dict[int, int] = field(default_factory=dict)
     draining: bool = False
-    wanting: bool = False
+    moving: bool = False
     changed_ns: int = 0
     _members: dict[str, _Watched] = field(default_factory=dict)
     _partitions: dict[int, tuple[int, str]] = field(default_factory=dict)
     _wishes: dict[int, str] = field(default_factory=dict)
     _looked_ns: int | None = None
+    _done_when: bool | None = None
+    """Whether it drained when there was nothing to write or to wait for; None: something has changed since."""
 
     def take_in(self, records: Iterable[Record], now_ns: int) -> None:
         """Take in what has changed, or that nothing has."""
@@ -182,17 +184,25 @@ class LeaseTable:
             for one in self._members.values():
                 one.seen_ns = now_ns
         self._looked_ns = now_ns
+        changed = False
         for record in records:
             self.position = max(self.position, record.revision)
             kind, _, name = record.key.partition("/")
             if kind == "member":
-                self._take_in_member(name, record, now_ns)
+                changed |= self._take_in_member(name, record, now_ns)
                 continue
-            self.changed_ns = now_ns
+            changed = True
             if kind == "wish":
                 self._wishes[int(name)] = record.value
             elif record.revision > self._partitions.get(int(name), (0, NOBODY))[0]:
                 self._set(int(name), record.revision, record.value)
+        if not changed:
+            return
+        self.changed_ns, self._done_when = now_ns, None
+        self._complete_members(now_ns)
+
+    def _complete_members(self, now_ns: int) -> None:
+        """Watch every holder of a partition; forget the first of many members that have ended."""
         for _, holder in self._partitions.values():
             if holder not in {NOBODY, self.member}:
                 self._members.setdefault(holder, _Watched(0, ALIVE, now_ns))
@@ -200,12 +210,13 @@ class LeaseTable:
         for name in ended[: max(0, len(ended) - MAX_ENDED)]:
             del self._members[name]
 
-    def _take_in_member(self, name: str, record: Record, now_ns: int) -> None:
+    def _take_in_member(self, name: str, record: Record, now_ns: int) -> bool:
+        """Take in the record of a member; return whether it is more than a renewal."""
         known = self._members.get(name)
-        if name != self.member and (known is None or record.revision > known.revision):
-            if known is None or known.state != record.value:
-                self.changed_ns = now_ns
-            self._members[name] = _Watched(record.revision, record.value, now_ns)
+        if name == self.member or (known is not None and record.revision <= known.revision):
+            return False
+        self._members[name] = _Watched(record.revision, record.value, now_ns)
+        return known is None or known.state != record.value
 
     def _set(self, partition: int, revision: int, holder: str) -> None:
         self._partitions[partition] = revision, holder
@@ -258,11 +269,9 @@ class LeaseTable:
             occupied: returns the partitions with a stream whose state is not kept yet; asked when one is to be left.
             gone: whether the process of a member has ended for certain.
         """
-        writes = [
-            Write(member_key(name), ENDED, one.revision)
-            for name, one in self._members.items()
-            if one.alive and (now_ns - one.seen_ns >= self.lease_ns or gone(name))
-        ]
+        writes = self._endings(now_ns, gone)
+        if not writes and self._done_when is self.draining:
+            return []  # the usual case
         mine, others = self._wished()
         # What is wished goes before an equal share.
         room = self._share() - len(mine)
@@ -274,7 +283,8 @@ class LeaseTable:
         for partition in [*sorted(wished - self.leaving.keys()), *surplus]:
             if len(self.leaving) < LEFT_AT_ONCE:
                 self.leaving[partition] = now_ns
-        self.wanting = room > 0 or not mine <= self.held.keys()
+        left = bool(self.leaving or wished or surplus)
+        self.moving = room > 0 or left or not mine <= self.held.keys()
         first = int.from_bytes(blake2b(self.member.encode(), digest_size=8).digest())
         for offset in range(PARTITIONS):  # each begins elsewhere, so that members seldom want the same one
             partition = (first + offset) % PARTITIONS
@@ -286,20 +296,34 @@ class LeaseTable:
                 room -= 1
             revision, _ = self._partitions.get(partition, (0, NOBODY))
             writes.append(Write(partition_key(partition), self.member, revision))
-        if self.leaving:
-            kept = occupied()
-            overdue_ns = now_ns - LEAVE_LEASES * self.lease_ns
-            writes += [
-                Write(partition_key(partition), NOBODY, self.held[partition])
-                for partition, since_ns in self.leaving.items()
-                if partition not in kept or since_ns <= overdue_ns
-            ]
+        writes += self._leavings(now_ns, occupied)
+        if not writes and not left:
+            self._done_when = self.draining
         return writes
+
+    def _endings(self, now_ns: int, gone: Callable[[str], bool]) -> list[Write]:
+        return [
+            Write(member_key(name), ENDED, one.revision)
+            for name, one in self._members.items()
+            if one.alive and (now_ns - one.seen_ns >= self.lease_ns or gone(name))
+        ]
+
+    def _leavings(self, now_ns: int, occupied: Callable[[], Container[int]]) -> list[Write]:
+        if not self.leaving:
+            return []
+        kept = occupied()
+        overdue_ns = now_ns - LEAVE_LEASES * self.lease_ns
+        return [
+            Write(partition_key(partition), NOBODY, self.held[partition])
+            for partition, since_ns in self.leaving.items()
+            if partition not in kept or since_ns <= overdue_ns
+        ]
 
     def written(self, write: Write, revision: int | None) -> None:
         """Take in what became of a write; None: refused, what is there instead comes with `take_in`."""
         if revision is None:
             return
+        self._done_when = None
         kind, _, name = write.key.partition("/")
         if kind == "member":
             self._members[name] = _Watched(revision, ENDED, 0)

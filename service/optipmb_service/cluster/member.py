@@ -35,7 +35,9 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 SECOND: Final = 1_000_000_000
-LOOKS_PER_LEASE: Final = 20
+LOOKS_PER_LEASE: Final = 8
+"""Each with a renewal: a request to a store elsewhere takes a millisecond of processor."""
+
 LONGEST_LOOK_S: Final = 0.1
 """Of a store on the same machine: how late a killed member may be noticed."""
 
@@ -207,7 +209,7 @@ class Member:
 
     def _run(self) -> None:
         while not self._ending.is_set():
-            hurries = self._table.wanting and self._clock() - self._table.changed_ns < self._lease_ns
+            hurries = self._table.moving and self._clock() - self._table.changed_ns < self._lease_ns
             self._wake.wait(min(self._look_s, SHORT_LOOK_S) if hurries else self._look_s)
             self._wake.clear()
             self._step()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import queue
 import threading
-from typing import TYPE_CHECKING, Final, Protocol, TypeVar, cast
+import time
+from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar, cast
 
 import optipmb_schemas as schemas
 import structlog
@@ -15,7 +17,10 @@ from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Iterator
+
+FULL_S: Final = 0.005
+"""How long the thread of the network waits before it looks again for room in a channel."""
 
 HEARTBEAT_S: Final = 1.0
 """How long the loss of a newest message of a cached publisher may stay unnoticed when no other one follows.
@@ -48,11 +53,56 @@ class Putting(Undeclared, Protocol):
         """Send it."""
 
 
+class Channel(Generic[_T]):
+    """What comes in on the threads of the network, in its order, for a thread that iterates over it.
+
+    Zenoh's own channels wake who waits for them ten times a second, to look for signals.
+
+    Args:
+        most: items that may wait; the thread of the network waits beyond that.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        # To put into this queue and to wake its reader takes half of what `queue.Queue` takes. It has no bound.
+        self._waiting: queue.SimpleQueue[_T | None] = queue.SimpleQueue()
+        self._closed = False
+
+    @property
+    def handler(self) -> tuple[Any, None]:
+        """What Zenoh is to be given."""
+        return directly(self._put)
+
+    def __iter__(self) -> Iterator[_T]:
+        """Yield what comes until the end."""
+        while (item := self._waiting.get()) is not None:
+            yield item
+
+    def close(self) -> None:
+        """End the reading after what has come."""
+        self._closed = True
+        self._waiting.put(None)
+
+    def _put(self, item: _T) -> None:
+        while self._waiting.qsize() >= self._most and not self._closed:
+            time.sleep(FULL_S)
+        self._waiting.put(item)
+
+
+def directly(take: Callable[[Any], None]) -> tuple[Any, None]:
+    """Have what comes handed over on the thread of the network.
+
+    A pair with something that could be read: with a callback alone Zenoh lets a subscription run in the background, and
+    what it has declared for recovery beside it is not withdrawn with it.
+    """
+    return zenoh.handlers.Callback(take, indirect=False), None
+
+
 class Readers:
     """What is read: each thing that was declared has a thread of its own, and no message ends the reading."""
 
     def __init__(self) -> None:
-        self._reading: list[tuple[Undeclared, threading.Thread]] = []
+        self._reading: list[tuple[Undeclared, Iterable[Any], threading.Thread]] = []
 
     def add(self, name: str, declared: Undeclared, handler: Iterable[_T], receive: Callable[[_T], None]) -> None:
         """Hand over what comes in, one after the other, until the end."""
@@ -67,13 +117,15 @@ class Readers:
 
         thread = threading.Thread(target=drain, name=f"reader-{name}", daemon=True)
         thread.start()
-        self._reading.append((declared, thread))
+        self._reading.append((declared, handler, thread))
 
     def stop(self, timeout: float) -> None:
         """Withdraw everything; what was received before is handed over within `timeout` seconds each."""
-        for declared, _ in self._reading:
+        for declared, handler, _ in self._reading:
             undeclare(declared)
-        for _, thread in self._reading:
+            if isinstance(handler, Channel):
+                handler.close()
+        for _, _, thread in self._reading:
             thread.join(timeout)
         self._reading.clear()
 

@@ -13,7 +13,7 @@ import queue
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import structlog
 import zenoh
@@ -23,7 +23,7 @@ from optipmb_schemas.late_join import LateJoin
 from optipmb_service.runtime.intake import ALL
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import line
-from optipmb_service.zenoh.handles import undeclare
+from optipmb_service.zenoh.handles import FULL_S, directly, undeclare
 from optipmb_service.zenoh.subscription import ask_cache
 
 if TYPE_CHECKING:
@@ -41,9 +41,6 @@ and Zenoh would take these for lost. Heartbeats tell of what was missed.
 """
 
 RECOVERY: Final = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
-
-FULL_S: Final = 0.005
-"""How long the thread of the network waits before it looks again for room in the queue."""
 
 
 class Topic:
@@ -97,10 +94,10 @@ class Topic:
         try:
             if passing is None and cached:
                 subscriber: Undeclared = zenoh.ext.declare_advanced_subscriber(
-                    self._session, key, _directly(put), history=NEWEST, recovery=RECOVERY
+                    self._session, key, directly(put), history=NEWEST, recovery=RECOVERY
                 )
             else:
-                passed = _directly(put if passing is None else lambda sample: put(partial(passing, sample)))
+                passed = directly(put if passing is None else lambda sample: put(partial(passing, sample)))
                 subscriber = self._session.declare_subscriber(key, passed)
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
@@ -152,12 +149,3 @@ class Topic:
             work()
         except Exception:
             log.exception("internal_error", reader=self._name)  # one message must not end the reading
-
-
-def _directly(take: Callable[[zenoh.Sample], None]) -> tuple[Any, None]:
-    """Have samples handed over on the thread of the network.
-
-    A pair with something that could be read: with a callback alone Zenoh lets a subscription run in the background, and
-    what it has declared for recovery beside it is not withdrawn with it.
-    """
-    return zenoh.handlers.Callback(take, indirect=False), None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import structlog
 import zenoh
@@ -11,7 +11,7 @@ from optipmb_schemas.late_join import ANSWER_S, LateJoin
 
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import line
-from optipmb_service.zenoh.handles import Readers
+from optipmb_service.zenoh.handles import Channel, Readers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,18 +51,19 @@ class Subscription:
         self._key = key
         self._receive = receive
         self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._hand_over, self._ask)
+        waiting: Channel[zenoh.Sample] = Channel(channel)
         try:
-            subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+            subscriber = zenoh.ext.declare_advanced_subscriber(
                 session,
                 key,
-                zenoh.handlers.FifoChannel(channel),
+                waiting.handler,
                 history=history,
                 recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
             )
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
         self._readers = Readers()
-        self._readers.add(key, subscriber, subscriber.handler, self._take)
+        self._readers.add(key, subscriber, waiting, self._take)
 
     def close(self, timeout: float = CLOSE_S) -> None:
         """End it; what came before is handed over within `timeout` seconds, and nothing afterwards."""

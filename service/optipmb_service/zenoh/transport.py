@@ -16,6 +16,7 @@ from optipmb_service.runtime.ports import Packet, TransportError
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.connection import close, line, opened
 from optipmb_service.zenoh.handles import (
+    Channel,
     Publisher,
     Question,
     Readers,
@@ -236,8 +237,9 @@ class Transport:
         return None
 
     def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
-        queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(CHANNEL // 16))
-        self._readers.add("queries", queryable, queryable.handler, _answering(answer))
+        channel: Channel[zenoh.Query] = Channel(CHANNEL // 16)
+        queryable = self._session.declare_queryable(key, channel.handler)
+        self._readers.add("queries", queryable, channel, _answering(answer))
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:
         """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
@@ -287,10 +289,9 @@ class Transport:
 
     def watch(self) -> None:
         """Log the nodes and routers that this session is linked to, as they come and go."""
-        listener = self._session.info.declare_transport_events_listener(
-            zenoh.handlers.FifoChannel(CHANNEL // 16), history=True
-        )
-        self._readers.add("links", listener, listener.handler, _log_link)
+        channel: Channel[zenoh.TransportEvent] = Channel(CHANNEL // 16)
+        listener = self._session.info.declare_transport_events_listener(channel.handler, history=True)
+        self._readers.add("links", listener, channel, _log_link)
 
     def _receive(self, sample: zenoh.Sample, receive: Callable[[Packet], None]) -> None:
         key = str(sample.key_expr)
@@ -335,12 +336,9 @@ class Transport:
 
     def _watch(self, name: str, pattern: str, told: Callable[[str, bool], None]) -> None:
         """Tell of the tokens of a pattern, those that are there and those that come and go."""
-        tokens = self._session.liveliness().declare_subscriber(
-            pattern, zenoh.handlers.FifoChannel(CHANNEL), history=True
-        )
-        self._readers.add(
-            name, tokens, tokens.handler, lambda one: told(str(one.key_expr), one.kind == zenoh.SampleKind.PUT)
-        )
+        channel: Channel[zenoh.Sample] = Channel(CHANNEL)
+        tokens = self._session.liveliness().declare_subscriber(pattern, channel.handler, history=True)
+        self._readers.add(name, tokens, channel, lambda one: told(str(one.key_expr), one.kind == zenoh.SampleKind.PUT))
 
     # The end
 
