@@ -30,6 +30,9 @@ _TANGENT = np.tan(BEAMS)
 _COSINE = np.cos(BEAMS)
 _STEP = 2.0 * np.pi / AZIMUTHS
 _AZIMUTH = np.linspace(-np.pi, np.pi, AZIMUTHS, endpoint=False)
+# Of every ray, beam by beam: the level part of a unit along it and the upward one, and where the level part points.
+_LEVEL, _UP = np.repeat(_COSINE, AZIMUTHS), np.repeat(np.sin(BEAMS), AZIMUTHS)
+_FORWARD, _LEFT = np.tile(np.cos(_AZIMUTH), len(BEAMS)), np.tile(np.sin(_AZIMUTH), len(BEAMS))
 
 
 @dataclass(frozen=True)
@@ -113,18 +116,20 @@ def _heights(bottom: Floats, top: Floats) -> tuple[Floats, Floats]:
 def scan(center: Floats, size: Floats, yaw: Floats, height: float, rng: np.random.Generator) -> Scan:
     """Return a scan with range noise and lost returns; arguments as in `cast`."""
     distance, owner, covered = cast(center, size, yaw, height)
-    beam, column = np.nonzero(owner != NOTHING)
-    target = owner[beam, column]
-    reach = distance[beam, column] / _COSINE[beam]
+    ray = np.flatnonzero(owner != NOTHING)
+    target = owner.ravel()[ray]
+    reach = distance.ravel()[ray] / _LEVEL[ray]
     part = reach / RANGE
     lost = np.where(target == GROUND, 0.05 + 0.5 * part, 0.03 + 0.12 * part**2)
     kept: Bools = rng.random(len(reach)) >= lost
     reach = reach + rng.laplace(0.0, 0.012, len(reach)) * (1.0 + part)
-    beam, column, target, reach = beam[kept], column[kept], target[kept], reach[kept]
-    level, cos, sin = reach * _COSINE[beam], np.cos(_AZIMUTH)[column], np.sin(_AZIMUTH)[column]
-    xyz = np.column_stack([level * cos, level * sin, reach * np.sin(BEAMS)[beam]])
+    ray, target, reach = ray[kept], target[kept], reach[kept]
+    level = reach * _LEVEL[ray]
+    xyz = np.empty((len(ray), 3), dtype=np.float32)
+    for axis, values in enumerate((level * _FORWARD[ray], level * _LEFT[ray], reach * _UP[ray])):
+        xyz[:, axis] = values
     return Scan(
-        xyz.astype(np.float32),
+        xyz,
         target,
         np.bincount(target[target >= 0], minlength=len(center)).astype(np.int64),
         covered,

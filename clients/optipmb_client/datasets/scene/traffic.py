@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optipmb_client.datasets.scene.crossing import Crossing
-from optipmb_client.datasets.scene.paths import STEP, Path, interpolate, resample, smooth
+from optipmb_client.datasets.scene.paths import STEP, Path, interpolate, resample, side_by_side, smooth
 from optipmb_client.datasets.scene.routes import Route
 from optipmb_client.geometry import Bools, Floats, Ints
 
@@ -40,6 +40,8 @@ _BACK_TO_WAY, _DAMPING = 0.5, 1.5
 """Acceleration back to the own way per metre beside it, and per metre a second."""
 _TO_THE_RIGHT = 0.05
 """So many metres two that would meet head-on count as right of each other."""
+_BESIDE: Floats = np.array([-0.3, 0.0, 0.3])
+"""Places on a pedestrian's way, from its own, that give the direction."""
 _SETTLING = 60
 """Steps before the scene begins in which those who start in one place move apart."""
 
@@ -61,11 +63,9 @@ class Vehicles:
 
     def __init__(self, routes: list[Route], size: Floats) -> None:
         self._routes = routes
-        longest = max(len(route.path.points) for route in routes)
         # Shorter routes go on at their last point; nobody gets there before the scene ends.
-        self._points = np.stack(
-            [np.pad(r.path.points, ((0, longest - len(r.path.points)), (0, 0)), "edge") for r in routes]
-        )
+        self._points = side_by_side([route.path for route in routes])
+        longest = self._points.shape[1]
         self._limit = np.stack([np.pad(r.limit, (0, longest - len(r.limit)), "edge") for r in routes])
         self._length, self._width = size[:, 0], size[:, 1]
         self._s = np.array([route.start for route in routes])
@@ -83,8 +83,8 @@ class Vehicles:
     def _axles(self) -> tuple[Floats, Floats]:
         reach = 0.3 * self._length
         return (
-            interpolate(self._points, self._all, self._s + reach),
-            interpolate(self._points, self._all, self._s - reach),
+            interpolate(self._points, self._all, self._s + reach, self._points.shape[1]),
+            interpolate(self._points, self._all, self._s - reach, self._points.shape[1]),
         )
 
     def step(self, h: float, crossing: Crossing) -> None:
@@ -108,13 +108,15 @@ class Vehicles:
         reach = 0.5 * np.maximum(self._length - self._width, 0.0)
         discs = center[:, None] + part[None, :, None] * (reach[:, None] * heading)[:, None]
         ahead = np.arange(1.0, _LOOK_AHEAD, 1.0)
-        way = interpolate(self._points, self._all[:, None], self._s[:, None] + 0.5 * self._length[:, None] + ahead)
-        # Who is too far away to be met is left out. Way and discs of each pair: (P, A, 1, 2) and (P, 1, 3, 2).
+        along = self._s[:, None] + 0.5 * self._length[:, None] + ahead
+        way = interpolate(self._points, self._all[:, None], along, self._points.shape[1])
+        # Who is too far away to be met is left out. Way and discs of each pair: (P, A, 2) and (P, 3, 2).
         apart = np.linalg.norm(center[:, None] - center, axis=2)
         far = _LOOK_AHEAD + 0.5 * (self._length[:, None] + self._length) + self._width[:, None] + self._width
         one, two = np.nonzero((apart < far) & (self._all[:, None] != self._all))
-        offset = way[one, :, None] - discs[two, None]
-        close = np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2).min(axis=2)
+        (x, y), (disc_x, disc_y) = np.moveaxis(way[one], 2, 0), np.moveaxis(discs[two], 2, 0)
+        squared = [(x - disc_x[:, k, None]) ** 2 + (y - disc_y[:, k, None]) ** 2 for k in range(len(part))]
+        close = np.sqrt(np.minimum(np.minimum(squared[0], squared[1]), squared[2]))
         touch = np.zeros((len(center), len(ahead), len(center)), dtype=np.bool_)
         touch[one, :, two] = close < 0.5 * (self._width[one] + self._width[two])[:, None] + 0.35
         hit = touch.any(axis=2)
@@ -165,6 +167,9 @@ class Walkers:
 
     def __init__(self, routes: list[Route]) -> None:
         self._routes = routes
+        self._points = side_by_side([route.path for route in routes])
+        self._count = np.array([[len(route.path.points)] for route in routes], dtype=np.int64).reshape(-1, 1)
+        self._all = np.arange(len(routes))[:, None]
         self._s = [route.start for route in routes]
         self._speed = [0.8 * float(r.limit[int(r.start / STEP)]) for r in routes]
         self._gate = [sum(g.stop < r.start for g in r.gates) for r in routes]
@@ -178,10 +183,10 @@ class Walkers:
 
     def state(self) -> tuple[Floats, Floats, Floats]:
         """Return centres (N, 2), yaws (N,) and velocities (N, 2)."""
-        center, along = np.empty((len(self._s), 2)), np.empty((len(self._s), 2))
-        for i, route in enumerate(self._routes):
-            before, center[i], after = route.path.at(np.array([self._s[i] - 0.3, self._s[i], self._s[i] + 0.3]))
-            along[i] = (after - before) / max(float(np.hypot(*(after - before))), 1e-9)
+        places = np.array(self._s)[:, None] + _BESIDE
+        before, center, after = interpolate(self._points, self._all, places, self._count).transpose(1, 0, 2)
+        along = after - before
+        along /= np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-9)[:, None]
         velocity = np.asarray(self._speed)[:, None] * along + self._drift
         return center + self._aside, np.arctan2(along[:, 1], along[:, 0]), velocity
 
