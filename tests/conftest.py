@@ -24,8 +24,8 @@ OTHERS = {
 }
 """Files whose tests `make test` leaves to `make alone` and `make accuracy`, by their marker."""
 
-# The same examples in every run; `--hypothesis-profile default` looks at others.
-hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None)
+# The same examples in every run, and fifty, unless a test says otherwise; `--hypothesis-profile default` looks at more.
+hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None, max_examples=50)
 hypothesis.settings.load_profile("same")
 
 

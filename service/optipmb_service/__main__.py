@@ -4,6 +4,7 @@ import sys
 
 from optipmb_service.app import health_command
 from optipmb_service.app.collector import collector_paused
+from optipmb_service.app.optional import without
 
 
 def main() -> None:
@@ -11,7 +12,8 @@ def main() -> None:
     if sys.argv[1:2] == ["health"]:
         sys.exit(health_command.main(sys.argv[2:]))
     try:
-        with collector_paused():
+        # structlog imports rich where typer has brought it, a twentieth of the start, for a colour that no log line has.
+        with collector_paused(), without("rich"):
             from optipmb_service.app import cli  # noqa: PLC0415 - a second that `health` can do without
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("optipmb"):

@@ -20,11 +20,11 @@ RULES = Rules(measure="distance", limit=2.0)
 
 def scene() -> tuple[DataSequence, Truth, ResultTable]:
     """Give a short scene, its truth, and the truth as tracks with one change of identity and some misses."""
-    sequence = open_dataset("scene", frames=30).sequences(["all"])[0]
+    sequence = open_dataset("scene", frames=20).sequences(["all"])[0]
     truth = sequence.truth()
     assert truth is not None
     rows = truth.take(~truth.ignored & (truth.frame % 7 != 3))
-    identity = np.where((rows.id == rows.id[0]) & (rows.frame > 15), 900, rows.id)
+    identity = np.where((rows.id == rows.id[0]) & (rows.frame > 10), 900, rows.id)
     columns = (rows.frame, identity, rows.label, rows.center, rows.size, rows.yaw)
     return sequence, truth, ResultTable(rows.labels, *columns, np.ones(len(rows)), rows.box2d)
 

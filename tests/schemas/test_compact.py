@@ -193,7 +193,7 @@ def test_fields_that_are_there_twice_or_unknown(tree: Any) -> None:
             assert not check(written(tree).replace(packed, more))
 
 
-@settings(max_examples=400)
+@settings(max_examples=200)
 @given(data=st.data())
 def test_every_number(examples: dict[str, Message], data: st.DataObject) -> None:
     """Numbers at and beyond the ends of every range, in any place."""
@@ -224,7 +224,7 @@ def written_with(example: Message, data: st.DataObject) -> bytes:
     return written(tree)
 
 
-@settings(max_examples=600)
+@settings(max_examples=200)
 @given(data=st.data())
 def test_damaged_bytes(examples: dict[str, Message], data: st.DataObject) -> None:
     """Bytes flipped, cut and put in: what is read is what the models make of it."""

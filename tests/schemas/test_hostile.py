@@ -47,7 +47,7 @@ def peak(payload: bytes, kind: type[Message], **options: Any) -> int:
 kinds = st.sampled_from(MESSAGES)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(payload=st.binary(max_size=300), kind=kinds)
 @example(payload=b"", kind=Detections)
 @example(payload=b"\xc1", kind=Detections)
@@ -62,7 +62,7 @@ def test_random_bytes(payload: bytes, kind: type[Message]) -> None:
         attempt(payload, kind, encoding=encoding)
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(data=st.data(), kind=kinds, in_json=st.booleans())
 def test_damaged_messages(
     examples: dict[str, Message], data: st.DataObject, kind: type[Message], *, in_json: bool
@@ -122,7 +122,7 @@ def put(value: Any, path: tuple[Any, ...], new: Any) -> Any:
     return copy
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(data=st.data(), kind=kinds, form=st.sampled_from(["blocks", "lists", "json"]))
 def test_values_of_other_types(
     examples: dict[str, Message], data: st.DataObject, kind: type[Message], form: str

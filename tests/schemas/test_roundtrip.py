@@ -265,7 +265,7 @@ messages: dict[type[Message], st.SearchStrategy[Message]] = {
 
 
 @pytest.mark.parametrize("kind", MESSAGES)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_every_message_comes_back_equal(kind: type[Message], data: st.DataObject) -> None:
     """Decoding what was encoded gives an equal message, as msgpack and as JSON, with and without a named encoding."""
@@ -276,7 +276,7 @@ def test_every_message_comes_back_equal(kind: type[Message], data: st.DataObject
 
 
 @pytest.mark.parametrize("kind", MESSAGES)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(data=st.data())
 def test_equal_messages_have_equal_bytes(kind: type[Message], data: st.DataObject) -> None:
     """A message and the one decoded from it encode to the same bytes."""

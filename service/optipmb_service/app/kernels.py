@@ -11,6 +11,7 @@ from typing import Final
 
 import optipmb
 from optipmb_service.app.collector import collector_paused
+from optipmb_service.app.optional import without
 
 UNUSED: Final = "scipy.linalg"
 COMPILER: Final = "libllvmlite"
@@ -24,12 +25,8 @@ def warm_up() -> None:
     kernel uses. It does without where there is none, so it is shown none.
     """
     with collector_paused():
-        if UNUSED not in sys.modules:
-            sys.modules[UNUSED] = None  # type: ignore[assignment]  # what makes an import fail, as Python has it
-            try:
-                import_module("numba.np.arraymath")
-            finally:
-                del sys.modules[UNUSED]
+        with without(UNUSED):
+            import_module("numba.np.arraymath")
         optipmb.warm_up()
     release_compiler()
 

@@ -86,7 +86,7 @@ def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> 
     )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(data=st.data(), count=st.integers(0, 3))
 def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.DataObject, count: int) -> None:
     """Whatever numbers the tracks hold, near every bound of the message: it is valid, or it is not made."""

@@ -49,7 +49,7 @@ def given_to(session: Session, frames: list[Detections]) -> list[Any]:
 IN_ORDER = in_order()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.permutations(range(len(IN_ORDER))), st.integers(0, len(IN_ORDER)))
 def test_any_interleaving_gives_the_state_of_frames_in_order(order: list[int], cut: int) -> None:
     """Tracks and state are the same bytes in whatever order frames come, and over a restart in between."""
