@@ -12,7 +12,7 @@ def main() -> None:
     if sys.argv[1:2] == ["health"]:
         sys.exit(health_command.main(sys.argv[2:]))
     try:
-        # structlog imports rich where typer has brought it, a twentieth of the start, for a colour that no log line has.
+        # structlog imports rich where typer has brought it: a twentieth of the start, for colours that no log line has.
         with collector_paused(), without("rich"):
             from optipmb_service.app import cli  # noqa: PLC0415 - a second that `health` can do without
     except ModuleNotFoundError as error:

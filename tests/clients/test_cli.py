@@ -245,9 +245,9 @@ def test_a_configuration_file_is_used(endpoint: str, tmp_path: Path, capsys: pyt
     assert str(tmp_path / "absent") in line
 
 
-def test_track_says_what_it_did(tmp_path: Path) -> None:
+def test_track_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Without --json a line per sequence and the folder of the results are printed."""
-    done = optipmb("track", *SMALL, "--sequences", "0000", "0001", "--out", tmp_path)
+    done = run_here(capsys, "track", *SMALL, "--sequences", "0000", "0001", "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert lines[0].startswith("0000: 8 frames, ")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from commands import optipmb
+from commands import run_here
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_client.load import Run, draw_runs, find_limit, generated, table_of
@@ -76,8 +76,8 @@ def test_runs_are_shown(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [("--streams", "0"), ("--dataset", "none"), ("--rate", "fast")])
-def test_wrong_use_is_one_line(options: tuple[str, ...]) -> None:
+def test_wrong_use_is_one_line(options: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     """A wrong option ends with status 2 and one line."""
-    result = optipmb("load", *options)
+    result = run_here(capsys, "load", *options)
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1

@@ -9,7 +9,7 @@ from typing import Any
 import bags
 import numpy as np
 import pytest
-from commands import optipmb, result_of
+from commands import result_of, run_here
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from optipmb_client.cli import run
@@ -121,10 +121,12 @@ def test_tracks_of_real_data_are_the_same_from_a_bag(tmp_path: Path) -> None:
     np.testing.assert_allclose(of_bag.covariance, of_data.covariance, rtol=1e-6, atol=1e-9)
 
 
-def test_a_bag_of_tracks_says_what_is_known_of_them(bag: Path, tmp_path: Path) -> None:
+def test_a_bag_of_tracks_says_what_is_known_of_them(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Another library reads ids, probabilities, poses, twists and covariances in ROS's order from the written bag."""
     table = tracks_of("rosbag", bag, tmp_path / "table")
-    done = optipmb("track", bag, "--profile", "scene", "--out", tmp_path / "tracks.mcap")
+    done = run_here(capsys, "track", bag, "--profile", "scene", "--out", tmp_path / "tracks.mcap")
     assert done.returncode == 0, done.stderr
     found = decoded(tmp_path / "tracks.mcap")
     assert set(found) == {f"/detector/boxes/tracks{end}" for end in ("", "/detections", "/markers", "/predicted")}
@@ -203,7 +205,7 @@ def test_the_command_tells_a_bag_from_other_files(
     bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`optipmb track PATH` goes by what the path is; a wrong one is one clear line and status 2."""
-    result = result_of(optipmb("track", bag, "--profile", "scene", "--out", tmp_path, "--json"))
+    result = result_of(run_here(capsys, "track", bag, "--profile", "scene", "--out", tmp_path, "--json"))
     assert (result["dataset"], result["sequences"][0]["name"], result["sequences"][0]["clouds"]) == (
         "rosbag",
         "detector.boxes",
@@ -326,7 +328,9 @@ def test_a_bag_without_detections_is_told(scene: DataSequence, tmp_path: Path) -
         open_dataset("rosbag", path)
 
 
-def test_classes_of_any_name_are_tracked(scene: DataSequence, tmp_path: Path) -> None:
+def test_classes_of_any_name_are_tracked(
+    scene: DataSequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Without a profile one is made for the bag; with one, classes are renamed to those that it has."""
     numbers = {"Car": "0", "Pedestrian": "1", "Cyclist": "2"}
 
@@ -339,7 +343,7 @@ def test_classes_of_any_name_are_tracked(scene: DataSequence, tmp_path: Path) ->
         return one._replace(message=json.loads(text))
 
     path = changed(scene, tmp_path / "numbers.mcap", change)
-    found = result_of(optipmb("track", path, "--out", tmp_path / "auto.mcap", "--json"))
+    found = result_of(run_here(capsys, "track", path, "--out", tmp_path / "auto.mcap", "--json"))
     assert (found["profile"], found["sequences"][0]["frames"]) == ("auto", 20)
     detected = [one for _, message in decoded(tmp_path / "auto.mcap")[DETECTIONS] for one in message.detections]
     assert {one.results[0].hypothesis.class_id for one in detected} == {"0", "1", "2"}
