@@ -72,6 +72,13 @@ class Input(NamedTuple):
     cached: bool = True
 
 
+def _inputs(streams: Iterable[str]) -> set[Input]:
+    """Return all subscriptions that there may be of these streams, and those that are of no single one."""
+    kinds: tuple[Kind, Kind] = ("detections", "points")
+    of_all = {Input("discovery"), Input("detections"), Input("points")}
+    return of_all | {Input(kind, stream, cached) for stream in streams for kind in kinds for cached in (False, True)}
+
+
 class Inputs(Protocol):
     """What is needed of the network."""
 
@@ -138,7 +145,10 @@ class Intake:
         )
         registry.caches = self
         self._subscribed: set[Input] = set()
-        self._known: set[str] = set()
+        self._known: dict[str, bool] = {}
+        """The streams whose inputs are in line, each with whether its publisher has a cache."""
+        self._aligned: object = None
+        """What they follow from beside the streams: where it changes, all are looked at."""
         self._announced: set[str] = set()
         self._lock = threading.Lock()
         self._came: set[int] = set()
@@ -313,7 +323,7 @@ class Intake:
         except Exception:
             with self._lock:
                 self._came |= came & self._member.partitions
-            self._known = known
+            self._known, self._aligned = known, None
             raise
 
     def _align(self, came: set[int], held: set[int], received: set[int], now_ns: int) -> None:
@@ -328,37 +338,54 @@ class Intake:
         if discovering and Input("discovery") not in self._subscribed and not everything:
             self._directory.adopt(now_ns)
         streams = self._directory.streams()
+        aligned = (held, received, everything, discovering)
+        anew, self._aligned = bool(came) or aligned != self._aligned, aligned
+        # Where thousands begin, each step is to look at those that have changed.
+        looked = streams if anew else dict(streams.items() - self._known.items())
+        gone = self._known.keys() - streams.keys()
+        strained = self._member.strained
+        later = self._later(looked, came, held, everything=everything, strained=strained)
+        if later:
+            looked = {stream: cached for stream, cached in looked.items() if stream not in later}
+        coming = self._coming(looked, came, held)
+        for session in coming:
+            self._registry.hold(session)
+        wanted = self._wanted(looked, received, everything=everything, discovering=discovering)
+        before = self._subscribed if anew else self._subscribed & _inputs(looked.keys() | gone)
+        for one in sorted(wanted - before):
+            self._inputs.subscribe(one.kind, one.stream, cached=one.cached)
+            self._subscribed.add(one)
+        left = before - wanted
+        self._inputs.unsubscribe((one.kind, one.stream, one.cached) for one in sorted(left))
+        self._subscribed -= left
+        self._announce(self._directory.announced(), strained=strained)
+        for stream in later:
+            del streams[stream]
+        self._known = streams
+        if coming:
+            self._take_up(coming)
+
+    def _later(
+        self, looked: dict[str, bool], came: set[int], held: set[int], *, everything: bool, strained: bool
+    ) -> set[str]:
+        """Return the new streams that are to be taken in by a later step."""
         session_of = self._registry.fusion.session_of
         new = [
             stream
-            for stream, cached in streams.items()
+            for stream, cached in looked.items()
             if stream not in self._known
             and (partition := partition_of(session_of(stream))) in held
             and not (cached and (everything or partition in came))
         ]
-        strained = self._member.strained
-        for stream in new[0 if strained else NEW_STREAMS :]:
-            del streams[stream]  # in a later step
         if len(new) > NEW_STREAMS and not strained:
             self._wake.set()
-        coming = self._coming(streams, came, held)
-        for session in coming:
-            self._registry.hold(session)
-        wanted = self._wanted(streams, received, everything=everything, discovering=discovering)
-        for one in sorted(wanted - self._subscribed):
-            self._inputs.subscribe(one.kind, one.stream, cached=one.cached)
-            self._subscribed.add(one)
-        self._inputs.unsubscribe((one.kind, one.stream, one.cached) for one in sorted(self._subscribed - wanted))
-        self._subscribed &= wanted
-        self._announce(self._directory.announced(), strained=strained)
-        self._known = set(streams)
-        if coming:
-            self._take_up(coming)
+        return set(new[0 if strained else NEW_STREAMS :])
 
     def _announce(self, streams: set[str], *, strained: bool) -> None:
         new = streams - self._announced
-        self._announced = (streams & self._announced) | set(islice(new, 0 if strained else NEW_STREAMS))
-        self._inputs.discover(self._announced)
+        announced = (streams & self._announced) | set(islice(new, 0 if strained else NEW_STREAMS))
+        self._inputs.discover(announced)
+        self._announced = announced
         if len(new) > NEW_STREAMS and not strained:
             self._wake.set()
 
@@ -380,16 +407,15 @@ class Intake:
     def _coming(self, streams: dict[str, bool], came: set[int], held: set[int]) -> list[str]:
         """Return the sessions that others may have received something of: those that came here, and new streams."""
         session_of = self._registry.fusion.session_of
-        own = self._directory.announced()
         coming = {session_of(stream) for stream in streams if came and partition_of(session_of(stream)) in came}
         coming |= {
             session
             for stream, cached in streams.items()
-            if not cached and stream not in self._known and stream not in own
+            if not cached and stream not in self._known and not self._directory.announces(stream)
             and partition_of(session := session_of(stream)) in held
             and self._registry.actor(session) is None
         }  # fmt: skip
-        return sorted(coming | self._registry.foreign(came))
+        return sorted(coming | self._registry.foreign(came) if came else coming)
 
     def _take_up(self, sessions: list[str]) -> None:
         packets: dict[str, list[tuple[Packet, bool]]] = {session: [] for session in sessions}

@@ -74,6 +74,11 @@ EVICT_EVERY_NS: Final = SECOND
 RIVAL_LEASES: Final = 3
 """Leases for which the token of an instance may stay whose stream has been taken over."""
 
+SWEEP_REST: Final = 200
+"""How many times as long as a look at all sessions took of the processor it rests before the next one."""
+
+MOST_REST_NS: Final = 5 * SECOND
+
 PARTS: Final = 4
 """What a stream's memory is divided into: mailbox, clouds, frames held, window."""
 
@@ -133,6 +138,7 @@ class Registry:
         self._past = MessageCounters()
         self._metrics = metrics
         self._full: dict[str, tuple[int, str]] = {}
+        self._sweep_ns = 0
         self._evicting: dict[str, int] = {}
         self._quotas = Quotas(
             Quota(settings.node_sessions, settings.node_rate, settings.node_mb_s * MEGABYTE),
@@ -276,6 +282,12 @@ class Registry:
             actors = sorted(self._actors.items())
         return [actor for _, actor in actors if actor.session is not None]
 
+    def _tracking(self) -> list[StreamActor]:
+        """Return the actors that have a session, in any order."""
+        with self._lock:
+            actors = list(self._actors.values())
+        return [actor for actor in actors if actor.session is not None]
+
     def actor(self, stream: str) -> StreamActor | None:
         """Return the actor of a stream that has a session."""
         with self._lock:
@@ -379,8 +391,20 @@ class Registry:
     # What the control loop has done now and then
 
     def sweep(self, now_ns: int) -> None:
-        """Log streams that fell silent, close sessions that have been idle for long, or are another instance's."""
-        for actor in self.actors():
+        """Log streams that fell silent, close sessions that have been idle for long, or are another instance's.
+
+        Where thousands are silent, that is done less often.
+        """
+        self._let_in()
+        if now_ns < self._sweep_ns:
+            return
+        began_ns = time.thread_time_ns()
+        self._sweep_all(now_ns)
+        self._sweep_ns = now_ns + min(MOST_REST_NS, SWEEP_REST * (time.thread_time_ns() - began_ns))
+
+    def _sweep_all(self, now_ns: int) -> None:
+        actors = self._tracking()
+        for actor in actors:
             if self._member.fence(actor.stream) is None:
                 # It began at the very moment in which its partition was left.
                 self.command(actor.stream, StreamActor.on_lost, urgent=True)
@@ -394,10 +418,9 @@ class Registry:
                     log.warning("stream_stale", stream=stream, age_s=round(age_s, 3))
             if now_ns - actor.meter.active_ns > self._settings.idle_s * SECOND and actor.mailbox.idle:
                 self.command(actor.stream, self._close_idle, urgent=False)
-        for stream, other in self._rivals.contested([actor.stream for actor in self.actors()], now_ns):
+        for stream, other in self._rivals.contested([actor.stream for actor in actors], now_ns):
             self._report("contested", stream, "one `store`, or `cluster`, for all instances", f"{other} tracks it too")
-        self._evict()
-        self._let_in()
+        self._evict(actors)
         self._trim(now_ns)
 
     def _trim(self, now_ns: int) -> None:
@@ -405,7 +428,8 @@ class Registry:
         lost: dict[str, list[bool]] = {}
         with self._foreign_lock:
             for stream, buffer in tuple(self._foreign.items()):
-                lost[stream] = buffer.trim(now_ns)
+                if dropped := buffer.trim(now_ns):
+                    lost[stream] = dropped
                 forgotten = len(self._foreign) > MAX_LIVES or now_ns - buffer.seen_ns > self._settings.idle_s * SECOND
                 if not buffer and forgotten:
                     del self._foreign[stream]
@@ -413,10 +437,12 @@ class Registry:
         for stream, dropped in lost.items():
             self._lose(stream, dropped)
 
-    def _evict(self) -> None:
+    def _evict(self, actors: list[StreamActor]) -> None:
         """Close sessions, the least recently used first, while all together keep more than the process may."""
-        held = [(actor.meter.active_ns, actor.held_bytes, actor) for actor in self.actors()]
+        held = [(actor.meter.active_ns, actor.held_bytes, actor) for actor in actors]
         excess = sum(size for _, size, _ in held) - self._settings.memory_mb * MEGABYTE // 2
+        if excess <= 0:
+            return
         for _, size, actor in sorted(held, key=lambda one: one[0]):
             if excess <= 0:
                 return
@@ -446,7 +472,7 @@ class Registry:
 
     def keep(self) -> None:
         """Have every session that changed give its state to the checkpoint writer."""
-        for actor in self.actors():
+        for actor in self._tracking():
             if actor.changed:  # thousands may be silent
                 actor.tell(StreamActor.keep)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import threading
 import time
 from collections import Counter
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from optipmb_schemas import Keys
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
+from optipmb_service.runtime import directory
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.intake import NEW_STREAMS, Intake
@@ -66,6 +68,28 @@ class Network:
         self.unasked.append(len({stream for _, stream, _ in self.subscribed} - asked))
         self.asked.append(list(sessions))
         return []
+
+
+class Following(Network):
+    """Keeps what is subscribed to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now: set[tuple[str, str, bool]] = set()
+
+    def subscribe(self, kind: str, stream: str, *, cached: bool) -> None:
+        """Add it."""
+        assert (kind, stream, cached) not in self.now
+        self.now.add((kind, stream, cached))
+
+    def unsubscribe(self, inputs: Iterable[object]) -> None:
+        """Take it away."""
+        left: Any = set(inputs)
+        assert left <= self.now
+        self.now -= left
+
+    def discover(self, streams: set[str]) -> None:
+        """Announcing is not looked at."""
 
 
 def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
@@ -161,6 +185,40 @@ def test_only_publishers_with_a_cache_are_subscribed_to_with_recovery() -> None:
     assert {stream for _, stream, recovered in network.subscribed if not recovered} == own.intersection(plain)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """Whatever streams and partitions came and went before, step by step, and whether publishers have caches."""
+    monkeypatch.setattr(directory, "FORGET_NS", 0)
+    chance = random.Random(seed)
+    held = set(range(PARTITIONS if seed == 0 else 30))
+    network = Following()
+    intake, _ = member_of(network, held)
+    seen = set()
+    for _ in range(300):
+        for stream in chance.sample(STREAMS[:60], chance.randrange(5)):
+            present = chance.random() < 0.6
+            if chance.random() < 0.5:
+                intake._published(f"{KEYS.detections(stream)}/@adv/pub/1/2/_", "token", present)
+            else:
+                intake._discovered(KEYS.discovered(stream, "other"), "other", present)
+        if chance.random() < 0.1:
+            partition = chance.randrange(PARTITIONS)
+            held ^= {partition}
+            intake.changed(partition, Change.HELD if partition in held else Change.LOST)
+        if chance.random() < 0.1:
+            intake._left.clear()
+        intake._expires_ns = 0
+        intake._step()
+        begins = Following()
+        fresh, _ = member_of(begins, held)
+        fresh._directory, fresh._left = intake._directory, dict(intake._left)
+        fresh._expires_ns = intake._expires_ns
+        fresh._step()
+        assert network.now == begins.now
+        seen.add(frozenset(network.now))
+    assert len(seen) > 30
+
+
 @pytest.mark.parametrize("fails", ["subscribe", "discover", "ask_recent", "take_up"])
 def test_a_step_that_fails_is_done_again(monkeypatch: pytest.MonkeyPatch, fails: str) -> None:
     """Sessions that are held while their streams come here are taken up, whatever raised in between."""
@@ -227,7 +285,7 @@ class Kept:
         registry._crowded = lambda: self.crowded
         registry._offer = self._offer
         registry._rivals = SimpleNamespace(contested=lambda *_: [])
-        registry._evict = lambda: None
+        registry._evict, registry._sweep_ns = lambda _: None, 0
         registry._quotas = SimpleNamespace(exceeded=lambda *_: self.exceeded)
         self.exceeded = ""
         registry._report = lambda code, *_: self.problems.append(code)
