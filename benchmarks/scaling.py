@@ -1,12 +1,14 @@
 """What streams and members cost a cluster on this machine: members, the NATS server and the router, each for itself.
 
-python benchmarks/scaling.py [--members N] [--streams N] [--rate HZ] [--objects N] [--seconds S] [--idle N] [--plain]
+python benchmarks/scaling.py [--members N] [--streams N] [--rate HZ] [--objects N] [--seconds S] [--idle N] [--begin HZ]
+                             [--plain] [--cached]
 
 Starts a NATS server, a router and members of one process each, and measures one after the other: the members alone;
 streams of few objects that send, from publishers with a cache as the client has them, or without (`--plain`); the same
 streams silent; one member more, which comes and goes; many streams that have sent one frame, from publishers that have
-gone. Processor time is the system's count for each process, so what else the machine does disturbs it little; times
-until something has happened are those of the clock on the wall.
+gone, or stay and have caches (`--cached`); one member more again. Processor time is the system's count for each
+process, so what else the machine does disturbs it little; times until something has happened are those of the clock on
+the wall.
 """
 
 from __future__ import annotations
@@ -252,10 +254,13 @@ class Measurement:
         self.figures["store_messages_per_member_s"] = alone.nats_messages_hz / arguments.members
         self.figures["member_mb"] = alone.members_mb / arguments.members
         with Connection(cluster.router.endpoint) as connection:
-            self._live(connection, alone)
-            self._one_more()
+            if arguments.streams:
+                self._live(connection, alone)
+                self._one_more()
         even(cluster)
-        self._idle()
+        with Connection(cluster.router.endpoint) as connection:
+            self._idle(connection)
+            self._one_more(of_idle=True)
 
     def _phase(self, name: str, before: Sample) -> Phase:
         self.phases.append(_phase(name, before, self._cluster.sample()))
@@ -311,30 +316,44 @@ class Measurement:
         figures["member_us_s_per_silent_stream"] = 1e6 * (silent.members_cpu - alone.members_cpu) / count
         figures["router_us_s_per_silent_stream"] = 1e6 * (silent.router_cpu - alone.router_cpu) / count
 
-    def _one_more(self) -> None:
-        cluster, figures = self._cluster, self.figures
-        began = time.monotonic()
+    def _one_more(self, *, of_idle: bool = False) -> None:
+        cluster, figures, kind = self._cluster, self.figures, "_of_idle" if of_idle else ""
+        before = cluster.sample()
+        time.sleep(QUIET_S)
+        still = _phase("", before, cluster.sample())
+        before, began = cluster.sample(), time.monotonic()
         last = cluster.add()
-        figures["member_starts_s"] = time.monotonic() - began
+        figures[f"member_starts_s{kind}"] = time.monotonic() - began
         even(cluster)
-        figures["member_has_its_share_s"] = time.monotonic() - began
+        figures[f"member_has_its_share_s{kind}"] = time.monotonic() - began
+        time.sleep(QUIET_S)
+        moved = self._phase(f"one member more begins, {len(cluster.members)} in all", before)
+        for name in ("members_cpu", "router_cpu", "nats_cpu", "nats_messages_hz"):
+            more = (getattr(moved, name) - getattr(still, name)) * moved.seconds
+            figures[f"more_{name.removesuffix('_hz')}{'' if name.endswith('_hz') else '_s'}{kind}"] = more
         before = cluster.sample()
         time.sleep(QUIET_S)
         self._phase(f"{len(cluster.members)} members", before)
-        _, figures["member_ends_s"] = last.end()
+        _, figures[f"member_ends_s{kind}"] = last.end()
 
-    def _idle(self) -> None:
+    def _idle(self, connection: Connection) -> None:
         arguments, cluster, figures, count = self._arguments, self._cluster, self.figures, self._arguments.idle
         still, began = cluster.sample(), time.monotonic()
         names = [named("idle", number) for number in range(count)]
         left, tries = names, 0
+        senders = []
         while left:  # a publisher without a cache loses messages where the network is busy
             tries += 1
             if tries > TRIES:
                 raise SystemExit(f"{len(left)} of {count} idle streams are not tracked")
             for number in paced(len(left), len(left) / arguments.begin):
                 frame = Sensor(left[number], objects=arguments.objects).detections(0)
-                self._session.put(KEYS.detections(frame.stream), schemas.encode(frame), encoding=DETECTIONS)
+                if arguments.cached:
+                    senders.append(connection.cached_sender(KEYS.detections(frame.stream), DETECTIONS, cache=100))
+                    senders[-1].put(schemas.encode(frame))
+                else:
+                    self._session.put(KEYS.detections(frame.stream), schemas.encode(frame), encoding=DETECTIONS)
+            figures[f"idle_tracked_when_sent_{tries}"] = self._owners.streams("idle")
             settled, seen = 0, 0
             while settled < SETTLED and seen < count:
                 time.sleep(0.5)
@@ -345,8 +364,15 @@ class Measurement:
         figures["idle_placed_s"], figures["idle_sent_s"] = time.monotonic() - began, count / arguments.begin
         time.sleep(5.0)  # the first checkpoints
         before = cluster.sample()
+        placed = _phase("", still, before)
         time.sleep(QUIET_S)
         quiet = self._phase(f"{count} idle streams more", before)
+        for name in ("members_cpu", "router_cpu", "nats_cpu"):
+            spent = (getattr(placed, name) - getattr(quiet, name)) * placed.seconds
+            figures[f"{name}_ms_until_an_idle_stream_is_tracked"] = 1e3 * spent / count
+        asked = (placed.nats_messages_hz - quiet.nats_messages_hz) * placed.seconds
+        figures["store_messages_until_an_idle_stream_is_tracked"] = asked / count
+        figures["member_us_s_per_idle_stream"] = 1e6 * quiet.members_cpu / count
         figures["member_kb_per_idle_stream"] = 1024 * (quiet.members_mb - still.members_mb) / count
         figures["router_kb_per_idle_stream"] = 1024 * (quiet.router_mb - still.router_mb) / count
         figures["nats_kb_per_idle_stream"] = 1024 * (quiet.nats_mb - still.nats_mb) / count
@@ -363,6 +389,7 @@ def main() -> None:
     parser.add_argument("--objects", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--idle", type=int, default=10_000, help="streams that send one frame")
+    parser.add_argument("--cached", action="store_true", help="idle streams whose publishers stay and have caches")
     parser.add_argument("--begin", type=float, default=500.0, help="idle streams that begin in a second")
     arguments = parser.parse_args()
     optipmb.warm_up()
