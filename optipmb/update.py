@@ -17,6 +17,7 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.density import PHI, STATE, V, X, Y, copy_state
+from optipmb.linearised import MODES, linearised_update
 from optipmb.motion import ORDER, SPREAD, WEIGHT, square_root, wrap
 from optipmb.position_noise import PLAIN
 from optipmb.prune import NEW
@@ -31,14 +32,18 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
+    Buffers = tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array]
 
 MEASURED = 5
 """Rows of z_M with a velocity; three without."""
 
 
 @kernel
-def workspace() -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Return the buffers of an update, to be used for one state after the other: root, chi, psi, nu, factor, W."""
+def workspace() -> Buffers:
+    """Return the buffers of an update, to be used for one state after the other.
+
+    They are root, chi, psi, nu, factor and W, and of the modes of `optipmb.linearised` weights, means and covariances.
+    """
     return (
         np.empty((STATE, STATE)),
         np.empty((2 * STATE, STATE)),
@@ -46,6 +51,9 @@ def workspace() -> tuple[Array, Array, Array, Array, Array, Array]:
         np.empty(MEASURED),
         np.empty((MEASURED, MEASURED)),
         np.empty((STATE, MEASURED)),
+        np.empty(MODES),
+        np.empty((MODES, STATE)),
+        np.empty((MODES, STATE, STATE)),
     )
 
 
@@ -114,7 +122,7 @@ def ukf_update(
     covariance: Array,
     z: Array,
     sigma: Array,
-    buffers: tuple[Array, Array, Array, Array, Array, Array],
+    buffers: Buffers,
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
@@ -138,7 +146,7 @@ def ukf_update(
     """
     with_velocity = not (math.isnan(z[2]) or math.isnan(z[3]))
     size = MEASURED if with_velocity else 3
-    root, chi, psi, innovation, factor, weighted = buffers
+    root, chi, psi, innovation, factor, weighted, _, _, _ = buffers
     repaired = square_root(covariance, root)
     v, phi = mean[V], mean[PHI]
 
@@ -214,105 +222,3 @@ def ukf_update(
             covariance_out[t, s] = value
     mean_out[PHI] = wrap(mean_out[PHI])
     return repaired
-
-
-@kernel
-def linearised_update(
-    mean: Array,
-    covariance: Array,
-    z: Array,
-    sigma: Array,
-    iterations: int,
-    buffers: tuple[Array, Array, Array, Array, Array, Array],
-    mean_out: Array,
-    covariance_out: Array,
-) -> None:
-    """Update one state with a measurement that has a velocity, by iterated posterior linearisation.
-
-    The UKF with kappa = 0 puts its sigma points at sqrt(6) deviations. Where the heading's is near one radian they lie
-    beyond half a turn, and the posterior claims to know far more than it does. Here H is replaced by the linear
-    function A x + b, with error covariance Omega, that is best in the mean square over the posterior of the iteration
-    before, the first time over the prior (Garcia-Fernandez et al., 2015); the Kalman update of the prior with it is the
-    next. Its moments are exact: with w = v_x + i v_y = v e^{i phi}, (v, phi) Gaussian, s = P_phi, c = P_{v phi},
-
-        E[w] = e^{i phi - s / 2} (v + i c),    E[w^2] = e^{2 i phi - 2 s} [(v + 2 i c)^2 + P_v],    E|w|^2 = v^2 + P_v
-        A_v = E[dw / dv] = e^{i phi - s / 2},    A_phi = E[dw / dphi] = i E[w],    Omega = cov(w) - A P A'
-
-    Args:
-        mean: (6,) m_+.
-        covariance: (6, 6) P_+.
-        z: (5,) z_M.
-        sigma: (6,) as in `ukf_update`.
-        iterations: how often, at least once.
-        buffers: of `workspace`; what they hold does not matter.
-        mean_out: (6,) receives m.
-        covariance_out: (6, 6) receives P.
-    """
-    _, _, _, innovation, factor, weighted = buffers
-    v, phi = mean[V], mean[PHI]
-    p_v, c, s = covariance[V, V], covariance[V, PHI], covariance[PHI, PHI]
-    for _ in range(iterations):
-        cos_phi, sin_phi = math.cos(phi), math.sin(phi)
-        shrunk = math.exp(-0.5 * s)
-        along_x, along_y = shrunk * cos_phi, shrunk * sin_phi  # A_v
-        w_x, w_y = along_x * v - along_y * c, along_y * v + along_x * c  # E[w]; A_phi = (-w_y, w_x)
-        real, imaginary = v * v - 4.0 * c * c + p_v, 4.0 * v * c
-        cos_2, sin_2 = math.cos(2.0 * phi), math.sin(2.0 * phi)
-        square_x = math.exp(-2.0 * s) * (cos_2 * real - sin_2 * imaginary)  # E[w^2]
-        square_y = math.exp(-2.0 * s) * (sin_2 * real + cos_2 * imaginary)
-        length = v * v + p_v  # E|w|^2
-        omega_xx = 0.5 * (length + square_x) - w_x * w_x
-        omega_yy = 0.5 * (length - square_x) - w_y * w_y
-        omega_xy = 0.5 * square_y - w_x * w_y
-        omega_xx -= along_x * along_x * p_v - 2.0 * along_x * w_y * c + w_y * w_y * s
-        omega_yy -= along_y * along_y * p_v + 2.0 * along_y * w_x * c + w_x * w_x * s
-        omega_xy -= along_x * along_y * p_v + (along_x * w_x - along_y * w_y) * c - w_x * w_y * s
-
-        # P_+ A' and the innovation of the linear function about the prior.
-        for r in range(STATE):
-            weighted[r, 0], weighted[r, 1], weighted[r, 4] = covariance[r, X], covariance[r, Y], covariance[r, PHI]
-            weighted[r, 2] = along_x * covariance[r, V] - w_y * covariance[r, PHI]
-            weighted[r, 3] = along_y * covariance[r, V] + w_x * covariance[r, PHI]
-        ahead, turn = mean[V] - v, mean[PHI] - phi
-        innovation[0], innovation[1] = z[0] - mean[X], z[1] - mean[Y]
-        innovation[2] = z[2] - (w_x + along_x * ahead - w_y * turn)
-        innovation[3] = z[3] - (w_y + along_y * ahead + w_x * turn)
-        innovation[4] = 0.5 * wrap(2.0 * (z[4] - phi)) - turn
-
-        # S = A P_+ A' + R + Omega, factored in place; then W = P_+ A' L^-T and u = L^-1 nu.
-        for q in range(MEASURED):
-            factor[0, q], factor[1, q], factor[4, q] = weighted[X, q], weighted[Y, q], weighted[PHI, q]
-            factor[2, q] = along_x * weighted[V, q] - w_y * weighted[PHI, q]
-            factor[3, q] = along_y * weighted[V, q] + w_x * weighted[PHI, q]
-            factor[q, q] += sigma[q] * sigma[q]
-        factor[2, 2] += omega_xx
-        factor[3, 3] += omega_yy
-        factor[3, 2] += omega_xy
-        if sigma[MEASURED] != 0.0:
-            factor[1, 0] += sigma[MEASURED]
-        for r in range(MEASURED):
-            for q in range(r + 1):
-                value = factor[r, q]
-                for k in range(q):
-                    value -= factor[r, k] * factor[q, k]
-                factor[r, q] = math.sqrt(value) if r == q else value / factor[q, q]
-            for k in range(r):
-                innovation[r] -= factor[r, k] * innovation[k]
-            innovation[r] /= factor[r, r]
-            for t in range(STATE):
-                for k in range(r):
-                    weighted[t, r] -= weighted[t, k] * factor[r, k]
-                weighted[t, r] /= factor[r, r]
-        for r in range(STATE):
-            mean_out[r] = mean[r]
-            for k in range(MEASURED):
-                mean_out[r] += weighted[r, k] * innovation[k]
-            for t in range(r + 1):
-                value = covariance[r, t]
-                for k in range(MEASURED):
-                    value -= weighted[r, k] * weighted[t, k]
-                covariance_out[r, t] = value
-                covariance_out[t, r] = value
-        v, phi = mean_out[V], mean_out[PHI]
-        p_v, c, s = covariance_out[V, V], covariance_out[V, PHI], covariance_out[PHI, PHI]
-    mean_out[PHI] = wrap(mean_out[PHI])

@@ -21,7 +21,7 @@ Size, height, existence and score stay as the tracker tells them.
 
 from collections.abc import Iterator
 from dataclasses import fields, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -156,9 +156,11 @@ def _predictions(
 ) -> tuple[Floats, Floats, Floats]:
     """Return m- (R, 6), P- (R, 6, 6) and G (R, 6, 6) of filtered states, each over its own time dt (R,), s."""
     root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
+    classes: Any = np.array(table.classes)
+    classes["linearisations"] = 0  # the smoother is the unscented one
     predicted, spread, cross = np.empty_like(mean), np.empty_like(covariance), np.empty_like(covariance)
     for row, c in enumerate(label.tolist()):
-        own = table.classes[c]
+        own = classes[c]
         predict_state(mean[row], covariance[row], dt[row], own, root, points, predicted[row], spread[row])
         # The deviations X - m_k are SPREAD times the columns of the root, once plus and once minus.
         cross[row, ORDER] = root @ (points[0::2] - points[1::2]) * (SPREAD * WEIGHT)

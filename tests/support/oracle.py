@@ -156,7 +156,7 @@ class Oracle:
             Q = np.diag(np.square([q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration]))
             tau, straight = c.acceleration_time or math.inf, c.motion == "cv"
             component.mean, component.covariance = predict(
-                component.mean, component.covariance, Q, dt, tau, straight=straight
+                component.mean, component.covariance, Q, dt, tau, straight=straight, exact=c.linearisations > 0
             )
             survival = c.survival ** (dt / self.nominal)
             if isinstance(component, Bernoulli):
