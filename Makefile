@@ -73,8 +73,9 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
+# Less urgent than the kernels, which the tests wait for.
 types: install
-	$(BIN)/mypy
+	nice $(BIN)/mypy
 
 # Kernels are compiled once, before processes that would each compile them.
 kernels: install

@@ -78,7 +78,7 @@ class Shifted:
 
 def test_detections_are_those_of_the_tracks(tmp_path: Path) -> None:
     """Tracked offline and evaluated: both columns are there, and detections that are raised by 3 m are 3 m too high."""
-    dataset = open_dataset("scene")
+    dataset = open_dataset("scene", frames=80)
     sequences = dataset.sequences(["all"])[:1]
     list(track(dataset, sequences, tmp_path, parameters=optipmb.load_profile("scene"), full=True))
     recordings = load_recordings("scene", sequences, tmp_path)
@@ -97,7 +97,7 @@ def test_detections_are_those_of_the_tracks(tmp_path: Path) -> None:
 
 def test_other_detections_are_noticed(tmp_path: Path) -> None:
     """Tracks of some classes, compared with the detections of all: headings are judged, and the reason is told."""
-    dataset = open_dataset("scene")
+    dataset = open_dataset("scene", frames=80)
     sequences = dataset.sequences(["all"])[:1]
     list(track(dataset, sequences, tmp_path, parameters=optipmb.load_profile("scene"), classes=["Car"], full=True))
     one = load_recordings("scene", sequences, tmp_path)[0]
