@@ -38,6 +38,7 @@ from optipmb import (
 from optipmb_client.datasets import DataSequence, DetectionFrame
 from optipmb_client.errors import UsageError
 from optipmb_client.geometry import Floats, Ints
+from optipmb_client.kernels import load_kernels
 from optipmb_client.recording import selected_frames
 from optipmb_client.smoothing import Smoother
 
@@ -358,10 +359,6 @@ def _steps(
         yield given, result, left_out, took
 
 
-_warm = functools.cache(warm_up)
-"""Once in each process."""
-
-
 def track_whole(
     parameters: Parameters,
     sequence: DataSequence,
@@ -377,7 +374,7 @@ def track_whole(
         UsageError: A frame holds values that the tracker refuses.
         DatasetError: The sequence cannot be read.
     """
-    _warm()
+    load_kernels()
     begun = time.monotonic()
     found: dict[int, NamedTracks] = {}
     steps: list[int] = []
