@@ -204,14 +204,14 @@ class Subscription:
         payload = sample.payload.to_bytes()
         self._inbox.put(Arrival(str(sample.key_expr), payload, str(sample.encoding), arrived))
 
-    def _ask(self, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[], None]) -> None:
+    def _ask(self, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[bool], None]) -> None:
         def take(answer: zenoh.Reply) -> None:
             if (sample := answer.ok) is not None:
                 reply(sample)
 
         self._session.get(
             selector,
-            zenoh.handlers.Callback(take, end),
+            zenoh.handlers.Callback(take, lambda: end(True)),
             accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=ANSWER_S,

@@ -75,15 +75,15 @@ class LateJoin(Generic[_S]):
 
     Args:
         receive: takes a sample; never called by two threads at once, nor after `close`. It must not raise.
-        ask: queries a selector; calls its second argument with each reply, and its third when no more will come, on any
-            thread but the one that asks.
+        ask: queries a selector; calls its second argument with each reply, and its third when no more will come, with
+            whether all that were asked have answered, on any thread but the one that asks.
         answered: told the key of a publisher when all has been handed over that its cache held. It must not raise.
     """
 
     def __init__(
         self,
         receive: Callable[[_S], object],
-        ask: Callable[[str, Callable[[_S], None], Callable[[], None]], object],
+        ask: Callable[[str, Callable[[_S], None], Callable[[bool], None]], object],
         answered: Callable[[str], object] = lambda _: None,
     ) -> None:
         self._receive = receive
@@ -179,9 +179,9 @@ class LateJoin(Generic[_S]):
         early: list[_S] = []
         zid, eid = source
         selector = f"{key}/@adv/pub/{zid}/{eid}/**?_sn={gap.first}..{gap.last}"
-        self._ask(selector, early.append, lambda: self._answered(source, key, gap, early))
+        self._ask(selector, early.append, lambda complete: self._answered(source, key, gap, early, complete=complete))
 
-    def _answered(self, source: _Source, key: str, gap: "_Gap[_S]", early: list[_S]) -> None:
+    def _answered(self, source: _Source, key: str, gap: "_Gap[_S]", early: list[_S], *, complete: bool) -> None:
         further = None
         with self._lock:
             if self._closed:
@@ -193,7 +193,8 @@ class LateJoin(Generic[_S]):
                 waiting = self._taken(source)
                 self._hand_over(source, waiting[0])
                 further = self._follow(source, waiting[1:])
-            if further is None and (waits is gap.behind or waits is None):  # else a later gap is still asked for
+            # Else a later gap is still asked for, or the cache may hold what has not come.
+            if complete and further is None and (waits is gap.behind or waits is None):
                 self._told(key)
         self._ask_for(source, key, further)
 

@@ -38,7 +38,7 @@ class Joined:
     """A subscription with its caches: what was handed over, and the queries that wait to be answered."""
 
     received: list[object] = field(default_factory=list)
-    asked: list[tuple[str, Callable[[Sample], None], Callable[[], None]]] = field(default_factory=list)
+    asked: list[tuple[str, Callable[[Sample], None], Callable[[bool], None]]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.join: LateJoin[Sample] = LateJoin(
@@ -52,12 +52,12 @@ class Joined:
         for number in numbers:
             self.join.take(sample(number, source))
 
-    def answer(self, *numbers: int) -> None:
-        """The cache's answer to the oldest query."""
+    def answer(self, *numbers: int, complete: bool = True) -> None:
+        """The cache's answer to the oldest query; one that is not complete comes too late."""
         _, reply, end = self.asked.pop(0)
         for number in numbers:
             reply(sample(number))
-        end()
+        end(complete)
 
 
 def sample(number: int, source: Entity = Entity()) -> Sample:
@@ -96,6 +96,15 @@ def test_a_gap_is_asked_for_once() -> None:
     one.answer()
     one.take(5, 8)
     assert (one.received, one.asked) == ([0, 1, 2, 3, 4, 6, 7, "a/b", 5, 8], [])
+
+
+def test_a_cache_that_does_not_answer_is_not_said_to_have_answered() -> None:
+    """What waited for it is handed over all the same, and so is what came of the answer."""
+    one = Joined()
+    one.take(0, 3)
+    one.answer(2, complete=False)
+    one.take(4)
+    assert one.received == [0, 2, 3, 4]
 
 
 def test_one_publisher_does_not_wait_for_another() -> None:

@@ -26,7 +26,7 @@ TOKEN_NS: Final = SECOND
 """How long the token of a publisher whose messages can be recovered may come after its first message."""
 
 BACK_NS: Final = 5 * SECOND
-"""How long a token may come after the start of this process, or back: who lost its router tries every 4 s at least."""
+"""How long a token may come after a session has begun, or back: who lost its router tries every 4 s at least."""
 
 MAX_UNPROVEN: Final = 256
 """Streams without a session that this instance announces at once: each costs members a token and subscriptions."""
@@ -64,11 +64,11 @@ class StreamDirectory:
         instance: the name of this one.
         idle_ns: silence after which an announced stream is announced no longer.
         has_session: whether a stream is tracked, here or elsewhere.
-        began_ns: since when tokens are heard of.
     """
 
-    def __init__(self, instance: str, idle_ns: int, has_session: Callable[[str], bool], began_ns: int = 0) -> None:
-        self._began_ns = began_ns
+    def __init__(self, instance: str, idle_ns: int, has_session: Callable[[str], bool]) -> None:
+        self.began_ns = 0
+        """Since when tokens are heard of, monotonic; set by whoever hears them."""
         self._instance = instance
         self._idle_ns = idle_ns
         self._has_session = has_session
@@ -169,7 +169,7 @@ class StreamDirectory:
             there = (stream for stream in self._nodes.get(node, ()) if self._streams[stream].tokens)
             found = {stream: True for stream in there if belongs(stream)}
             for stream in sensors:
-                known = self._streams.get(stream, _Known(left_ns=self._began_ns))
+                known = self._streams.get(stream, _Known(left_ns=self.began_ns))
                 if known.left_ns is not None and now_ns - known.left_ns < BACK_NS:
                     found[stream] = False
         return found

@@ -109,8 +109,8 @@ class Inputs(Protocol):
     def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
         """Return what other instances have received lately of sessions, each packet with whether it is a frame."""
 
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]]], None]) -> None:
-        """Call `then` soon with what the caches of a stream hold of its detections, all frames."""
+    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
+        """Call `then` soon with what the caches of a stream hold, all frames, and with whether all have answered."""
 
     def pass_through(self, then: Callable[[], None]) -> None:
         """Call `then` when all that has come until now is handed over."""
@@ -138,10 +138,7 @@ class Intake:
         self._linger_ns = round(linger_s * SECOND)
         session_of = registry.fusion.session_of
         self._directory = StreamDirectory(
-            registry.instance,
-            round(idle_s * SECOND),
-            lambda stream: registry.tracked(session_of(stream)),
-            time.monotonic_ns(),
+            registry.instance, round(idle_s * SECOND), lambda stream: registry.tracked(session_of(stream))
         )
         registry.caches = self
         self._subscribed: set[Input] = set()
@@ -168,6 +165,7 @@ class Intake:
         self._inputs.receive(
             registry.frame, registry.cloud, self._noticed, registry.passed_by, registry.caches_answered
         )
+        self._directory.began_ns = time.monotonic_ns()  # a start may take long before
         self._inputs.watch_streams(self._published, self._discovered)
         self._step()
         self._thread.start()
@@ -247,8 +245,11 @@ class Intake:
         node = node_of(session)
         return self._directory.awaited(node, lambda one: session_of(one) == session, sensors, time.monotonic_ns())
 
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]]], None]) -> None:
-        """Call `then` soon, on a thread that it must not keep, with what the caches of a stream hold, all frames."""
+    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
+        """Call `then` soon with what the caches of a stream hold, all frames, and with whether all have answered.
+
+        It is called on a thread that it must not keep.
+        """
         self._inputs.ask_cache(stream, then)
 
     def handed_over(self, timeout: float) -> bool:
@@ -358,6 +359,8 @@ class Intake:
         left = before - wanted
         self._inputs.unsubscribe((one.kind, one.stream, one.cached) for one in sorted(left))
         self._subscribed -= left
+        if not everything and any(one.kind == "detections" for one in left):
+            self._registry.forget_caches({one.stream for one in self._subscribed if one.kind == "detections"})
         self._announce(self._directory.announced(), strained=strained)
         for stream in later:
             del streams[stream]

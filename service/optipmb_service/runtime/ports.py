@@ -57,8 +57,10 @@ class Caches(Protocol):
             sensors: streams that were there before; their publishers may come back.
         """
 
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]]], None]) -> None:
+    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
         """Call `then` soon, on a thread that it must not keep, with what the caches of a stream hold, all frames.
+
+        It is told, too, whether all caches have answered in time.
 
         Raises:
             TransportError: the network is closed.

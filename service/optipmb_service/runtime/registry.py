@@ -237,6 +237,12 @@ class Registry:
         if actor is not None and actor.mailbox.offer_command(lambda: actor.on_caches_answered(stream), urgent=False):
             self._scheduler.submit(actor)
 
+    def forget_caches(self, received: set[str]) -> None:
+        """Forget which caches have answered, but for streams that are received still: they hold more by now."""
+        with self._foreign_lock:
+            for buffer in self._foreign.values():
+                buffer.answered &= received
+
     def _hand(self, stream: str, packet: Packet, *, frame: bool) -> None:
         offered = Mailbox.offer_frame if frame else Mailbox.offer_cloud
         if not self._offer(stream, lambda actor: offered(actor.mailbox, packet)):

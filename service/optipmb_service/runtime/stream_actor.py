@@ -22,6 +22,7 @@ import structlog
 
 from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.decoding import message_of
+from optipmb_service.runtime.directory import BACK_NS
 from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.ports import Packet, TransportError
 from optipmb_service.runtime.stream_counters import StreamCounters
@@ -322,23 +323,27 @@ class StreamActor:
 
     def _awaits(self, session: Session) -> bool:
         """Whether the caches of sensors may hold what has not come; those that have not answered are asked."""
-        # While a session is young, there may be sensors that it does not know; its own name stands for them.
-        sensors = {*session.sensors, self.stream} if session.young else session.sensors
         caches = self._context.caches()
-        awaited = caches.awaited(self.stream, sensors)
+        awaited = caches.awaited(self.stream, session.sensors)
         for stream, is_there in awaited.items():
             if is_there and stream not in self._asked:
                 self._asked.add(stream)
                 with contextlib.suppress(TransportError):  # the end
                     caches.ask_cache(stream, partial(self._take_cached, stream))
-        return not awaited.keys() <= self._answered
+        # Tokens of sensors that a young session does not know may be on their way.
+        young_ns = session.young_since_ns
+        is_young = young_ns is not None and time.monotonic_ns() - young_ns < BACK_NS
+        return is_young or not awaited.keys() <= self._answered
 
-    def _take_cached(self, stream: str, packets: list[tuple[Packet, bool]]) -> None:
-        """Have the worker take what a cache held; called on any thread."""
+    def _take_cached(self, stream: str, packets: list[tuple[Packet, bool]], complete: bool) -> None:  # noqa: FBT001 - as the network calls it
+        """Have the worker take what a cache held; one that has not answered is asked again. Called on any thread."""
 
         def take(actor: StreamActor, cached: TakeoverBuffer) -> None:
             actor._catch_up(cached)
-            actor.on_caches_answered(stream)
+            if complete:
+                actor.on_caches_answered(stream)
+            else:
+                actor._asked.discard(stream)
 
         self._hand_over(packets, take)
 

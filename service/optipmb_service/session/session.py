@@ -328,9 +328,11 @@ class Session:
         return self._recovery_ns is not None
 
     @property
-    def young(self) -> bool:
-        """Whether it `awaits_caches` so soon after its beginning that it may not know all its sensors."""
-        return self._began is not None or self._young_ns is not None
+    def young_since_ns(self) -> int | None:
+        """Since when, monotonic, it `awaits_caches`, if it began so lately that it may not know all its sensors."""
+        if self._recovery_ns is None or (self._began is None and self._young_ns is None):
+            return None
+        return self._recovery_ns - self._policy.recovery_wait_ns
 
     @property
     def sensors(self) -> set[str]:

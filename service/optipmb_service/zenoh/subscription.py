@@ -80,22 +80,28 @@ class Subscription:
         except Exception:
             log.exception("internal_error", reader=self._key)  # one message must not end the reading
 
-    def _ask(self, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[], None]) -> None:
+    def _ask(self, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[bool], None]) -> None:
         ask_cache(self._session, selector, reply, end)
 
 
 def ask_cache(
-    session: zenoh.Session, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[], None]
+    session: zenoh.Session, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[bool], None]
 ) -> None:
-    """Ask publishers' caches for what they hold: `reply` is called with each message, and `end` when no more comes."""
+    """Ask publishers' caches for what they hold: `reply` is called with each message, and `end` when no more comes.
+
+    `end` is told whether all have answered, within `ANSWER_S`.
+    """
+    errors = []
 
     def take(answer: zenoh.Reply) -> None:
         if (sample := answer.ok) is not None:
             reply(sample)
+        else:
+            errors.append(answer.err)
 
     session.get(
         selector,
-        zenoh.handlers.Callback(take, end),
+        zenoh.handlers.Callback(take, lambda: end(not errors)),
         target=zenoh.QueryTarget.ALL,
         accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
         consolidation=zenoh.ConsolidationMode.NONE,

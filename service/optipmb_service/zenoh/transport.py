@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
 
 import optipmb_schemas as schemas
@@ -199,8 +200,10 @@ class Transport:
             raise TransportError(line(error)) from error
         return found
 
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]]], None]) -> None:
+    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
         """Call `then`, on a thread of the network, with what the caches of a stream hold of its detections, all frames.
+
+        It is told, too, whether all caches have answered in time.
 
         Raises:
             TransportError: the session is closed.
@@ -211,7 +214,7 @@ class Transport:
             self._receive(sample, lambda packet: found.append((packet, True)))
 
         try:
-            ask_cache(self._session, f"{self._keys.detections(stream)}/@adv/pub/**", reply, lambda: then(found))
+            ask_cache(self._session, f"{self._keys.detections(stream)}/@adv/pub/**", reply, partial(then, found))
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
 

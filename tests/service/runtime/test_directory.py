@@ -26,7 +26,8 @@ class Discoverer:
 def test_caches_are_awaited_of_publishers_that_are_there_or_may_come_back() -> None:
     """Of sensors that were there before, not of those without a cache, nor of those that are gone for long."""
     streams = front, rear, plain, other = ["site/node/front", "site/node/rear", "site/node/plain", "site/car/lidar"]
-    one = StreamDirectory("a", IDLE_NS, lambda _: True, SECOND)
+    one = StreamDirectory("a", IDLE_NS, lambda _: True)
+    one.began_ns = SECOND
 
     def awaited(now_ns: int, *sensors: str) -> dict[str, bool]:
         return one.awaited("site/node", lambda stream: stream.startswith("site/node/"), sensors, now_ns)

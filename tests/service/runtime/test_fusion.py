@@ -7,6 +7,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import optipmb_service.runtime.directory
+import optipmb_service.runtime.stream_actor
 import pytest
 from fusing import FRONT, FUSED, REAR, drive
 from optipmb_schemas import Keys, SessionParameters, SessionState, Tracks, decode
@@ -16,7 +18,7 @@ from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy
+from optipmb_service.session.values import SECOND, Policy
 from optipmb_service.settings import SettingsInvalidError, load
 from router import Node, Sensor, until
 from sessions import Merged, tracks
@@ -118,6 +120,34 @@ def test_after_a_restart_no_cache_is_waited_for_that_has_answered_or_is_gone(
         state = tracked()
     assert state is not None
     assert (state.digest, state.late, state.gaps) == (undisturbed_digest(rest), 0, 0)
+
+
+def test_a_sensor_that_is_heard_of_after_the_session_began_loses_no_frame(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While its token may be on its way, what a cache holds of another sensor goes no second ahead of its frames."""
+    monkeypatch.setattr(optipmb_service.runtime.directory, "BACK_NS", 0)
+    monkeypatch.setattr(optipmb_service.runtime.stream_actor, "BACK_NS", 600 * SECOND)
+    frames = drive(40)
+    service, endpoint = start(fuse=["site/node/*"], recovery_wait_s=60)
+    with Node(endpoint) as node:
+
+        def heard_of(*sensors: str) -> bool:
+            service.housekeeping()
+            return [one.sensors for one in service.status().sessions] == [sensors]
+
+        def reached(frames: int) -> bool:
+            service.housekeeping()
+            return node.ask(KEYS.query(FUSED, "state"), SessionState).frames >= frames
+
+        node.send(*(one for one in frames if one.stream == REAR.stream))
+        until(lambda: heard_of(REAR.stream) and reached(1), "the rear sensor is heard of")
+        node.send(*(one for one in frames if one.stream == FRONT.stream))
+        until(lambda: heard_of(FRONT.stream, REAR.stream), "the front sensor is heard of")
+        monkeypatch.setattr(optipmb_service.runtime.stream_actor, "BACK_NS", 0)
+        until(lambda: reached(80), "all are tracked")
+        state = node.ask(KEYS.query(FUSED, "state"), SessionState)
+    assert (state.digest, state.late, state.gaps) == (undisturbed_digest(frames), 0, 0)
 
 
 def test_queries_are_answered_for_the_session(start: Callable[..., Any]) -> None:
