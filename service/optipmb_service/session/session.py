@@ -449,17 +449,18 @@ class Session:
         """Whether no frame is missing before one: of its sensor, and after a restore of those that were live.
 
         When a session of several sensors begins, their caches come one after the other, too: until it is known which
-        sensors there are, none goes ahead of the time that has passed by more than late frames may come.
+        sensors there are, none goes ahead of the time that has passed by more than half of the time for which late
+        frames are taken; the other half is for sensors that began a little earlier and are heard of a little later.
         """
-        timeline = self._processed.timeline
+        timeline, margin_ns = self._processed.timeline, self._policy.rewind_ns // 2
         if self._began:
             stamp_ns, began_ns = self._began
-            ahead_ns = frame_id.stamp_ns - stamp_ns - self._policy.rewind_ns
+            ahead_ns = frame_id.stamp_ns - stamp_ns - margin_ns
             # Stamps that pass faster than time come from a cache, and the other caches begin as early.
             self._backlog |= ahead_ns > self._now_ns - began_ns
             return ahead_ns <= (0 if self._backlog else self._now_ns - began_ns)
         if isinstance(timeline, FusedTimeline) and self.recovering:
-            if self._young_ns is not None and frame_id.stamp_ns - self._young_ns > self._policy.rewind_ns:
+            if self._young_ns is not None and frame_id.stamp_ns - self._young_ns > margin_ns:
                 return False
             for name, newest_ns in timeline.live().items():
                 held = self._pending[name].first if name in self._pending else None

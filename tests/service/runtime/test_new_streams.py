@@ -15,7 +15,7 @@ from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.runtime import directory
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.fusion import Fusion
-from optipmb_service.runtime.intake import NEW_STREAMS, Intake
+from optipmb_service.runtime.intake import ALL, NEW_STREAMS, Intake
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.registry import Registry
 from optipmb_service.runtime.takeover_buffer import UNASKED_NS, TakeoverBuffer
@@ -102,6 +102,7 @@ def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
         cloud=None,
         passed_by=None,
         caches_answered=None,
+        forget_caches=lambda _: None,
         actor=lambda _: None,
         foreign=lambda _: set[str](),
         hold=lambda _: None,
@@ -187,12 +188,17 @@ def test_only_publishers_with_a_cache_are_subscribed_to_with_recovery() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
-    """Whatever streams and partitions came and went before, step by step, and whether publishers have caches."""
+    """Whatever streams and partitions came and went before, step by step, and whether publishers have caches.
+
+    Of streams whose detections are received no longer it is forgotten that their caches had answered.
+    """
     monkeypatch.setattr(directory, "FORGET_NS", 0)
     chance = random.Random(seed)
     held = set(range(PARTITIONS if seed == 0 else 30))
     network = Following()
-    intake, _ = member_of(network, held)
+    intake, registry = member_of(network, held)
+    answered = set[str]()
+    registry.forget_caches = answered.intersection_update
     seen = set()
     for _ in range(300):
         for stream in chance.sample(STREAMS[:60], chance.randrange(5)):
@@ -216,6 +222,9 @@ def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPat
         fresh._step()
         assert network.now == begins.now
         seen.add(frozenset(network.now))
+        received = {stream for kind, stream, _ in network.now if kind == "detections"}
+        assert answered <= received or ALL in received
+        answered |= received - {ALL}
     assert len(seen) > 30
 
 

@@ -310,6 +310,22 @@ def test_when_a_session_begins_the_caches_of_all_sensors_are_waited_for() -> Non
     assert state_bytes(live.snapshot()) == state_bytes(other.snapshot())
 
 
+def test_a_cache_that_is_handed_over_slowly_leaves_room_for_another() -> None:
+    """Two seconds of one sensor come within 0.3 s; what comes then of another, which began earlier, is not late."""
+    one, frames = fused(Policy()), drive(40)
+    other, merged, again = fused(), Merged(), Merged()
+    rear, front = ([frame for frame in frames if frame.stream == sensor.stream] for sensor in (REAR, FRONT))
+    assert front[0].stamp_ns < rear[0].stamp_ns
+    for frame in rear[:20]:
+        merged.take(one.on_detections(frame, 15_000_000 * frame.seq))
+    for frame in front + rear[20:]:
+        merged.take(one.on_detections(frame, 300_000_000))
+    merged.take(one.recovered(400_000_000))
+    again.take(given_to(other, frames))
+    assert one.counters.late == 0
+    assert merged.plain() == again.plain()
+
+
 def test_a_silent_sensor_holds_up_nobody_for_longer_than_the_wait_for_recovery() -> None:
     """After a restart a sensor that does not come back is waited for as long as missing frames are."""
     one = fused()
