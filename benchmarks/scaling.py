@@ -125,12 +125,12 @@ class Cluster:
         """Return what has been used so far."""
         varz, jsz = (self._ask(page) for page in ("varz", "jsz"))
         alive = [one.process.pid for one in self.members if one.process.poll() is None]
-        used = [_used(pid) for pid in alive]
-        nats, router = _used(self._nats.pid), _used(self.router.process.pid)
+        taken = [used(pid) for pid in alive]
+        nats, router = used(self._nats.pid), used(self.router.process.pid)
         return Sample(
             time.monotonic(),
-            sum(one[0] for one in used),
-            sum(one[1] for one in used),
+            sum(one[0] for one in taken),
+            sum(one[1] for one in taken),
             *nats,
             int(varz["in_msgs"]),
             int(varz["in_bytes"]),
@@ -143,7 +143,7 @@ class Cluster:
             return dict(json.load(answer))
 
 
-def _used(pid: int) -> tuple[float, float]:
+def used(pid: int) -> tuple[float, float]:
     """Return processor seconds and megabytes of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
@@ -239,6 +239,7 @@ class Measurement:
     def __init__(self, arguments: argparse.Namespace, cluster: Cluster, session: zenoh.Session) -> None:
         self._arguments, self._cluster, self._session = arguments, cluster, session
         self._owners = Owners(session)
+        self._idle_senders: list[object] = []
         self.phases: list[Phase] = []
         self.figures: dict[str, float] = {}
 
@@ -341,7 +342,6 @@ class Measurement:
         still, began = cluster.sample(), time.monotonic()
         names = [named("idle", number) for number in range(count)]
         left, tries = names, 0
-        senders = []
         while left:  # a publisher without a cache loses messages where the network is busy
             tries += 1
             if tries > TRIES:
@@ -349,8 +349,9 @@ class Measurement:
             for number in paced(len(left), len(left) / arguments.begin):
                 frame = Sensor(left[number], objects=arguments.objects).detections(0)
                 if arguments.cached:
-                    senders.append(connection.cached_sender(KEYS.detections(frame.stream), DETECTIONS, cache=100))
-                    senders[-1].put(schemas.encode(frame))
+                    sender = connection.cached_sender(KEYS.detections(frame.stream), DETECTIONS, cache=100)
+                    sender.put(schemas.encode(frame))
+                    self._idle_senders.append(sender)
                 else:
                     self._session.put(KEYS.detections(frame.stream), schemas.encode(frame), encoding=DETECTIONS)
             figures[f"idle_tracked_when_sent_{tries}"] = self._owners.streams("idle")
