@@ -7,10 +7,11 @@ with error covariance Omega, that is best in the mean square over the posterior 
 update of the prior with it is the next. The first posterior is that of position and heading alone, which are linear.
 The moments of the velocity v e^{i phi} are exact (`optipmb.motion.polar_moments`).
 
-A heading that is measured modulo pi has a posterior with several modes, one for each heading z_phi + j pi that the
-prior allows. The velocity decides between them, if the object moves. Each mode is updated by itself, has the likelihood
-of the measurement as its weight, and is described with the heading nearer to that of the heaviest, as x or as T x
-(`optipmb.heading`); one Gaussian of the same mean and covariance replaces them.
+A heading that is measured modulo pi has a posterior with several modes, one for each of the three nearest headings
+z_phi + j pi that the prior allows. The velocity decides between them, if the object moves. Each mode is updated by
+itself, has the likelihood of the measurement as its weight, and is described with the heading nearer to that of the
+heaviest, as x or as T x (`optipmb.heading`); one Gaussian of the same mean and covariance replaces them. It is told
+with the heading nearer to that of the prior: its sign is a state of its own.
 """
 
 from __future__ import annotations
@@ -86,9 +87,6 @@ def linearised_update(
         if weight[count] > weight[heaviest]:
             heaviest = count
         count += 1
-    if count == 1:
-        mean_out[:], covariance_out[:] = means[0], covariances[0]
-        return
     largest, total = weight[heaviest], 0.0
     for k in range(count):
         if math.cos(means[k, PHI] - means[heaviest, PHI]) < 0.0:
@@ -99,6 +97,8 @@ def linearised_update(
         weight[k] /= total
     ends = np.array([0, count])
     moment_match(ends, weight, means, covariances, mean_out.reshape(1, STATE), covariance_out.reshape(1, STATE, STATE))
+    if math.cos(mean_out[PHI] - mean[PHI]) < 0.0:
+        turn_around(mean_out, covariance_out)
 
 
 @kernel

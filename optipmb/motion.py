@@ -16,8 +16,8 @@ make the tracker prefer compass directions.
 Where the heading's standard deviation nears one radian the twelve points lie beyond half a turn, and the transform
 claims to know far more than it does. Objects of a class with `linearisations` are predicted by exact moments instead
 (`predict_moments`): the way of a frame is D = e^{i theta} (L + i o), with theta = phi + omega dt / 2 and a length L
-that are linear in the state. That holds from `KNOWN` standard deviations of the speed on. A speed that is hardly known
-is no Gaussian, and exact moments of it would spread an object over places that it cannot reach.
+that are nearly linear in the state. This is done where the speed exceeds `KNOWN` standard deviations. One that is
+hardly known is not Gaussian enough: exact moments of it would spread an object over places that it cannot reach.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def predict_state(
         dt: time to predict over, s, positive.
         own: parameters of its class: the motion model and its time constant tau, q of ``Q = diag(q^2) dt``, and
             whether measured velocities are linearised: then, where the speed is known and the acceleration does not
-            decay, `predict_moments`.
+            decay, `predict_moments`, unless the covariance has to be repaired.
         root: (6, 6) buffer for the square root.
         points: (12, 6) buffer for the transformed points, as deviations from the transformed centre; the mean is
             added last, so that large world coordinates cost no digits.
@@ -180,10 +180,11 @@ def predict_state(
         Number of pivots that had to be repaired.
     """
     straight, tau, process_noise = own.constant_velocity, own.acceleration_time, own.process_noise
-    if own.linearisations > 0 and tau == math.inf and abs(mean[V]) > KNOWN * math.sqrt(covariance[V, V]):
+    repaired = square_root(covariance, root)
+    known = abs(mean[V]) > KNOWN * math.sqrt(covariance[V, V])
+    if own.linearisations > 0 and tau == math.inf and known and repaired == 0:
         predict_moments(mean, covariance, dt, own, mean_out, covariance_out)
         return 0
-    repaired = square_root(covariance, root)
     v, phi = mean[V], mean[PHI]
     omega, a = (0.0, 0.0) if straight else (mean[OMEGA], mean[A])
     along0, across0, v0, a0 = travel(v, omega, a, dt, tau)
@@ -260,11 +261,11 @@ def polar_moments(
         E|D|^2 = L^2 + o^2 + P_L,                                  Omega = cov(D) - A P A'
 
     Args:
-        length: mean of L.
-        offset: o.
+        length: mean of L, m for a way and m/s for a velocity.
+        offset: o, in the unit of L.
         angle: mean of theta, rad.
         p_l: P_L, variance of L.
-        c: covariance of L and theta.
+        c: covariance of L and theta, rad times the unit of L.
         s: variance of theta, rad^2.
 
     Returns:
@@ -300,8 +301,9 @@ def predict_moments(
 
         D = e^{i (phi + u)} (G + sinc(u) dt dv + dt^2 / 2 da),    dv and da: deviations from the mean,
 
-    which is the motion itself at the mean, and but for the curvature in omega where the state deviates. As x and y
-    gain D, the covariance is F P F' + Q dt, with A_L and A_theta of `polar_moments` in F, and Omega added for x and y.
+    which is the motion itself at the mean, and to first order where the state deviates, but for terms of dt^3 in omega
+    and a. As x and y gain D, the covariance is F P F' + Q dt, with A_L and A_theta of `polar_moments` in F, and Omega
+    added for x and y.
     """
     straight, process_noise = own.constant_velocity, own.process_noise
     v, phi, omega, a = mean[V], mean[PHI], mean[OMEGA], mean[A]

@@ -232,7 +232,7 @@ class ClassParameters(_Table):
         default=None, description="how the sign of the heading is found; without it, it stays that of the birth"
     )
     linearisations: Annotated[int, Field(ge=0, le=10)] = Field(
-        default=0, description="0: measured velocities update by the paper's UKF; else how often they are linearised"
+        default=0, description="0: the paper's UKF; else linearisations of a velocity, and moments of known speeds"
     )
     process_noise: ProcessNoise = Field(description="Q")
     measurement_noise: MeasurementNoise = Field(description="R")

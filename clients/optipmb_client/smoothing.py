@@ -11,7 +11,8 @@ Automatic Control 53(3), 2008), with the motion models of the tracker. From the 
     P^s_k = P_k + G (P^s_{k+1} - P-) G'
 
 m_k and P_k are the state and covariance of every frame in which the filter holds the object; in frames in which it is a
-track, those of its told box (`optipmb.reported`). So frames without detection need no rule of their own.
+track, those of its told box (`optipmb.reported`). So frames without detection need no rule of their own. Where the
+filter predicts by exact moments (`optipmb.motion.predict_moments`), the smoother is the unscented one nevertheless.
 
 An object does not turn by pi from frame to frame, so one sign of the heading holds for the whole track: the one in
 favour of which the mean of the log odds (`optipmb.heading`) is; and this mean is the confidence in it.

@@ -204,7 +204,10 @@ def linearised_update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array
         else:
             described.append((mean, covariance))
     likely = np.exp(np.array(weights) - max(weights))
-    return moment_match(list(likely / likely.sum()), described)
+    mean, covariance = moment_match(list(likely / likely.sum()), described)
+    if math.cos(mean[3] - m[3]) < 0:  # the sign of the heading is a state of its own
+        mean, covariance = around @ mean + np.array([0, 0, 0, np.pi, 0, 0]), around @ covariance @ around
+    return mean, covariance
 
 
 def update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array, Array]:

@@ -22,7 +22,7 @@ FACING, HALF_TURN = np.array([1.0, 1.0, -1.0, 1.0, 1.0, -1.0]), np.array([0.0, 0
 def nees(label: str, missed: float, linearisations: int, seed: int = 0) -> float:
     """Mean NEES / 6 of a class of `nuscenes-paper` with measured velocities.
 
-    A state and the one with the opposite heading describe the same motion; the error is to the nearer of the two.
+    A state and the one with the opposite heading describe the same motion; that with the smaller NEES counts.
     """
     parameters = optipmb.load_profile("nuscenes-paper")
     table, c, dt = ClassTable.of(parameters), parameters.labels.index(label), parameters.nominal_period

@@ -272,6 +272,7 @@ class LeaseTable:
         writes = self._endings(now_ns, gone)
         if not writes and self._done_when is self.draining:
             return []  # the usual case
+        self._done_when = None
         mine, others = self._wished()
         # What is wished goes before an equal share.
         room = self._share() - len(mine)

@@ -99,8 +99,6 @@ class LogReader:
             messages = await self._look(wanted, parts)
             if messages or number == 0:
                 take(messages)
-            if self._log.missing("detections"):
-                return
 
     async def _look(self, wanted: Missed, parts: dict[str, _Part]) -> list[LogMessage]:
         """Return what is new in the log; nothing where it cannot be read in time."""

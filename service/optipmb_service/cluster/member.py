@@ -44,7 +44,9 @@ LONGEST_LOOK_S: Final = 0.1
 SHORT_LOOK_S: Final = 0.02
 """While partitions change hands: each is held by nobody for as long."""
 
-RENEWALS_PER_LEASE: Final = 10
+RENEWALS_PER_LEASE: Final = 2 * LOOKS_PER_LEASE
+"""At most: so each look that is not a short one renews."""
+
 STRAINED: Final = 4
 """Part of a lease without a renewal from which on it is late; half a lease is the end of the write lease."""
 
@@ -245,6 +247,8 @@ class Member:
             if not self._keep():
                 return
             self._table.written(write, self._store.put(write))
+            if write.value == ENDED:
+                self._wake.set()  # its partitions can be taken at once
 
     def _keep(self) -> bool:
         """Renew this member's record if it is time to; False: nothing else can be done now."""

@@ -247,12 +247,8 @@ class MessageLog:
     async def _one(self, topic: Topic, request: Mapping[str, object]) -> _Found | None:
         return next(iter(await self._found(topic, request)), None)
 
-    def missing(self, topic: Topic) -> bool:
-        """Whether there was no such log a moment ago."""
-        return time.monotonic() < self._missing_until.get(topic, 0.0)
-
     async def _found(self, topic: Topic, request: Mapping[str, object]) -> list[_Found]:
-        if self.missing(topic):
+        if time.monotonic() < self._missing_until.get(topic, 0.0):
             return []
         try:
             messages = await self.connection.read(self._names[topic], request)

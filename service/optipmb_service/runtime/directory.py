@@ -26,7 +26,9 @@ TOKEN_NS: Final = SECOND
 """How long the token of a publisher whose messages can be recovered may come after its first message."""
 
 BACK_NS: Final = 5 * SECOND
-"""How long a token may come after a session has begun, or back: who lost its router tries every 4 s at least."""
+"""How long a token may come after a session has begun, or back: who lost its router tries every 4 s at least.
+
+Sessions wait no longer than `recovery_wait_s` in any case."""
 
 MAX_UNPROVEN: Final = 256
 """Streams without a session that this instance announces at once: each costs members a token and subscriptions."""

@@ -129,7 +129,7 @@ class Session:
             and not (self._restored or self.counters.frames or self._began)
             and self._policy.recovery_wait_ns
         ):
-            self._began = frame_id.stamp_ns, now_ns
+            self._began = frame_id.stamp_ns, now_ns if arrived_ns is None else arrived_ns
             self._recover_until(now_ns + self._policy.recovery_wait_ns)
         judged_by = pending.timeline
         decision, arrived = judged_by.judge(frame_id)

@@ -77,6 +77,9 @@ class Channel(Generic[_T]):
         """Yield what comes until the end."""
         while (item := self._waiting.get()) is not None:
             yield item
+        with contextlib.suppress(queue.Empty):
+            while (item := self._waiting.get_nowait()) is not None:  # what waited for room
+                yield item
 
     def close(self) -> None:
         """End the reading after what has come."""

@@ -13,13 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lease_log import LEASE_S, SECOND, Alone, HandMember, MemoryLeases, Shared
 from nats_process import NatsProcess, NatsTrio
-from optipmb_service.cluster import log_writer, nats_connection
 from optipmb_service.cluster import member as members_module
+from optipmb_service.cluster import nats_connection
 from optipmb_service.cluster.jetstream import JetStream
 from optipmb_service.cluster.leases import LEFT_AT_ONCE, PARTITIONS, Change, WriteLease, partition_key, partition_of
-from optipmb_service.cluster.log_writer import LogWriter
 from optipmb_service.cluster.member import Member
-from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import ENDED, Fenced, Record, StoreError, Write
 from optipmb_service.runtime.persistence import CheckpointWriter
@@ -330,6 +328,22 @@ def test_who_drains_holds_nothing(make: Make) -> None:
     assert drained.member.holds(stream)
 
 
+def test_a_drain_that_is_undone_leaves_nothing_between(make: Make) -> None:
+    """Partitions that could not be left meanwhile, as their streams' states were not kept, have a holder again."""
+    one, other = (HandMember(name, make()) for name in "ab")
+    even(one, other)
+    for _ in range(5):
+        assert one.turn(TICK_S)
+    one.occupied = set(range(PARTITIONS))
+    one.member.drain()
+    assert one.turn(TICK_S)
+    assert one.member._table.leaving
+    one.member.drain(drains=False)
+    one.occupied = set()
+    even(one, other)
+    assert not one.member._table.leaving
+
+
 def test_the_last_member_drains_in_vain(make: Make) -> None:
     """Nobody is there to take what it leaves: nobody waits for that or confirms it, and it goes on tracking.
 
@@ -473,11 +487,9 @@ def patiently(call: Callable[[], Any]) -> Any:
 def test_of_three_servers_one_may_be_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of three servers in turn is killed and comes back: the same members go on, under the same fences.
 
-    The log of detections is written and read on, each message once. Without two of them nothing is saved; when one is
-    back, all goes on.
+    Without two of them nothing is saved; when one is back, all goes on.
     """
     monkeypatch.setattr(nats_connection, "CALL_S", 2.0)  # what is lost with a leader is asked again
-    monkeypatch.setattr(log_writer, "TRIES", 100)  # a busy machine takes long to elect one
     with NatsTrio(tmp_path) as servers:
         stores = [JetStream(servers.urls, "test") for _ in range(2)]
         members = [HandMember(name, store) for name, store in zip("ab", stores, strict=True)]
@@ -487,28 +499,14 @@ def test_of_three_servers_one_may_be_lost(tmp_path: Path, monkeypatch: pytest.Mo
         held = [dict(one.member._table.held) for one in members]
         assert [len(one) for one in held] == [PARTITIONS // 2] * 2
         partition, fence = next(iter(held[0].items()))
-        put, read = (MessageLog(servers.urls, "test") for _ in range(2))
-        lost: list[tuple[str, str]] = []
-        writer = LogWriter(put, {"detections": Retention(60, 2**25)}, lambda *one: lost.append(one))
-        seqs: list[int] = []
-
-        def in_log() -> list[int]:
-            try:
-                found = read.connection.call(read.read("detections", STREAM, 1))
-            except StoreError:
-                return []
-            return [message.seq for _, message in found]
 
         def check(data: bytes) -> None:
-            seqs.append(len(seqs))
-            writer.put(LogMessage("detections", STREAM, bytes(16), seqs[-1], seqs[-1], "", (0, 0), data, ""))
             checkpoint = {STREAM: Fenced(partition_key(partition), fence, data)}
             assert patiently(lambda: stores[0].save(checkpoint)) == frozenset()
             assert patiently(lambda: stores[1].load(STREAM)) == data
             for one in members:
                 until(lambda one=one: one.turn(TICK_S * 3), "a renewal")  # type: ignore[misc]
             assert [one.member._table.held for one in members] == held
-            until(lambda: in_log() == seqs, "all are in the log")
 
         for index in range(3):
             servers.kill(index)
@@ -521,13 +519,11 @@ def test_of_three_servers_one_may_be_lost(tmp_path: Path, monkeypatch: pytest.Mo
             stores[0].save({STREAM: Fenced(partition_key(partition), fence, b"lost")})
         servers.start(0)
         check(b"two servers again")
-        assert not lost
-        writer.close()
-        for connection in (put.connection, read.connection, *stores):
-            connection.close(5.0)
+        for store in stores:
+            store.close(5.0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(count=st.integers(1, 5), seed=st.integers(0, 10**6))
 def test_no_partition_ever_has_two_owners(count: int, seed: int) -> None:
     """Fault 17: members are frozen, cut off, left without answers and ended, in any order, their clocks apart.

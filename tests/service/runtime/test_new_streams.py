@@ -92,6 +92,24 @@ class Following(Network):
         """Announcing is not looked at."""
 
 
+class Holding:
+    """A member that holds some partitions, which may change."""
+
+    strained = False
+
+    def __init__(self, held: set[int]) -> None:
+        self._held = held
+
+    @property
+    def partitions(self) -> set[int]:
+        """Return those of this moment."""
+        return set(self._held)
+
+    def holds(self, stream: str) -> bool:
+        """Whether a stream is of one of them."""
+        return partition_of(stream) in self._held
+
+
 def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
     """Return the intake of a member that holds some partitions and tracks nothing yet."""
     registry = SimpleNamespace(
@@ -109,8 +127,7 @@ def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
         take_up=lambda *_: None,
         changed=lambda *_: None,
     )
-    member = SimpleNamespace(partitions=held, strained=False, holds=lambda stream: partition_of(stream) in held)
-    untyped: Any = registry, member, network
+    untyped: Any = registry, Holding(held), network
     return Intake(*untyped, standby=False, linger_s=10.0, idle_s=3600.0), registry
 
 

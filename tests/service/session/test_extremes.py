@@ -149,7 +149,7 @@ def tracks_after(frames: int) -> optipmb.Tracks:
 
 def test_repairs_are_counted_and_shown() -> None:
     """Covariances without rank are repaired, counted in the session's state, and the count survives a checkpoint."""
-    one = Session(SENSOR.stream, optipmb.load_profile("nuscenes-paper"))  # `nuscenes` takes no square roots of these
+    one = Session(SENSOR.stream, NUSCENES)
     feed(one, range(4), SENSOR)
     checkpoint = one.snapshot()
     bernoulli = replace(checkpoint.head.density.bernoulli, covariance=np.zeros((3, 6, 6)))
