@@ -4,7 +4,6 @@ import gc
 import sys
 from typing import NoReturn
 
-from optipmb_client import kernels
 from optipmb_client.extras import to_install
 
 
@@ -19,7 +18,6 @@ def main() -> NoReturn:
             raise
         sys.exit(f"optipmb: {text}")
     gc.enable()
-    kernels.own_process = True
     cli.main()
 
 

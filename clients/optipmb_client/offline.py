@@ -38,7 +38,6 @@ from optipmb import (
 from optipmb_client.datasets import DataSequence, DetectionFrame
 from optipmb_client.errors import UsageError
 from optipmb_client.geometry import Floats, Ints
-from optipmb_client.kernels import load_kernels
 from optipmb_client.recording import selected_frames
 from optipmb_client.smoothing import Smoother
 
@@ -359,6 +358,10 @@ def _steps(
         yield given, result, left_out, took
 
 
+_warm = functools.cache(warm_up)
+"""Once in each process."""
+
+
 def track_whole(
     parameters: Parameters,
     sequence: DataSequence,
@@ -374,7 +377,7 @@ def track_whole(
         UsageError: A frame holds values that the tracker refuses.
         DatasetError: The sequence cannot be read.
     """
-    load_kernels()
+    _warm()
     begun = time.monotonic()
     found: dict[int, NamedTracks] = {}
     steps: list[int] = []

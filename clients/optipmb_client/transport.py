@@ -205,13 +205,17 @@ class Subscription:
         self._inbox.put(Arrival(str(sample.key_expr), payload, str(sample.encoding), arrived))
 
     def _ask(self, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[bool], None]) -> None:
+        errors = []
+
         def take(answer: zenoh.Reply) -> None:
             if (sample := answer.ok) is not None:
                 reply(sample)
+            else:
+                errors.append(answer.err)
 
         self._session.get(
             selector,
-            zenoh.handlers.Callback(take, lambda: end(True)),
+            zenoh.handlers.Callback(take, lambda: end(not errors)),
             accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=ANSWER_S,

@@ -65,8 +65,6 @@ def test_killed_workers_lose_nothing(data: Path, tmp_path: Path) -> None:
         done = track(opened, sequences, out, data=asked, parameters=parameters, executor=dying, note=notes.append)
         results = [next(done) for _ in range(40)]
         victim = workers(os.getpid()).pop()
-        mapped = [Path(f"/proc/{one}/maps").read_text() for one in workers(os.getpid())]
-        assert not any("scipy/linalg" in one for one in mapped), "a tenth of the start, for no kernel"
         os.kill(victim, signal.SIGKILL)
         results += done
     assert [one.name for one in results] == [one.name for one in sequences]

@@ -16,7 +16,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Protocol, Self
 
-from optipmb_client import kernels
 from optipmb_client.bulk.task import Done, Failed, Function, WorkerDiedError, attempt
 
 __all__ = ["ATTEMPTS", "Executor", "Here", "Processes"]
@@ -168,7 +167,6 @@ def _begin(end: Connection, folder: str) -> None:
     """Make a process ready: it ends when the other end of the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its processes
     threading.Thread(target=_end_with, args=(end, Path(folder)), daemon=True).start()
-    kernels.own_process = True
     tempfile.tempdir = folder  # what a killed process leaves goes with it
 
 
