@@ -15,6 +15,7 @@ FUZZ_TARGETS := fuzz-messages fuzz-checkpoints fuzz-protobuf
 .PHONY: help kernels docs release demo test accuracy alone bounds ray bench baseline figures load kills soak fuzz $(FUZZ_TARGETS) containers install lint types tests check lowest paths pythons repeat schemas wheel clean tune ablate
 help:
 	@echo "make demo    start the service, replay a generated scene through it, draw the tracks (out/demo/)"
+	@echo "make install a virtual environment with everything, and compiled kernels"
 	@echo "make test    lint, types, schemas, tests"
 	@echo "make wheel   build the wheel, install it alone into an empty environment, and use it there"
 	@echo "make check   lint, types, and the tests nearest to what changed since SINCE=main, in less than a minute"
@@ -46,7 +47,8 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 	$(BIN)/python -m pip install --quiet --constraint requirements.lock --editable ".[dev]"
 	touch $@
 
-install: $(VENV)/.installed
+# Kernels are compiled here, once, for who imports the package would compile them otherwise.
+install: kernels
 
 # What the demo needs, and no tools of developers; in the environment of developers it is all there.
 DEMO ?= $(if $(wildcard $(VENV)/.installed),$(VENV),.venv-demo)
@@ -58,27 +60,27 @@ demo: $(DEMO)/bin/optipmb
 	$(DEMO)/bin/optipmb demo --out out/demo
 
 # OPTIONAL=--optional: said clearly, and no failure, where no container engine runs.
-containers: install
+containers: $(VENV)/.installed
 	$(BIN)/python docker/containers.py $(OPTIONAL)
 
 # The demonstration is among the tests (tests/e2e/test_demo.py); CI also runs the command, which installs less.
-test: install
+test: $(VENV)/.installed
 	$(MAKE) --jobs 4 types kernels lint schemas tests
 
 # For figures, nothing else should run on the machine. SERVICE holds options of the service, SECONDS how long a run takes.
 load: install
 	sh benchmarks/load.sh $(BIN)
 
-lint: install
+lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-# Less urgent than the kernels, which the tests wait for.
-types: install
+# Less urgent than the kernels, which the tests wait for where the package has changed.
+types: $(VENV)/.installed
 	nice $(BIN)/mypy
 
-# Kernels are compiled once, before processes that would each compile them.
-kernels: install
+# Before processes that would each compile them.
+kernels: $(VENV)/.installed
 	$(BIN)/optipmb warm-up
 
 # Twice as many as two processors: what starts processes and waits for them leaves half of the time free. Files run in
@@ -96,7 +98,7 @@ alone: kernels
 	$(BIN)/pytest tests/e2e -m alone
 
 # Compiling all kernels a second time takes a minute; what is compiled is kept in .pytest_cache.
-bounds: install
+bounds: $(VENV)/.installed
 	$(BIN)/pytest tests/tracker -m bounds
 
 # Clusters on this machine, with the machine for themselves.
@@ -105,28 +107,28 @@ ray: kernels
 
 # For a developer: style, types, and the tests nearest to what changed since SINCE (a commit; files not committed count).
 SINCE ?= main
-check: install
+check: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python tests/nearest.py $(SINCE)
 
 # The wheel with the oldest packages that pyproject.toml allows; and with every newer Python that is here.
-lowest: install
+lowest: $(VENV)/.installed
 	mkdir -p out
 	$(BIN)/python tests/lowest.py >out/lowest.txt
 	sh tests/elsewhere.sh $(PYTHON) $(BIN) $(CURDIR)/out/lowest.txt
 
 # What stands in the README, from pip install to tracks; PATHS=csv, python, node or kitti walks one of them alone.
 PATHS ?=
-paths: install
+paths: $(VENV)/.installed
 	mkdir -p out
 	rm -rf out/dist
 	$(BIN)/python -m build --wheel --outdir out/dist . >out/build.log
 	$(BIN)/python -m build --wheel --outdir out/dist node >>out/build.log
 	$(BIN)/python tests/paths.py out/dist $(PATHS)
 
-pythons: install
+pythons: $(VENV)/.installed
 	sh tests/pythons.sh $(BIN)
 
 # As often as N says, each time in a fresh clone, with LOAD processes computing beside it: tests that pass now and then fail here.
@@ -135,7 +137,7 @@ LOAD ?= 0
 repeat:
 	sh tests/repeat.sh $(N) $(LOAD)
 
-schemas: install
+schemas: $(VENV)/.installed
 	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md schemas/json
 	$(BIN)/python docs/reference.py --check docs/operation.md
 
@@ -160,7 +162,7 @@ docs: $(DOCS)/.installed
 	@echo "the site is in out/site"
 
 # Everything that a release needs, up to publishing.
-release: install
+release: $(VENV)/.installed
 	sh tests/release.sh $(BIN)
 
 bench: install

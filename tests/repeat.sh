@@ -27,7 +27,9 @@ for number in $(seq "$times"); do
   rm -rf "$clone"
   git clone --quiet "$root" "$clone"
   [ ! -e "$VENV/.installed" ] || touch "$VENV/.installed"
-  make -s -C "$clone" install VENV="$VENV"
+  began=$(date +%s)
+  make -s -C "$clone" install VENV="$VENV" >"$work/install.log" 2>&1 || { cat "$work/install.log"; exit 1; }
+  installed=$(($(date +%s) - began))
   began=$(date +%s)
   if make -C "$clone" test VENV="$VENV" >"$work/$number.log" 2>&1; then
     passed=$((passed + 1))
@@ -35,7 +37,7 @@ for number in $(seq "$times"); do
   else
     result="failed:"
   fi
-  echo "$number: $result $(($(date +%s) - began)) s $(grep -E '^(FAILED|ERROR)' "$work/$number.log" | head -5 | tr '\n' ' ')"
+  echo "$number: $result $(($(date +%s) - began)) s, installed in $installed s $(grep -E '^(FAILED|ERROR)' "$work/$number.log" | head -5 | tr '\n' ' ')"
   [ "$result" = passed ] || cp "$work/$number.log" "$root/out/repeat-$number.log" 2>/dev/null || tail -50 "$work/$number.log"
 done
 echo "$passed of $times passed, $load processes beside it"
