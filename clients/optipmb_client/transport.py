@@ -43,7 +43,6 @@ CLOUD_BATCHES = 16  # of 64 kB on the way to the network: with the default of 2 
 # The parts of Zenoh's objects used here, typed: its own stubs leave some of them untyped, and one wrongly typed.
 class _ZenohPublisher(Protocol):
     def put(self, payload: bytes) -> object: ...
-    def undeclare(self) -> object: ...
 
 
 class _ZenohMatchingStatus(Protocol):
@@ -145,9 +144,8 @@ class Sender:
     """A publisher of encoded messages on one key."""
 
     def __init__(self, publisher: _ZenohPublisher, matching: _ZenohMatching | None) -> None:
-        self._publisher = publisher
+        self._publisher: _ZenohPublisher | None = publisher
         self._matching = matching
-        self._using = threading.Lock()  # Zenoh refuses to withdraw a publisher while another thread puts
 
     @property
     def wanted(self) -> bool:
@@ -164,16 +162,21 @@ class Sender:
         Raises:
             ConnectionFailed: After `close`.
         """
+        publisher = self._publisher
+        if publisher is None:
+            raise ConnectionFailed("this publisher has been closed")
         try:
-            with self._using:
-                self._publisher.put(payload)
+            publisher.put(payload)
         except zenoh.ZError as error:
             raise ConnectionFailed("this publisher has been closed") from error
 
     def close(self) -> None:
-        """Withdraw the publisher."""
-        with self._using, contextlib.suppress(zenoh.ZError):  # the session may be closed already
-            self._publisher.undeclare()
+        """Withdraw the publisher.
+
+        It is let go of. What Zenoh calls `undeclare` waits for the heartbeats to end with the lock of the interpreter
+        held; while the thread that sends them waits for that lock, the whole process would stand still for ten seconds.
+        """
+        self._publisher = self._matching = None
 
 
 class Subscription:

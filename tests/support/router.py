@@ -139,8 +139,7 @@ class Node:
         """Leave the network in order."""
         for close in self._closing:
             close()
-        for publisher in self._publishers.values():
-            publisher.undeclare()
+        self._publishers.clear()  # withdraws them; to undeclare them may stop the process for ten seconds
         self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
     def send(self, *messages: Detections | Points) -> None:

@@ -63,14 +63,7 @@ def check(node: Node, frames: int, *, owner: str, sensor: Sensor = SENSOR) -> Se
     assert distinct(node, sensor) == {seq: {one} for seq, one in enumerate(tracks)}
     owned = [KEYS.owner(sensor.stream, owner)]
     until(lambda: node.alive(KEYS.owners(sensor.stream)) == owned, f"{owner} owns it")
-    answers: list[tuple[bool, str, bytes]] = []
-
-    def answered() -> bool:
-        answers[:] = node.query(KEYS.query(sensor.stream, "state"))
-        return [ok for ok, _, _ in answers] == [True]
-
-    until(answered, "one member answers, and none that was just woken lets the question time out")
-    state = decode(answers[0][2], SessionState)
+    state = node.ask(KEYS.query(sensor.stream, "state"), SessionState)
     assert (state.digest, state.frames, state.gaps) == (digest, frames, 0)
     return state
 

@@ -15,13 +15,14 @@ import zenoh.ext
 
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import close, line, opened
-from optipmb_service.zenoh.handles import Putting, cached_publisher, publish_problem, undeclare
+from optipmb_service.zenoh.handles import Publisher, cached_publisher, publish_problem
 from optipmb_service.zenoh.subscription import Subscription
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.settings import Settings
+    from optipmb_service.zenoh.handles import Putting
 
 
 class _Matching(Protocol):
@@ -64,12 +65,13 @@ class Outgoing:
         wanted: Callable[[], None],
     ) -> None:
         self._matching: _Matching | None = None
-        self._detections = cached_publisher(session, keys.detections(stream), schemas.Detections, cache)
+        self._detections = Publisher(cached_publisher(session, keys.detections(stream), schemas.Detections, cache))
         if cache_clouds:
             low = zenoh.Priority.DATA_LOW
-            self._points = cached_publisher(
+            cached = cached_publisher(
                 session, keys.points(stream), schemas.Points, cache_clouds, priority=low, express=False
             )
+            self._points = Publisher(cached)
             return
         try:
             plain = session.declare_publisher(
@@ -78,7 +80,7 @@ class Outgoing:
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.DATA_LOW,
             )
-            self._points, self._matching = cast("Putting", plain), cast("_Matching", plain)
+            self._points, self._matching = Publisher(cast("Putting", plain)), cast("_Matching", plain)
             plain.declare_matching_listener(lambda _status: wanted())
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
@@ -94,7 +96,7 @@ class Outgoing:
         Raises:
             TransportError: the publisher is withdrawn.
         """
-        self._put(self._detections, payload)
+        self._detections.publish(payload)
 
     def points(self, payload: bytes) -> None:
         """Send an encoded cloud.
@@ -102,19 +104,13 @@ class Outgoing:
         Raises:
             TransportError: the publisher is withdrawn.
         """
-        self._put(self._points, payload)
+        self._points.publish(payload)
 
     def close(self) -> None:
         """Withdraw both."""
-        undeclare(self._detections)
-        undeclare(self._points)
-
-    @staticmethod
-    def _put(publisher: Putting, payload: bytes) -> None:
-        try:
-            publisher.put(payload)
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
+        self._detections.release()
+        self._points.release()
+        self._matching = None
 
 
 class Client:

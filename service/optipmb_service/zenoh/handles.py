@@ -46,7 +46,7 @@ class _Dropped(Protocol):
     def drop(self) -> object: ...
 
 
-class Putting(Undeclared, Protocol):
+class Putting(Protocol):
     """A publisher of Zenoh's own."""
 
     def put(self, payload: bytes) -> object:
@@ -178,28 +178,42 @@ def publish_problem(session: zenoh.Session, keys: schemas.Keys, problem: schemas
 
 
 class Publisher:
-    """The publisher of a stream's tracks, and the token that says who tracks it."""
+    """A publisher of Zenoh's own, and the token that goes with it.
 
-    def __init__(self, publisher: Putting, token: Undeclared, forget: Callable[[Publisher], None]) -> None:
-        self._publisher = publisher
+    It is withdrawn by letting go of it: what Zenoh calls `undeclare` waits for the heartbeats to end with the lock of
+    the interpreter held. While the thread that sends them waits for that lock, the whole process would stand still
+    until Zenoh gives up, after ten seconds.
+    """
+
+    def __init__(
+        self,
+        publisher: Putting,
+        token: Undeclared | None = None,
+        forget: Callable[[Publisher], None] = lambda _: None,
+    ) -> None:
+        self._publisher: Putting | None = publisher
         self._token = token
         self._forget = forget
 
     def publish(self, payload: bytes) -> None:
-        """Send encoded tracks.
+        """Send an encoded message.
 
         Raises:
             TransportError: the publisher is withdrawn.
         """
+        publisher = self._publisher
+        if publisher is None:
+            raise TransportError("the publisher is withdrawn")
         try:
-            self._publisher.put(payload)
+            publisher.put(payload)
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
 
     def release(self) -> None:
         """Withdraw both."""
-        undeclare(self._token)
-        undeclare(self._publisher)
+        if self._token is not None:
+            undeclare(self._token)
+        self._publisher = None
         self._forget(self)
 
 
