@@ -189,7 +189,7 @@ class Intake:
                 self._came.discard(partition)
                 self._left[partition] = time.monotonic_ns() + self._linger_ns
         with self._handed:
-            owed = self._registry.foreign({partition})
+            owed = self._registry.untracked.of_partitions({partition})
             (self._owed.update if change is Change.LOST else self._owed.difference_update)(owed)
         self._hurry.set()
         self._wake.set()
@@ -206,7 +206,7 @@ class Intake:
         asked = [session for session in sessions if self._may_have(session)]
         if asked:
             self._drain(asked)
-            for packet in self._registry.recent(asked):
+            for packet in self._registry.untracked.recent(asked):
                 give(packet)
             with self._handed:
                 self._owed.difference_update(asked)
@@ -223,7 +223,7 @@ class Intake:
         if self._member.holds(session):
             return False
         subscribed = DISCOVERY in self._received or partition_of(session) in self._received
-        return subscribed or self._registry.is_foreign(session)
+        return subscribed or session in self._registry.untracked
 
     def _drain(self, sessions: list[str]) -> None:
         """Wait for what is on its way through this process, for a moment at most."""
@@ -287,7 +287,7 @@ class Intake:
             return True  # to be reported
         is_raw = self._directory.noticed(stream, time.monotonic_ns(), recoverable=recoverable)
         if is_raw and stream not in self._known:
-            self._registry.expect(self._registry.fusion.session_of(stream))
+            self._registry.untracked.expect(self._registry.fusion.session_of(stream))
             if self._directory.announces(stream):
                 self._wake.set()
         return is_raw
@@ -350,7 +350,7 @@ class Intake:
             looked = {stream: cached for stream, cached in looked.items() if stream not in later}
         coming = self._coming(looked, came, held)
         for session in coming:
-            self._registry.hold(session)
+            self._registry.untracked.hold(session)
         wanted = self._wanted(looked, received, everything=everything, discovering=discovering)
         before = self._subscribed if anew else self._subscribed & _inputs(looked.keys() | gone)
         for one in sorted(wanted - before):
@@ -360,7 +360,7 @@ class Intake:
         self._inputs.unsubscribe((one.kind, one.stream, one.cached) for one in sorted(left))
         self._subscribed -= left
         if not everything and any(one.kind == "detections" for one in left):
-            self._registry.forget_caches({one.stream for one in self._subscribed if one.kind == "detections"})
+            self._registry.untracked.forget_caches({one.stream for one in self._subscribed if one.kind == "detections"})
         self._announce(self._directory.announced(), strained=strained)
         for stream in later:
             del streams[stream]
@@ -418,7 +418,7 @@ class Intake:
             and partition_of(session := session_of(stream)) in held
             and self._registry.actor(session) is None
         }  # fmt: skip
-        return sorted(coming | self._registry.foreign(came) if came else coming)
+        return sorted(coming | self._registry.untracked.of_partitions(came) if came else coming)
 
     def _take_up(self, sessions: list[str]) -> None:
         packets: dict[str, list[tuple[Packet, bool]]] = {session: [] for session in sessions}

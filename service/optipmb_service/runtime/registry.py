@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
@@ -26,11 +25,12 @@ from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
 from optipmb_service.runtime.rivals import Rivals
 from optipmb_service.runtime.stream_actor import StreamActor
 from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
+from optipmb_service.runtime.untracked import UntrackedMessages
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import SECOND, Lineage, MessageCounters, Policy
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterable
+    from collections.abc import Callable
     from pathlib import Path
 
     from optipmb_service.cluster.member import Member
@@ -47,9 +47,6 @@ log = structlog.get_logger("optipmb_service")
 
 MAX_UNPROVEN: Final = 256
 """Actors at once of streams that have not sent a valid message yet."""
-
-MAX_NEWCOMERS: Final = 16_384
-"""Streams beyond them whose first messages wait, within `standby_mb`, until some of these have sent a valid one."""
 
 MAX_UNPROVEN_STRAINED: Final = 16
 """The same while the lease is renewed late: each of them delays that."""
@@ -131,7 +128,6 @@ class Registry:
         self._lock = threading.Lock()
         self._actors: dict[str, StreamActor] = {}
         self._unproven: set[StreamActor] = set()
-        self._newcomers: dict[str, None] = {}
         self._sessions = 0
         self._lives: OrderedDict[str, Lineage] = OrderedDict()
         self._streams: dict[str, tuple[str, str]] = {}
@@ -146,9 +142,12 @@ class Registry:
         )
         self._rivals = Rivals(settings.instance, round(RIVAL_LEASES * settings.lease_s * SECOND))
         self.told_owner = self._rivals.told
-        foreign = ByteBudget(settings.standby_mb * MEGABYTE)
-        self._foreign: dict[str, TakeoverBuffer] = {}
-        self._foreign_lock = threading.Lock()
+        standby = ByteBudget(settings.standby_mb * MEGABYTE)
+
+        def buffer() -> TakeoverBuffer:
+            return TakeoverBuffer(round(settings.standby_s * SECOND), standby)
+
+        self.untracked = UntrackedMessages(member.holds, buffer, self._lose)
         self.caches: Caches
         """What publishers keep; set before anything is received."""
         self._mailboxes = ByteBudget(settings.memory_mb * MEGABYTE // 2)
@@ -182,7 +181,7 @@ class Registry:
             persistence=persistence,
             missed=missed,
             dump=lambda stream, dump: _save(settings.folder, stream, dump),
-            buffer=lambda: TakeoverBuffer(round(settings.standby_s * SECOND), foreign),
+            buffer=buffer,
             keep=self._keep,
             caches=lambda: self.caches,
             room=self._room,
@@ -214,7 +213,7 @@ class Registry:
             self._report("invalid_value", "", error.expected, error.received)
             return
         own = self._member.holds(session)
-        if not own and self._kept_for_takeover(session, packet, frame=frame):
+        if not own and self.untracked.keep(session, packet, frame=frame):
             self._metrics.foreign("detections" if frame else "points", packet.size)
         else:
             self._metrics.received("detections" if frame else "points", packet.size)
@@ -227,50 +226,21 @@ class Registry:
             stream, session = self.parsed(key)
         except schemas.MessageError:
             return
-        with self._foreign_lock:
-            buffer = self._foreign.get(session)
-            if buffer is not None:
-                buffer.answered.add(stream)
-                return
+        if self.untracked.cache_answered(session, stream):
+            return
         with self._lock:
             actor = self._actors.get(session)
         if actor is not None and actor.mailbox.offer_command(lambda: actor.on_caches_answered(stream), urgent=False):
             self._scheduler.submit(actor)
 
-    def forget_caches(self, received: set[str]) -> None:
-        """Forget which caches have answered, but for streams that are received still: they hold more by now."""
-        with self._foreign_lock:
-            for buffer in self._foreign.values():
-                buffer.answered &= received
-
     def _hand(self, stream: str, packet: Packet, *, frame: bool) -> None:
         offered = Mailbox.offer_frame if frame else Mailbox.offer_cloud
         if not self._offer(stream, lambda actor: offered(actor.mailbox, packet)):
-            self._put_off(stream, packet, frame=frame)
-
-    def _kept_for_takeover(self, stream: str, packet: Packet, *, frame: bool, own: bool = False) -> bool:
-        """Keep a packet of a stream that is not tracked here; False where the stream is to be tracked here.
-
-        Once the stream is, what was kept goes first, so packets are kept until that has been handed over. Those that
-        were received to be tracked here (`own`) are kept until somebody asks for them, and counted when dropped.
-        """
-        if self._member.holds(stream) and stream not in self._foreign:
-            return False
-        with self._foreign_lock:
-            buffer = self._foreign.get(stream)
-            if buffer is None:
-                if self._member.holds(stream):
-                    return False
-                buffer = self._foreign[stream] = self._context.buffer()
-            buffer.unasked |= own
-            lost = buffer.add(packet, frame=frame, own=own)
-            buffer.seen_ns = packet.now_ns
-        self._lose(stream, lost)
-        return True
+            self.untracked.put_off(stream, packet, frame=frame)
 
     def _keep(self, stream: str, packet: Packet, frame: bool) -> None:  # noqa: FBT001 - as a field of the context
         """Keep a packet that was received to be tracked here until its stream is, here or by who asks for it."""
-        if not self._kept_for_takeover(stream, packet, frame=frame, own=True):
+        if not self.untracked.keep(stream, packet, frame=frame, own=True):
             self._hand(stream, packet, frame=frame)
 
     def command(self, stream: str, command: Callable[[StreamActor], None], *, urgent: bool) -> bool:
@@ -315,63 +285,21 @@ class Registry:
         if not self._member.holds(self.parsed(key)[1]):
             self._metrics.foreign("detections", size)
 
-    def is_foreign(self, session: str) -> bool:
-        """Whether something may have been kept of a session for a takeover."""
-        return session in self._foreign
-
-    def foreign(self, partitions: Container[int]) -> set[str]:
-        """Return the sessions of partitions of which something is kept for a takeover."""
-        with self._foreign_lock:
-            return {session for session in self._foreign if partition_of(session) in partitions}
-
     def waits(self, session: str) -> bool:
         """Whether messages of a session wait for a worker."""
         with self._lock:
             actor = self._actors.get(session)
         return actor is not None and (actor.occupied or not actor.mailbox.idle)
 
-    def recent(self, sessions: Iterable[str]) -> list[Packet]:
-        """Return what is kept of sessions, the oldest first."""
-        with self._foreign_lock:
-            buffers = [self._foreign[session] for session in sessions if session in self._foreign]
-            kept = [one for buffer in buffers for one in buffer.asked()]
-        return sorted((packet for packet, _ in kept if packet.payload is not None), key=lambda one: one.now_ns)
-
-    def expect(self, session: str) -> None:
-        """Keep what comes of a session that is new to all members until its own has asked for it."""
-        with self._foreign_lock:
-            if session not in self._foreign and not self._member.holds(session):
-                buffer = self._foreign[session] = self._context.buffer()
-                buffer.unasked, buffer.seen_ns = True, time.monotonic_ns()
-
-    def hold(self, session: str) -> None:
-        """Keep what comes of a session until it is taken up."""
-        with self._foreign_lock:
-            self._newcomers.pop(session, None)
-            self._foreign.setdefault(session, self._context.buffer()).seen_ns = time.monotonic_ns()
-
     def take_up(self, session: str, packets: list[tuple[Packet, bool]]) -> None:
         """Go on with a session that has come here: with what others received of it, then with what was kept here."""
-        with self._foreign_lock:
-            self._offer_kept(session, packets)
+        self.untracked.hand_over(session, packets, self._take_up)
 
-    def _offer_kept(self, session: str, packets: list[tuple[Packet, bool]]) -> None:
-        """Do so, called with the lock of what is kept; without a buffer it has been taken up before."""
-        buffer = self._foreign.get(session)
-        self._newcomers.pop(session, None)
-        if buffer is None:
-            if not packets:
-                return
-            buffer = self._foreign[session] = self._context.buffer()
-            buffer.seen_ns = time.monotonic_ns()
-        if not self._member.holds(session):  # it has gone again
-            for packet, frame in packets:
-                buffer.add(packet, frame=frame)
-            return
-        known = {(packet.key, packet.payload) for packet, _ in packets}
-        packets = packets + [one for one in buffer.take() if (one[0].key, one[0].payload) not in known]
-        self._offer(session, partial(_take_up, packets=packets, answered=buffer.answered.copy()), limited=False)
-        del self._foreign[session]  # from now on readers hand over newer ones
+    def _take_up(self, session: str, packets: list[tuple[Packet, bool]], answered: set[str]) -> None:
+        def take_up(actor: StreamActor) -> bool | None:
+            return actor.mailbox.offer_command(lambda: actor.take_up(packets, answered), urgent=True)
+
+        self._offer(session, take_up, limited=False)
 
     def tracked(self, session: str) -> bool:
         """Whether a session is there, here or elsewhere: something valid has come of it."""
@@ -427,21 +355,7 @@ class Registry:
         for stream, other in self._rivals.contested([actor.stream for actor in actors], now_ns):
             self._report("contested", stream, "one `store`, or `cluster`, for all instances", f"{other} tracks it too")
         self._evict(actors)
-        self._trim(now_ns)
-
-    def _trim(self, now_ns: int) -> None:
-        """Drop what has been kept for too long."""
-        lost: dict[str, list[bool]] = {}
-        with self._foreign_lock:
-            for stream, buffer in tuple(self._foreign.items()):
-                if dropped := buffer.trim(now_ns):
-                    lost[stream] = dropped
-                forgotten = len(self._foreign) > MAX_LIVES or now_ns - buffer.seen_ns > self._settings.idle_s * SECOND
-                if not buffer and forgotten:
-                    del self._foreign[stream]
-                    self._newcomers.pop(stream, None)
-        for stream, dropped in lost.items():
-            self._lose(stream, dropped)
+        self.untracked.trim(now_ns, round(self._settings.idle_s * SECOND))
 
     def _evict(self, actors: list[StreamActor]) -> None:
         """Close sessions, the least recently used first, while all together keep more than the process may."""
@@ -463,12 +377,9 @@ class Registry:
         told = StreamActor.on_recalled if change is Change.RECALLED else StreamActor.on_lost
         with self._lock:
             actors = [actor for actor in self._actors.values() if partition_of(actor.stream) == partition]
-        now_ns = time.monotonic_ns()
         for actor in actors:
-            with self._foreign_lock:  # before the session ends: what comes from then on is kept for who asks
-                if actor.session is not None and not self._member.holds(actor.stream):
-                    buffer = self._foreign.setdefault(actor.stream, self._context.buffer())
-                    buffer.seen_ns, buffer.unasked = now_ns, buffer.unasked or change is Change.RECALLED
+            if actor.session is not None:  # before it ends: what comes from then on is kept for who asks
+                self.untracked.leave(actor.stream, asked_for=change is Change.RECALLED)
             actor.tell(told)
 
     def resume(self) -> None:
@@ -566,33 +477,14 @@ class Registry:
             self._unproven = {one for one in self._unproven if not one.occupied and known(one.stream) is one}
         return len(self._unproven) >= most
 
-    def _put_off(self, session: str, packet: Packet, *, frame: bool) -> None:
-        """Keep the first messages of a stream until there is room for it among those that are new."""
-        with self._foreign_lock:
-            buffer = self._foreign.get(session)
-            if buffer is None and len(self._newcomers) < MAX_NEWCOMERS:
-                buffer = self._foreign[session] = self._context.buffer()
-                buffer.unasked = True
-                self._newcomers[session] = None
-            lost = [frame]
-            if buffer is not None:
-                lost = buffer.add(packet, frame=frame, own=True)
-                buffer.seen_ns = packet.now_ns
-                if not buffer and session in self._newcomers:
-                    del self._foreign[session], self._newcomers[session]
-        self._lose(session, lost)
-
     def _let_in(self) -> None:
         """Hand over what was put off, as far as there is room."""
-        while self._newcomers:
+        waits = True
+        while waits:
             with self._lock:
                 if self._crowded():
                     return
-            with self._foreign_lock:
-                # At once: a session that the intake holds meanwhile it takes up itself, with what others received.
-                session = next(iter(self._newcomers), None)
-                if session is not None:
-                    self._offer_kept(session, [])
+            waits = self.untracked.hand_over_newcomer(self._take_up)
 
     def _discard(self, actor: Actor) -> None:
         with self._lock:
@@ -625,11 +517,10 @@ class Registry:
 
     def _lose(self, stream: str, lost: list[bool]) -> None:
         """Count messages that were dropped before their stream was tracked, each True: a frame."""
-        if lost:
-            frames = sum(lost)
-            with self._lock:
-                self._past += MessageCounters(received=frames, refused=frames, clouds_refused=len(lost) - frames)
-            self._report_shed(stream)
+        frames = sum(lost)
+        with self._lock:
+            self._past += MessageCounters(received=frames, refused=frames, clouds_refused=len(lost) - frames)
+        self._report_shed(stream)
 
     def _report_shed(self, stream: str) -> None:
         self._report("shed", stream, f"fewer than {MAX_UNPROVEN} new streams at once", "more than can wait")
@@ -678,10 +569,6 @@ def _save(folder: Path | None, stream: str, dump: bytes) -> str:
     except OSError as error:
         log.warning("store_failed", error=str(error))
         return ""
-
-
-def _take_up(actor: StreamActor, packets: list[tuple[Packet, bool]], *, answered: set[str]) -> bool | None:
-    return actor.mailbox.offer_command(lambda: actor.take_up(packets, answered), urgent=True)
 
 
 def _flush(actor: StreamActor) -> None:

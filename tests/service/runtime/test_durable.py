@@ -95,7 +95,7 @@ def test_a_closed_stream_that_moves_stays_closed(start: Callable[..., Any], tmp_
         before = node.tracks(SENSOR.stream, 5)[-1]
         assert node.ask(KEYS.query(SENSOR.stream, "reset"), SessionState, b'{"close": true}').state == "closed"
         until(lambda: not service._registry.waits(SENSOR.stream), "its state is kept")
-        service._registry.hold(SENSOR.stream)
+        service._registry.untracked.hold(SENSOR.stream)
         service._registry.take_up(SENSOR.stream, [])
         until(lambda: not service._registry.waits(SENSOR.stream), "it is taken up, and no session is there")
         node.send(*(SENSOR.detections(seq) for seq in range(5, 10)))

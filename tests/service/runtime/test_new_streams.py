@@ -19,6 +19,7 @@ from optipmb_service.runtime.intake import ALL, NEW_STREAMS, Intake
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.registry import Registry
 from optipmb_service.runtime.takeover_buffer import UNASKED_NS, TakeoverBuffer
+from optipmb_service.runtime.untracked import UntrackedMessages
 from optipmb_service.session.values import SECOND, MessageCounters
 from router import until
 
@@ -120,10 +121,8 @@ def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
         cloud=None,
         passed_by=None,
         caches_answered=None,
-        forget_caches=lambda _: None,
         actor=lambda _: None,
-        foreign=lambda _: set[str](),
-        hold=lambda _: None,
+        untracked=UntrackedMessages(lambda _: True, lambda: TakeoverBuffer(0, ByteBudget(0)), lambda *_: None),
         take_up=lambda *_: None,
         changed=lambda *_: None,
     )
@@ -215,7 +214,7 @@ def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPat
     network = Following()
     intake, registry = member_of(network, held)
     answered = set[str]()
-    registry.forget_caches = answered.intersection_update
+    registry.untracked.forget_caches = answered.intersection_update
     seen = set()
     for _ in range(300):
         for stream in chance.sample(STREAMS[:60], chance.randrange(5)):
@@ -251,7 +250,7 @@ def test_a_step_that_fails_is_done_again(monkeypatch: pytest.MonkeyPatch, fails:
     network, held = Network(announced=STREAMS[:5], published=STREAMS[5:10]), set[int]()
     intake, registry = member_of(network, held)
     kept, taken, failed = set[str](), set[str](), list[str]()
-    registry.hold = kept.add
+    registry.untracked.hold = kept.add
     registry.take_up = lambda session, _: (kept.discard(session), taken.add(session))
     where: Any = registry if fails == "take_up" else network
     works = getattr(where, fails)
@@ -277,20 +276,16 @@ def test_a_step_that_fails_is_done_again(monkeypatch: pytest.MonkeyPatch, fails:
 @pytest.mark.parametrize("new", [True, False], ids=["new", "known"])
 def test_the_first_frame_of_a_new_stream_is_kept_until_it_is_asked_for(*, new: bool) -> None:
     """What a new stream sent is kept beyond the usual time until its member has asked; no other stream's is."""
-    registry: Any = Registry.__new__(Registry)
     budget, keep_ns = ByteBudget(1 << 20), 10 * SECOND
-    registry._foreign, registry._foreign_lock = {}, threading.Lock()
-    registry._member = SimpleNamespace(holds=lambda _: False)
-    registry._context = SimpleNamespace(buffer=lambda: TakeoverBuffer(keep_ns, budget))
+    untracked = UntrackedMessages(lambda _: False, lambda: TakeoverBuffer(keep_ns, budget), lambda *_: None)
     stream, at_ns = STREAMS[0], 0
     if new:
-        registry.expect(stream)
-    assert registry._kept_for_takeover(stream, Packet(KEYS.detections(stream), b"1", 1, "", at_ns, at_ns), frame=True)
-    buffer = registry._foreign[stream]
-    buffer.trim(UNASKED_NS)
-    assert len(registry.recent([stream])) == new
-    buffer.trim(keep_ns + 1)
-    assert not buffer
+        untracked.expect(stream)
+    assert untracked.keep(stream, Packet(KEYS.detections(stream), b"1", 1, "", at_ns, at_ns), frame=True)
+    untracked.trim(UNASKED_NS, 3600 * SECOND)
+    assert len(untracked.recent([stream])) == new
+    untracked.trim(keep_ns + 1, 3600 * SECOND)
+    assert not untracked.recent([stream])
 
 
 class Kept:
@@ -303,13 +298,15 @@ class Kept:
         self.metrics: Counter[str] = Counter()
         self.problems: list[str] = []
         self.offered: list[list[Packet]] = []
-        registry._lock, registry._foreign_lock, registry._foreign = threading.Lock(), threading.Lock(), {}
-        registry._actors, registry._newcomers, registry._past = {}, {}, MessageCounters()
+        registry._lock, registry._actors, registry._past = threading.Lock(), {}, MessageCounters()
         registry._member = SimpleNamespace(holds=lambda _: self.holds, strained=False)
-        registry._context = SimpleNamespace(buffer=lambda: TakeoverBuffer(keep_ns, budget))
+        registry.untracked = UntrackedMessages(
+            lambda _: self.holds, lambda: TakeoverBuffer(keep_ns, budget), registry._lose
+        )
         registry._settings = SimpleNamespace(idle_s=3600.0)
         registry._crowded = lambda: self.crowded
-        registry._offer = self._offer
+        registry._offer = lambda *_: not self.crowded
+        registry._take_up = lambda _, packets, __: self.offered.append([packet for packet, _ in packets])
         registry._rivals = SimpleNamespace(contested=lambda *_: [])
         registry._evict, registry._sweep_ns = lambda _: None, 0
         registry._quotas = SimpleNamespace(exceeded=lambda *_: self.exceeded)
@@ -320,12 +317,6 @@ class Kept:
             foreign=lambda topic, _: self.metrics.update([f"foreign {topic}"]),
         )
         registry.parsed = lambda key: (key, key)
-
-    def _offer(self, _: str, offer: Any, *, limited: bool = True) -> bool:
-        if limited and self.crowded:
-            return False
-        self.offered.append([packet for packet, _ in offer.keywords["packets"]])
-        return True
 
 
 def detections(number: int, size: int = 10) -> Packet:
@@ -349,7 +340,7 @@ def test_a_stream_that_the_intake_holds_is_not_let_in() -> None:
     kept = Kept()
     kept.registry.frame(detections(0))
     kept.crowded = False
-    free = kept.registry._foreign_lock
+    free = kept.registry.untracked._lock
 
     class Held:
         """The lock: the intake holds the stream as soon as it has been let go."""
@@ -359,14 +350,14 @@ def test_a_stream_that_the_intake_holds_is_not_let_in() -> None:
 
         def __exit__(self, *_: object) -> None:
             free.release()
-            kept.registry._foreign_lock = free
-            kept.registry.hold(STREAMS[0])
+            kept.registry.untracked._lock = free
+            kept.registry.untracked.hold(STREAMS[0])
 
-    kept.registry._foreign_lock = Held()
+    kept.registry.untracked._lock = Held()
     kept.registry._let_in()
     kept.registry.take_up(STREAMS[0], [(detections(1), True)])
     assert [packet.wall_ns for offered in kept.offered for packet in offered] == [0, 1]
-    assert not kept.registry._foreign
+    assert STREAMS[0] not in kept.registry.untracked
 
 
 def test_what_is_put_off_counts_as_received() -> None:
@@ -386,7 +377,7 @@ def test_what_is_put_off_and_dropped_is_refused() -> None:
     registry = kept.registry
     for number in range(50):
         registry.frame(detections(number, 1000))
-    assert (len(registry._foreign[STREAMS[0]]), registry._past.refused) == (3, 47)
+    assert (len(registry.untracked._buffers[STREAMS[0]]), registry._past.refused) == (3, 47)
     registry.cloud(detections(50, 1000))
     assert registry._past.clouds_refused == 1
     registry.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
@@ -400,7 +391,7 @@ def test_what_is_put_off_is_within_the_quota() -> None:
     kept.registry.frame(detections(0))
     kept.exceeded = "a message"
     kept.registry.frame(detections(1))
-    assert (len(kept.registry._foreign[STREAMS[0]]), kept.registry._past.refused) == (1, 1)
+    assert (len(kept.registry.untracked._buffers[STREAMS[0]]), kept.registry._past.refused) == (1, 1)
     assert kept.problems == ["quota"]
 
 
@@ -413,10 +404,10 @@ def test_what_a_session_passes_on_is_kept_until_it_is_asked_for(*, asked: bool) 
     for packet in passed:
         registry._keep(STREAMS[0], packet, True)
     registry.frame(detections(2))
-    assert registry.foreign(range(PARTITIONS)) == {STREAMS[0]}
+    assert registry.untracked.of_partitions(range(PARTITIONS)) == {STREAMS[0]}
     if asked:
-        assert registry.recent([STREAMS[0]])[:2] == passed
+        assert registry.untracked.recent([STREAMS[0]])[:2] == passed
     registry.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
-    assert not registry._foreign[STREAMS[0]]
+    assert not registry.untracked._buffers[STREAMS[0]]
     assert registry._past.refused == (0 if asked else 2)
     assert kept.metrics == {"foreign detections": 1}
