@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import threading
+from typing import Final
+
+MEGABYTE: Final = 2**20
 
 
 class ByteBudget:

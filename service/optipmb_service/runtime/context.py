@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from optipmb_service.runtime.byte_budget import MEGABYTE
+from optipmb_service.session.values import SECOND, Policy
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,7 +22,11 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.ports import Caches, MessageSink, Packet
     from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
-    from optipmb_service.session.values import Lineage, Policy
+    from optipmb_service.session.values import Lineage
+    from optipmb_service.settings import Settings
+
+PARTS: Final = 4
+"""What a stream's memory is divided into: mailbox, clouds, frames held, window."""
 
 
 class Actor(Protocol):
@@ -99,3 +106,25 @@ class ActorContext:
     arm: Callable[[Actor, int], None]
     metrics: Metrics
     tracker: Callable[[optipmb.Parameters], Any]
+
+
+def part_of(settings: Settings) -> int:
+    """Return the bytes that each part of a stream's memory may take."""
+    return settings.stream_mb * MEGABYTE // PARTS
+
+
+def policy_of(settings: Settings) -> Policy:
+    """Return what sessions follow."""
+    return Policy(
+        gap_limit_ns=round(settings.gap_limit_s * SECOND),
+        cloud_wait_ns=round(settings.cloud_wait_s * SECOND),
+        cloud_memory_ns=round(settings.cloud_memory_s * SECOND),
+        clouds=settings.queue_clouds,
+        cloud_bytes=part_of(settings),
+        held_bytes=part_of(settings),
+        rewind_bytes=part_of(settings),
+        rewind_ns=round(settings.rewind_s * SECOND),
+        late_clouds=settings.late_clouds,
+        recovery_wait_ns=round(settings.recovery_wait_s * SECOND),
+        max_speed=settings.max_speed,
+    )

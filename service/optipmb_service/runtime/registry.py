@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
@@ -17,21 +16,20 @@ import structlog
 import optipmb
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.runtime import dumps
-from optipmb_service.runtime.byte_budget import ByteBudget
-from optipmb_service.runtime.context import Actor, ActorContext
+from optipmb_service.runtime.admission import Admission
+from optipmb_service.runtime.byte_budget import MEGABYTE, ByteBudget
+from optipmb_service.runtime.context import Actor, ActorContext, part_of, policy_of
 from optipmb_service.runtime.fusion import FUSED, Fusion
 from optipmb_service.runtime.mailbox import Mailbox
-from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
 from optipmb_service.runtime.rivals import Rivals
 from optipmb_service.runtime.stream_actor import StreamActor
 from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 from optipmb_service.runtime.untracked import UntrackedMessages
 from optipmb_service.session.problems import problem_of
-from optipmb_service.session.values import SECOND, Lineage, MessageCounters, Policy
+from optipmb_service.session.values import SECOND, MessageCounters
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from optipmb_service.cluster.member import Member
     from optipmb_service.observability.metrics import Metrics
@@ -41,6 +39,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.ports import Caches, MessageSink, Packet
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.runtime.scheduler import Scheduler
+    from optipmb_service.session.values import Lineage
     from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
@@ -51,23 +50,6 @@ MAX_UNPROVEN: Final = 256
 MAX_UNPROVEN_STRAINED: Final = 16
 """The same while the lease is renewed late: each of them delays that."""
 
-MAX_LIVES: Final = 65_536
-"""Streams without a session whose past is remembered."""
-
-DUMPS: Final = "quarantine"
-MAX_DUMPS: Final = 32
-
-MEGABYTE: Final = 2**20
-
-EVICT_IDLE_S: Final = 30.0
-"""Silence after which a session is closed for a stream that has none, when there is no more room."""
-
-REFUSED_NS: Final = SECOND // 10
-"""How long a stream without room is refused without another look."""
-
-EVICT_EVERY_NS: Final = SECOND
-"""A session is asked to close no more often than this."""
-
 RIVAL_LEASES: Final = 3
 """Leases for which the token of an instance may stay whose stream has been taken over."""
 
@@ -75,9 +57,6 @@ SWEEP_REST: Final = 200
 """How many times as long as a look at all sessions took of the processor it rests before the next one."""
 
 MOST_REST_NS: Final = 5 * SECOND
-
-PARTS: Final = 4
-"""What a stream's memory is divided into: mailbox, clouds, frames held, window."""
 
 MAX_KEYS: Final = 8192
 """Keys whose stream is remembered."""
@@ -128,18 +107,11 @@ class Registry:
         self._lock = threading.Lock()
         self._actors: dict[str, StreamActor] = {}
         self._unproven: set[StreamActor] = set()
-        self._sessions = 0
-        self._lives: OrderedDict[str, Lineage] = OrderedDict()
         self._streams: dict[str, tuple[str, str]] = {}
         self._past = MessageCounters()
         self._metrics = metrics
-        self._full: dict[str, tuple[int, str]] = {}
         self._sweep_ns = 0
-        self._evicting: dict[str, int] = {}
-        self._quotas = Quotas(
-            Quota(settings.node_sessions, settings.node_rate, settings.node_mb_s * MEGABYTE),
-            Quota(settings.site_sessions, settings.site_rate, settings.site_mb_s * MEGABYTE),
-        )
+        self._admission = Admission(settings, self._used, self._evict_for_another)
         self._rivals = Rivals(settings.instance, round(RIVAL_LEASES * settings.lease_s * SECOND))
         self.told_owner = self._rivals.told
         standby = ByteBudget(settings.standby_mb * MEGABYTE)
@@ -156,22 +128,10 @@ class Registry:
             keys=self.keys,
             fused=self.fusion.is_session,
             limits=self.limits,
-            policy=Policy(
-                gap_limit_ns=round(settings.gap_limit_s * SECOND),
-                cloud_wait_ns=round(settings.cloud_wait_s * SECOND),
-                cloud_memory_ns=round(settings.cloud_memory_s * SECOND),
-                clouds=settings.queue_clouds,
-                cloud_bytes=settings.stream_mb * MEGABYTE // PARTS,
-                held_bytes=settings.stream_mb * MEGABYTE // PARTS,
-                rewind_bytes=settings.stream_mb * MEGABYTE // PARTS,
-                rewind_ns=round(settings.rewind_s * SECOND),
-                late_clouds=settings.late_clouds,
-                recovery_wait_ns=round(settings.recovery_wait_s * SECOND),
-                max_speed=settings.max_speed,
-            ),
+            policy=policy_of(settings),
             queue_frames=settings.queue_frames,
             queue_clouds=settings.queue_clouds,
-            mailbox_bytes=settings.stream_mb * MEGABYTE // PARTS,
+            mailbox_bytes=part_of(settings),
             mailboxes=self._mailboxes,
             step_limit_ns=round(settings.step_limit_s * SECOND),
             sink=sink,
@@ -180,13 +140,13 @@ class Registry:
             member=member,
             persistence=persistence,
             missed=missed,
-            dump=lambda stream, dump: _save(settings.folder, stream, dump),
+            dump=lambda stream, dump: dumps.save(settings.folder, stream, dump),
             buffer=buffer,
             keep=self._keep,
             caches=lambda: self.caches,
-            room=self._room,
+            room=self._admission.room,
             admit=self._admit,
-            release=self._release,
+            release=self._admission.release,
             discard=self._discard,
             submit=scheduler.submit,
             arm=arm,
@@ -412,7 +372,7 @@ class Registry:
 
     def _over_quota(self, stream: str, packet: Packet, *, frame: bool) -> bool:
         """Refuse a message for which its node, or site, has no more quota."""
-        exceeded = self._quotas.exceeded(stream, packet.size, packet.now_ns)
+        exceeded = self._admission.exceeded(stream, packet.size, packet.now_ns)
         if not exceeded:
             return False
         with self._lock:
@@ -420,32 +380,13 @@ class Registry:
         self._report("quota", stream, exceeded, "more")
         return True
 
-    def _room(self, stream: str) -> str:
-        """Return why a further stream has no room; empty when it has. A refusal is remembered for a moment."""
-        now_ns = time.monotonic_ns()
-        until_ns, why = self._full.get(stream, (0, ""))
-        if now_ns >= until_ns:
-            why = self._look_for_room(stream)
-            if len(self._full) >= MAX_UNPROVEN:
-                self._full.clear()
-            if why:
-                self._full[stream] = now_ns + REFUSED_NS, why
-        return why
+    def _used(self) -> list[tuple[str, int]]:
+        """Return the streams with a session, and when each was last used."""
+        return [(actor.stream, actor.meter.active_ns) for actor in self.actors()]
 
-    def _look_for_room(self, stream: str) -> str:
-        if full := self._quotas.full(stream):
-            return full
-        if self._sessions < self._settings.max_sessions:
-            return ""
-        tracked = [(actor.stream, actor.meter.active_ns) for actor in self.actors()]
-        victim = victim_of(stream, tracked, time.monotonic_ns(), round(EVICT_IDLE_S * SECOND))
-        if victim is None:
-            return f"at most {self._settings.max_sessions} streams at once"
-        if self._evicting.get(victim, 0) < time.monotonic_ns():
-            self._evicting = {victim: time.monotonic_ns() + EVICT_EVERY_NS}
-            self._report("refused", victim, f"at most {self._settings.max_sessions} streams at once", "another site's")
-            self.command(victim, lambda actor: actor.close_session("evicted"), urgent=True)
-        return "a moment: another session is being closed"
+    def _evict_for_another(self, stream: str) -> None:
+        self._report("refused", stream, f"at most {self._settings.max_sessions} streams at once", "another site's")
+        self.command(stream, lambda actor: actor.close_session("evicted"), urgent=True)
 
     def _offer(self, stream: str, offer: Callable[[StreamActor], bool | None], *, limited: bool = True) -> bool:
         while True:
@@ -493,23 +434,10 @@ class Registry:
                 self._past += actor.totals()
 
     def _admit(self, stream: str) -> Lineage | None:
-        with self._lock:
-            if self._sessions >= self._settings.max_sessions:
-                return None
-            self._sessions += 1
-            lineage = self._lives.pop(stream, Lineage())
-        self._quotas.count(stream, 1)
-        self._let_in()
+        lineage = self._admission.admit(stream)
+        if lineage is not None:
+            self._let_in()
         return lineage
-
-    def _release(self, stream: str, lineage: Lineage) -> None:
-        with self._lock:
-            self._sessions -= 1
-            self._full.clear()  # who was refused may have room now
-            self._lives[stream] = lineage
-            if len(self._lives) > MAX_LIVES:
-                self._lives.popitem(last=False)
-        self._quotas.count(stream, -1)
 
     def _refuse(self, stream: str) -> None:
         self._count_refused()
@@ -558,17 +486,6 @@ class Registry:
             message=message,
         )
         self._reporter.report(problem, time.monotonic_ns())
-
-
-def _save(folder: Path | None, stream: str, dump: bytes) -> str:
-    """Write what is needed to see an error again into the folder of the state; return the file, empty without one."""
-    if folder is None:
-        return ""
-    try:
-        return str(dumps.save(folder / DUMPS, stream, dump, most=MAX_DUMPS))
-    except OSError as error:
-        log.warning("store_failed", error=str(error))
-        return ""
 
 
 def _flush(actor: StreamActor) -> None:

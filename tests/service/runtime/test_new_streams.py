@@ -309,7 +309,7 @@ class Kept:
         registry._take_up = lambda _, packets, __: self.offered.append([packet for packet, _ in packets])
         registry._rivals = SimpleNamespace(contested=lambda *_: [])
         registry._evict, registry._sweep_ns = lambda _: None, 0
-        registry._quotas = SimpleNamespace(exceeded=lambda *_: self.exceeded)
+        registry._admission = SimpleNamespace(exceeded=lambda *_: self.exceeded)
         self.exceeded = ""
         registry._report = lambda code, *_: self.problems.append(code)
         registry._metrics = SimpleNamespace(
