@@ -134,7 +134,7 @@ def test_the_entry_point_health_check_and_stop_signal_hold() -> None:
 
     assert IMAGE.last("ENTRYPOINT").words == [program]
     assert not healthy()
-    with ServiceProcess(environment={**environment, "OPTIPMB_STORE": "none"}) as service:
+    with ServiceProcess(environment={**environment, "OPTIPMB_STORE": "none"}, fresh=True) as service:
         service.wait_ready()
         assert healthy()
         status, _ = service.end(getattr(signal, IMAGE.last("STOPSIGNAL").value))

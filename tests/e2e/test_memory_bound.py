@@ -31,7 +31,7 @@ def peak_mb(pid: int) -> float:
 def test_garbage_takes_no_more_memory_than_is_set(capsys: pytest.CaptureFixture[str]) -> None:
     """A hundred messages of 16 MB that are none: memory stays near the setting, another stream is served."""
     settings = {"OPTIPMB_MEMORY_MB": str(MEMORY_MB), "OPTIPMB_STREAM_MB": "64"}
-    with ServiceProcess(environment=settings) as service:
+    with ServiceProcess(environment=settings, fresh=True) as service:
         service.wait_ready()
         with Node(service.endpoint) as node:
             node.send(SENSOR.detections(0))

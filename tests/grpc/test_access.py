@@ -139,7 +139,10 @@ def test_tokens_of_ones_own(network: Network, tmp_path: Path) -> None:
 
     paths = f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
     environment = {"PYTHONPATH": paths, "OPTIPMB_GRPC_TOKENS": "own_tokens:caller"}
-    with ServiceProcess("router") as router, GatewayProcess(router.endpoint, environment=environment) as gateway:
+    with (
+        ServiceProcess("router") as router,
+        GatewayProcess(router.endpoint, environment=environment, fresh=True) as gateway,
+    ):
         gateway.wait_ready()
         one = gateway.stub()
         asked = pb.QueryTracksRequest(pattern=FOREIGN)

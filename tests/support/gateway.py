@@ -32,14 +32,20 @@ class GatewayProcess(ServiceProcess):
         router: its endpoint.
         options: further ones.
         environment: variables.
+        fresh: whether it is a new interpreter.
     """
 
-    def __init__(self, router: str, *options: str, environment: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, router: str, *options: str, environment: Mapping[str, str] | None = None, fresh: bool = False
+    ) -> None:
         port = free_endpoint().rpartition(":")[2]
         self.address = f"127.0.0.1:{port}"
         super().__init__(
-            "grpc", "--connect", router, "--grpc", self.address, *options, environment=environment, listen=False
-        )  # fmt: skip
+            *("grpc", "--connect", router, "--grpc", self.address, *options),
+            environment=environment,
+            listen=False,
+            fresh=fresh,
+        )
 
     def stub(self, options: Sequence[tuple[str, int]] = ()) -> Any:
         """The generated stub on a channel of its own."""

@@ -1,4 +1,4 @@
-"""The real command in a process of its own: started, awaited by its ready line, always ended."""
+"""The real command in a process of its own, forked or fresh: started, awaited by its ready line, always ended."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Self
 
+from forked import Forked
 from routers import free_endpoint
 
 if TYPE_CHECKING:
@@ -28,16 +29,26 @@ class ServiceProcess:
         options: what follows the command's name.
         environment: variables on top of this process's, which loses its own settings.
         listen: whether a free endpoint is given to it.
+        fresh: whether it is a new interpreter, for what is claimed of a start, of memory and of what is loaded; else
+            it is forked from a process that has imports and kernels behind it.
     """
 
-    def __init__(self, *options: str, environment: Mapping[str, str] | None = None, listen: bool = True) -> None:
+    def __init__(
+        self,
+        *options: str,
+        environment: Mapping[str, str] | None = None,
+        listen: bool = True,
+        fresh: bool = False,
+    ) -> None:
         self.endpoint = free_endpoint()
         where = ("--listen", self.endpoint) if listen else ()
         clean = {name: value for name, value in os.environ.items() if not name.startswith("OPTIPMB_")}
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._errors: list[str] = []
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "optipmb_service", *options, *where],
+        words = (*options, *where)
+        fresh_command = [sys.executable, "-m", "optipmb_service", *words]
+        self.process: subprocess.Popen[str] = (subprocess.Popen if fresh else Forked)(
+            fresh_command if fresh else words,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

@@ -35,7 +35,7 @@ def test_a_start_is_short_and_a_signal_ends_it_in_order() -> None:
     """
     optipmb.warm_up()
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    with ServiceProcess("--instance", "one") as service:
+    with ServiceProcess("--instance", "one", fresh=True) as service:
         assert service.wait_ready() == f"ready instance=one endpoints={service.endpoint}"
         with Node(service.endpoint) as node:
             node.send(*(SENSOR.detections(seq) for seq in range(5)))
@@ -51,7 +51,7 @@ def test_a_start_is_short_and_a_signal_ends_it_in_order() -> None:
 
 def test_a_signal_during_the_start_ends_it() -> None:
     """Before it is ready, too, a signal ends it with status 0."""
-    with ServiceProcess() as service:
+    with ServiceProcess(fresh=True) as service:
         service.wait_log("starting")
         status, seconds = service.end(signal.SIGTERM)
         assert status == 0

@@ -40,7 +40,7 @@ def busy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
     optipmb.warm_up()  # a process that compiles keeps the compiler's memory
     sensors = [replace(SENSOR, stream=f"site/node{k}/lidar", objects=40) for k in range(STREAMS)]
     environment = {"OPTIPMB_STORE": str(tmp_path_factory.mktemp("store"))}
-    with ServiceProcess(environment=environment) as service:
+    with ServiceProcess(environment=environment, fresh=True) as service:
         service.wait_ready()
         with Node(service.endpoint) as node:
             for seq in range(FRAMES):

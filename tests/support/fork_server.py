@@ -1,0 +1,77 @@
+"""A process that has imported the service and loaded the kernels, and forks for each start that it is asked for.
+
+Run by `forked`, as `fork_server.py FD`. An order comes as one packet with the three files that the new process is to
+have. The packet is JSON: the words behind `optipmb-service`, the environment, the folder. The answer is the number of
+the new process. That one is forked twice, so that it has no parent here; whoever asked takes it as a child of its own.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import runpy
+import socket
+import sys
+from pathlib import Path
+
+LARGEST = 1 << 18
+FILES = 3
+TASKS = Path("/proc/self/task")
+
+
+def load() -> None:
+    """Import what a service imports until it is ready, as it does, and load its kernels."""
+    from optipmb_service.app.collector import collector_paused  # noqa: PLC0415 - as the command does it
+    from optipmb_service.app.optional import without  # noqa: PLC0415
+
+    with collector_paused(), without("rich"):
+        from optipmb_service.app import cli, worker  # noqa: F401, PLC0415
+    from optipmb_service.app.kernels import warm_up  # noqa: PLC0415
+
+    warm_up()
+    gc.collect()
+    gc.freeze()
+
+
+def serve(asking: socket.socket) -> None:
+    """Fork for every order, until nobody is there to give one; returns in a new process, and at the end."""
+    while True:
+        packet, files, _, _ = socket.recv_fds(asking, LARGEST, FILES)
+        if not packet:
+            os._exit(0)
+        reading, writing = os.pipe()
+        between = os.fork()
+        if between == 0:
+            child = os.fork()
+            if child == 0:
+                os.close(reading)
+                os.close(writing)
+                asking.close()
+                become(json.loads(packet), files)
+                return
+            os.write(writing, str(child).encode())
+            os._exit(0)
+        os.waitpid(between, 0)  # before the answer: from here on the new process belongs to whoever asked
+        asking.send(os.read(reading, 32))
+        for one in (reading, writing, *files):
+            os.close(one)
+
+
+def become(order: dict[str, object], files: list[int]) -> None:
+    """Take over files, environment, folder and words of the order."""
+    for number, one in enumerate(files):
+        os.dup2(one, number)
+        os.close(one)
+    os.environ.clear()
+    os.environ.update(order["environment"])
+    os.chdir(order["folder"])
+    sys.argv[1:] = order["words"]
+
+
+if __name__ == "__main__":
+    with socket.socket(fileno=int(sys.argv[1])) as asking_here:
+        load()
+        asking_here.send(str(len(list(TASKS.iterdir()))).encode())
+        serve(asking_here)
+    runpy.run_module("optipmb_service", run_name="__main__", alter_sys=True)

@@ -1,0 +1,71 @@
+"""Processes of the service without the second of processor time that imports and kernels take of a start.
+
+They are forked from one that has these loaded (`fork_server`); from `main` on they run what a start from a shell runs,
+with its own words, environment, files and signals. Tests that are about a start itself begin with a new interpreter.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+SERVER = Path(__file__).with_name("fork_server.py")
+PR_SET_CHILD_SUBREAPER = 36
+
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
+"""numpy's linear algebra starts others when it is imported."""
+
+
+@functools.cache
+def server() -> socket.socket:
+    """The one server of this process, started when first needed: where it takes orders."""
+    asking, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    number = theirs.fileno()
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("OPTIPMB_")}
+    process = subprocess.Popen(
+        [sys.executable, str(SERVER), str(number)], pass_fds=(number,), env=clean | ONE_THREAD,
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    theirs.close()
+
+    def end() -> None:
+        asking.close()
+        process.wait()
+
+    atexit.register(end)
+    threads = asking.recv(32)
+    assert threads == b"1", f"with {threads!r} threads a fork would copy locks that others hold"
+    return asking
+
+
+class Forked(subprocess.Popen[str]):
+    """`python -m optipmb_service` with the words given, as `subprocess.Popen` starts and ends it."""
+
+    def _execute_child(self, args: Any, executable: Any, *given: Any) -> None:
+        """Fork where `Popen` forks and calls exec; what it gives here has been the same since Python 3.9."""
+        del executable
+        _, _, _, folder, environment, _, _, _, *pipes = given[:14]
+        stdin, _, _, stdout, _, stderr = pipes
+        order = {
+            "words": list(args),
+            "environment": dict(os.environ if environment is None else environment),
+            "folder": folder or os.getcwd(),  # noqa: PTH109 - a text is needed
+        }
+        asking = server()
+        kernel = ctypes.CDLL(None, use_errno=True)
+        kernel.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        try:
+            socket.send_fds(asking, [json.dumps(order).encode()], [stdin, stdout, stderr])
+            self.pid = int(asking.recv(32))
+        finally:
+            kernel.prctl(PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)
+        self._child_created = True
+        self._close_pipe_fds(*pipes)
