@@ -21,9 +21,8 @@ from optipmb_service.observability import collectors
 from optipmb_service.observability.health import STUCK_S
 from optipmb_service.observability.metrics import Collected, ReadOnDemand, families
 from optipmb_service.runtime.fusion import Fusion
-from optipmb_service.runtime.ports import TransportError
-from optipmb_service.runtime.queries import UNDRAINED, drain_asked, move_asked
-from optipmb_service.session.problems import problem_of
+from optipmb_service.runtime.requests import guarded, problem_with
+from optipmb_service.runtime.service_queries import UNDRAINED, drain_asked, move_asked
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -184,23 +183,22 @@ class AggregateView:
 
     def answer(self, request: Request) -> None:
         """Answer a query about the instance, and finish it whatever happens."""
+        guarded(request, lambda: self._answer(request))
+
+    def _answer(self, request: Request) -> None:
         keys = self._keys
         status, metrics = keys.status(self._instance), keys.metrics(self._instance)
         orders = {keys.move(self._instance): self._move, keys.drain(self._instance): self._drain}
-        try:
-            if request.key in orders:
+        if request.key in orders:
+            try:
                 orders[request.key](request)
-                return
-            if request.matches(status):
-                request.answer(status, self.status())
-            if request.matches(metrics):
-                request.answer_text(metrics, self.text(), TEXT)
-        except schemas.MessageError as error:
-            request.refuse(self._problem(error))
-        except TransportError as error:
-            log.warning("reply_failed", key=request.key, error=str(error))
-        finally:
-            request.finish()
+            except schemas.MessageError as error:
+                request.refuse(problem_with(error, instance=self._instance))
+            return
+        if request.matches(status):
+            request.answer(status, self.status())
+        if request.matches(metrics):
+            request.answer_text(metrics, self.text(), TEXT)
 
     def _move(self, request: Request) -> None:
         """Carry out a move.
@@ -264,17 +262,6 @@ class AggregateView:
                     for sample in metric.samples
                 ]
         yield from merged.values()
-
-    def _problem(self, error: schemas.MessageError) -> schemas.Problem:
-        return problem_of(
-            error.code,
-            stream="",
-            instance=self._instance,
-            path=error.path,
-            expected=error.expected,
-            received=error.received,
-            message=f"Query: {error.path or 'payload'}: expected {error.expected}, received {error.received}.",
-        )
 
 
 def _newest(parts: Iterable[schemas.ServiceStatus]) -> tuple[schemas.MemberSummary, ...]:

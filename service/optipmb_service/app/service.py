@@ -34,9 +34,10 @@ from optipmb_service.runtime.intake import Intake
 from optipmb_service.runtime.kept_tracks import RecentTracks
 from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter, NoPersistence
 from optipmb_service.runtime.ports import TransportError
-from optipmb_service.runtime.queries import Queries, members_of
 from optipmb_service.runtime.registry import Registry
 from optipmb_service.runtime.scheduler import Scheduler
+from optipmb_service.runtime.service_queries import ServiceQueries, members_of
+from optipmb_service.runtime.stream_queries import StreamQueries
 from optipmb_service.runtime.track_query import TrackQuery
 from optipmb_service.session.problems import problem_of
 from optipmb_service.zenoh import Transport
@@ -134,15 +135,19 @@ class Service:
             idle_s=settings.idle_s,
         )
         self._metrics.add(self._figures)
-        self._queries = Queries(
-            self._registry,
-            self.status,
-            self._metrics.text,
-            self._metrics.samples,
-            self._member,
-            self._intake.hand_over,
-            settings.workers,
-            TrackQuery([*logged, recent], settings.instance, settings.limits.limits()),
+        limits = settings.limits.limits()
+        self._stream_queries = StreamQueries(self._registry, TrackQuery([*logged, recent], settings.instance, limits))
+        self._service_queries = ServiceQueries(
+            settings.instance,
+            self._registry.keys,
+            limits,
+            self._registry.fusion,
+            status=self.status,
+            metrics=self._metrics.text,
+            samples=self._metrics.samples,
+            member=self._member,
+            hand_over=self._intake.hand_over,
+            workers=settings.workers,
         )
 
     def start(self, *, announce: bool = True) -> None:
@@ -152,7 +157,7 @@ class Service:
         self._persistence.start(self._registry.keep)
         self._member.start(self._intake.changed, self._registry.resume, self._registry.occupied)
         self._intake.start()
-        self._transport.serve(self._queries.about_streams, self._queries.about_service)
+        self._transport.serve(self._stream_queries.answer, self._service_queries.answer)
         self._state = "ready"
         if announce:
             self._transport.announce()

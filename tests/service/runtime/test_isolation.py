@@ -28,7 +28,7 @@ from optipmb_service.app.clustering import STORE_FILE
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.observability.health import ProcessHealth
-from optipmb_service.runtime import persistence, queries
+from optipmb_service.runtime import persistence, stream_queries
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.missed_frames import NoLog
@@ -280,14 +280,14 @@ def test_a_question_about_the_state_keeps_no_frame_waiting(
 ) -> None:
     """The digest of a state is made on a thread of its own: frames are tracked meanwhile."""
     gate, asked = threading.Event(), threading.Event()
-    digest = queries.digest_of
+    digest = stream_queries.digest_of
 
     def slow(checkpoint: Any) -> str:
         asked.set()
         assert gate.wait(20)
         return digest(checkpoint)
 
-    monkeypatch.setattr(queries, "digest_of", slow)
+    monkeypatch.setattr(stream_queries, "digest_of", slow)
     _, endpoint = start()
     with Node(endpoint) as node, ThreadPoolExecutor(1) as asking:
         node.send(CAREFUL.detections(0))

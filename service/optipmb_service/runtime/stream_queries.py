@@ -1,4 +1,4 @@
-"""Answers to queries: the state and density of sessions, resets, parameters, the status of the service.
+"""Answers to queries about streams: the state and density of sessions, resets, parameters, tracks of the past.
 
 What concerns a session is run by the worker of its stream, so that nothing else happens to it meanwhile: a question
 about the state or the density goes before the frames that wait, a reset or a change of parameters takes its turn among
@@ -8,7 +8,6 @@ them. The query thread itself only sorts. An error is a reply too: a `Problem`, 
 from __future__ import annotations
 
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Literal, TypeVar
 
@@ -17,19 +16,16 @@ import optipmb_schemas as schemas
 import structlog
 
 import optipmb
-from optipmb_service.cluster.store import StoreError
 from optipmb_service.runtime.ports import TransportError
+from optipmb_service.runtime.requests import guarded, problem_with
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.convert import density_of
-from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import RefusedError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable
 
-    from optipmb_service.cluster.leases import MemberLease
-    from optipmb_service.cluster.member import Member
-    from optipmb_service.runtime.ports import Packet, Request
+    from optipmb_service.runtime.ports import Request
     from optipmb_service.runtime.registry import Registry
     from optipmb_service.runtime.stream_actor import StreamActor
     from optipmb_service.runtime.track_query import TrackQuery
@@ -37,144 +33,27 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
-TEXT = "text/plain;version=0.0.4"
-"""Zenoh encoding of the metrics."""
-
-JSON = "application/json"
-"""Zenoh encoding of the metrics as data."""
-
-MOVE_S = 15.0
-"""How long a stream may take to be moved; it takes a second."""
-
-UNDRAINED = "not all taken in time; it goes on draining until that is undone"
-"""Why a drain was not confirmed."""
-
-MOVES = 16
-"""Moves that wait for each other."""
-
 NO_SESSION = "0" * 32
 """Session id in the state of a stream that has none."""
 
 _T = TypeVar("_T", bound=schemas.Message)
 
 
-class Queries:
-    """Answers every request, and finishes it whatever happens.
+class StreamQueries:
+    """Answers every request about streams, and finishes it whatever happens.
 
     Args:
         registry: the streams.
-        status: makes the status of the service.
-        metrics: makes its metrics, in Prometheus' text format.
-        samples: makes its metrics as data for the parent of this process.
-        member: the partitions of this process.
-        hand_over: gives what was received lately of sessions that are tracked elsewhere now.
-        workers: how many processes the service has.
         tracks: answers queries for tracks.
     """
 
-    def __init__(
-        self,
-        registry: Registry,
-        status: Callable[[], schemas.ServiceStatus],
-        metrics: Callable[[], bytes],
-        samples: Callable[[], bytes],
-        member: Member,
-        hand_over: Callable[[Iterable[str], Callable[[Packet], None]], None],
-        workers: int,
-        tracks: TrackQuery,
-    ) -> None:
+    def __init__(self, registry: Registry, tracks: TrackQuery) -> None:
         self._registry = registry
         self._tracks = tracks
-        self._status = status
-        self._metrics = metrics
-        self._samples = samples
-        self._member = member
-        self._handed_over = hand_over
-        self._workers = workers
         self._keys = registry.keys
-        self._moves = ThreadPoolExecutor(1, "move")
-        self._moving = threading.BoundedSemaphore(MOVES)
         self._digests = ThreadPoolExecutor(1, "digest")
-        self._handovers = ThreadPoolExecutor(1, "recent")
 
-    def about_service(self, request: Request) -> None:
-        """Answer with the status of the service, its metrics, or both when the key has a `*`; or have streams moved."""
-        instance = self._registry.instance
-        if request.key == self._keys.recent():
-            self._handovers.submit(_guarded, request, lambda: self._hand_over(request))
-            return
-        if request.key in {self._keys.move(instance), self._keys.drain(instance)}:
-            if self._moving.acquire(blocking=False):
-                moves = self._move if request.key == self._keys.move(instance) else self._drain
-                self._moves.submit(self._move_in_turn, request, moves)
-            else:
-                many = schemas.MessageError("invalid_value", "worker", f"at most {MOVES} moves at a time", "more")
-                _guarded(request, lambda: request.refuse(self._problem("", many)))
-            return
-        _guarded(request, lambda: self._report(request, self._keys.status(instance), self._keys.metrics(instance)))
-
-    def _report(self, request: Request, status: str, metrics: str) -> None:
-        if request.key == self._keys.samples(self._registry.instance):
-            request.answer_text(request.key, self._samples(), JSON)
-            return
-        if request.matches(status):
-            request.answer(status, self._status())
-        if request.matches(metrics):
-            request.answer_text(metrics, self._metrics(), TEXT)
-
-    def _hand_over(self, request: Request) -> None:
-        """Answer with what was received lately of sessions, whose names are lines, to who tracks them now."""
-        key = self._keys.recent(self._registry.instance)
-
-        def give(packet: Packet) -> None:
-            request.answer_text(key, packet.payload or b"", packet.encoding, about=packet.key)
-
-        self._handed_over((request.payload or b"").decode("ascii", "replace").splitlines(), give)
-
-    def _move_in_turn(self, request: Request, moves: Callable[[Request], None]) -> None:
-        try:
-            _guarded(request, lambda: moves(request))
-        finally:
-            self._moving.release()
-
-    def _move(self, request: Request) -> None:
-        """Have a stream brought here, and say so."""
-        try:
-            asked = move_asked(request, self._registry.limits, self._workers)
-        except schemas.MessageError as error:
-            request.refuse(self._problem("", error))
-            return
-        try:
-            received = (
-                "" if self._member.bring(self._registry.fusion.session_of(asked.stream), MOVE_S) else "none in time"
-            )
-        except StoreError as error:
-            received = str(error)
-        if received:
-            failed = schemas.MessageError("invalid_value", "worker", "a worker to which the stream comes", received)
-            request.refuse(self._problem(asked.stream, failed))
-        else:
-            request.answer(request.key, asked)
-
-    def _drain(self, request: Request) -> None:
-        """Have all streams taken by others, and say so."""
-        try:
-            asked = drain_asked(request, self._registry.limits)
-        except schemas.MessageError as error:
-            request.refuse(self._problem("", error))
-            return
-        received = "none" if asked.drain and not self._member.others else ""
-        if not received:
-            self._member.drain(drains=asked.drain)
-            if asked.drain and not self._member.drained(MOVE_S):
-                received = UNDRAINED
-        if received:
-            failed = schemas.MessageError("invalid_value", "drain", "another member that takes the streams", received)
-            request.refuse(self._problem("", failed))
-        else:
-            request.answer(request.key, asked)
-
-    def about_streams(self, request: Request) -> None:
+    def answer(self, request: Request) -> None:
         """Answer what concerns sessions, here or on the worker of the stream."""
         name = request.key.rpartition("/")[2]
         if "*" in request.key:
@@ -185,7 +64,7 @@ class Queries:
             self._keys.tracks(stream)
         except schemas.MessageError as error:
             nowhere = self._problem("", error)
-            _guarded(request, lambda: request.refuse(nowhere))
+            guarded(request, lambda: request.refuse(nowhere))
             return
         session = self._registry.fusion.session_of(stream)
         if self._registry.elsewhere(session):
@@ -193,7 +72,7 @@ class Queries:
             return
         if session != stream:
             shared = schemas.MessageError("invalid_value", "key", f"{session}, the session that it shares", stream)
-            _guarded(request, lambda: request.refuse(self._problem(stream, shared)))
+            guarded(request, lambda: request.refuse(self._problem(stream, shared)))
             return
         if name == "tracks":
             self._tracks.answer(request, stream)
@@ -208,23 +87,23 @@ class Queries:
             unknown = schemas.MessageError(
                 "invalid_value", "key", f"one of q/{', q/'.join((*commands, 'tracks'))}", f"q/{name}"
             )
-            _guarded(request, lambda: request.refuse(self._problem(stream, unknown)))
+            guarded(request, lambda: request.refuse(self._problem(stream, unknown)))
             return
         command, urgent = commands[name]
 
         def answer(actor: StreamActor) -> None:
             if name == "state" and not actor.elsewhere:
-                self._later(self._state(actor), lambda state: _guarded(request, lambda: self._say(request, state)))
+                self._later(self._state(actor), lambda state: guarded(request, lambda: self._say(request, state)))
                 return
             # Where several instances run, the one that tracks the stream answers.
-            _guarded(request, lambda: None if actor.elsewhere else command(actor, request))
+            guarded(request, lambda: None if actor.elsewhere else command(actor, request))
 
         # A stream can be set up ahead of its first frame, by a valid request.
         seeks = name == "parameters" and self._sets(request)
         taken = self._registry.command(stream, lambda actor: actor.ask(answer, seek=seeks), urgent=urgent)
         if not taken:
             full = schemas.MessageError("too_large", "key", "fewer new streams at once", "another one")
-            _guarded(request, lambda: request.refuse(self._problem(stream, full)))
+            guarded(request, lambda: request.refuse(self._problem(stream, full)))
 
     def _sets(self, request: Request) -> bool:
         """Whether a request for parameters is valid and changes any."""
@@ -277,7 +156,12 @@ class Queries:
 
         def work() -> None:
             said, checkpoint = state
-            then(said if checkpoint is None else said.model_copy(update={"digest": digest_of(checkpoint)}))
+            if checkpoint is not None:
+                try:
+                    said = said.model_copy(update={"digest": digest_of(checkpoint)})
+                except Exception:
+                    log.exception("internal_error", stream=said.stream)  # who asked must not wait for a timeout
+            then(said)
 
         self._digests.submit(work)
 
@@ -373,52 +257,7 @@ class Queries:
             return None
 
     def _problem(self, stream: str, error: schemas.MessageError, *, code: str = "") -> schemas.Problem:
-        return problem_of(
-            code or error.code,
-            stream=stream,
-            instance=self._registry.instance,
-            path=error.path,
-            expected=error.expected,
-            received=error.received,
-            message=f"Query: {error.path or 'payload'}: expected {error.expected}, received {error.received}.",
-        )
-
-
-def move_asked(request: Request, limits: schemas.Limits, workers: int) -> schemas.MoveRequest:
-    """Return what a request to move a stream says.
-
-    Raises:
-        MessageError: it is none, or there is no such worker.
-    """
-    asked = schemas.decode(request.payload or b"", schemas.MoveRequest, encoding=request.encoding, limits=limits)
-    if asked.worker >= workers:
-        raise schemas.MessageError("invalid_value", "worker", f"a worker from 0 to {workers - 1}", str(asked.worker))
-    return asked
-
-
-def drain_asked(request: Request, limits: schemas.Limits) -> schemas.DrainRequest:
-    """Return what a request to leave all streams says.
-
-    Raises:
-        MessageError: it is none.
-    """
-    if not request.payload:
-        return schemas.DrainRequest()
-    return schemas.decode(request.payload, schemas.DrainRequest, encoding=request.encoding, limits=limits)
-
-
-def members_of(leases: Sequence[MemberLease]) -> tuple[schemas.MemberSummary, ...]:
-    """Return the lines of the members in the status."""
-    return tuple(
-        schemas.MemberSummary(
-            member=one.member,
-            state=one.state,
-            age_s=one.age_ns / 1e9,
-            partitions=tuple(one.fences),
-            fences=tuple(one.fences.values()),
-        )
-        for one in leases
-    )
+        return problem_with(error, instance=self._registry.instance, stream=stream, code=code)
 
 
 class _Countdown:
@@ -435,15 +274,3 @@ class _Countdown:
             done = self._left == 0
         if done:
             self._last()
-
-
-def _guarded(request: Request, answer: Callable[[], None]) -> None:
-    """Answer, and finish the request whatever happens: an asker must not wait for its timeout."""
-    began_ns = time.monotonic_ns()
-    try:
-        answer()
-    except TransportError as error:
-        log.warning("reply_failed", key=request.key, error=str(error))
-    finally:
-        request.finish()
-        log.debug("query", key=request.key, took_ms=(time.monotonic_ns() - began_ns) / 1e6)
