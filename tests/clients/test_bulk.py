@@ -139,7 +139,7 @@ def test_workers_end_with_the_command(data: Path, tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     for way in (signal.SIGKILL, signal.SIGTERM):
         out = tmp_path / way.name
-        process = start("track", data, "--profile", "kitti", "--out", out, "--jobs", "2")
+        process = start("track", data, "--profile", "kitti", "--out", out, "--jobs", "2", fresh=True)
         until = time.monotonic() + ENDS_S
         while len(found := workers(process.pid)) < 2 and process.poll() is None and time.monotonic() < until:
             time.sleep(0.02)

@@ -295,7 +295,7 @@ def test_the_viewer_is_served_to_a_browser(incident: Path) -> None:
     """With --web the address that is printed answers with a page; it ends in time."""
     port = free_endpoint().rpartition(":")[2]
     grpc = free_endpoint().rpartition(":")[2]
-    process = start("watch", incident, "--web", "--web-port", port, "--data-port", grpc, "--seconds", 20)
+    process = start("watch", incident, "--web", "--web-port", port, "--data-port", grpc, "--seconds", 20, fresh=True)
     try:
         assert process.stdout is not None
         line = process.stdout.readline()

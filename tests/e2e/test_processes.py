@@ -73,7 +73,7 @@ def test_the_service_ends_when_its_parent_is_killed() -> None:
 @pytest.mark.parametrize("stage", ["starting", "replaying"])
 def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path, stage: str, number: int, status: int) -> None:
     """Whatever ends the demo, at whichever stage: the service ends too, and there is no traceback."""
-    process = start("demo", "--out", tmp_path, "--frames", 10, "--speed", 0.1)
+    process = start("demo", "--out", tmp_path, "--frames", 10, "--speed", 0.1, fresh=True)
     assert process.stderr is not None
     try:
         for line in process.stderr:

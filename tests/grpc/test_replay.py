@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from commands import result_of, run_here
+from commands import result_of, run_here, start
 from gateway import GatewayProcess
 from optipmb_client import Publisher, Subscriber
 from optipmb_client.errors import ConnectionFailed
@@ -73,10 +72,10 @@ def test_kitti_through_three_gateways_at_once(
     run_here(capsys, "replay", *data, "--sequences", *names, *zenoh)
     options = ("--json", "--out", str(tmp_path / "grpc"), *map(str, data))
     commands = [
-        [sys.executable, "-m", "optipmb_client", "replay", *options, "--sequences", name, *connect(gateway)]
+        ["replay", *options, "--sequences", name, *connect(gateway)]
         for name, gateway in zip(names, gateways, strict=True)
     ]
-    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for command in commands]
+    running = [start(*command) for command in commands]
     printed = [process.communicate(timeout=240)[0] for process in running]
     assert [process.returncode for process in running] == [0, 0, 0]
     assert json.loads(printed[0])["sequences"][0]["clouds"] > 0
@@ -92,13 +91,12 @@ def test_a_gateway_that_is_killed_loses_nothing(
     with GatewayProcess(service.endpoint) as doomed:
         doomed.wait_ready()
         # At five frames a second the sixteen clouds that a publisher keeps bridge three seconds without a gateway.
-        command = [sys.executable, "-m", "optipmb_client", "replay", *scene, "--speed", "0.5", "--json"]
-        command += [*connect(doomed, gateways[1]), "--out", str(tmp_path / "grpc")]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as replay:
+        command = ["replay", *scene, "--speed", "0.5", "--json", *connect(doomed, gateways[1])]
+        with start(*command, "--out", tmp_path / "grpc") as replay:
             wait_for_frames(gateways[1], 15)
             doomed.process.send_signal(signal.SIGKILL)
-            output, _ = replay.communicate(timeout=120)
-    result: Any = result_of(subprocess.CompletedProcess(command, replay.returncode, output, ""))
+            output, errors = replay.communicate(timeout=120)
+    result: Any = result_of(subprocess.CompletedProcess(command, replay.returncode, output, errors))
     assert replay.returncode == 0
     compare(tmp_path, ("track", "grpc"), ["0000"])
     assert (result["sequences"][0]["returned"], result["missing"]) == (50, 0)

@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 import pytest
+from forked import Forked
 from optipmb_client.cli import run
 
 
@@ -25,10 +26,11 @@ def run_here(capsys: pytest.CaptureFixture[str], *arguments: object) -> "subproc
     return subprocess.CompletedProcess(words, status, shown.out, shown.err)
 
 
-def start(*arguments: object) -> "subprocess.Popen[str]":
-    """Start the client's command and return the running process."""
-    command = [sys.executable, "-m", "optipmb_client", *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def start(*arguments: object, fresh: bool = False) -> "subprocess.Popen[str]":
+    """Start the client's command and return the running process; a new interpreter where a start is the claim."""
+    command = ("optipmb_client", *map(str, arguments))
+    whole = (sys.executable, "-m", *command) if fresh else command
+    return (subprocess.Popen if fresh else Forked)(whole, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def result_of(done: "subprocess.CompletedProcess[str]") -> Any:

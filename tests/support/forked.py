@@ -1,4 +1,4 @@
-"""Processes of the service without the second of processor time that imports and kernels take of a start.
+"""Processes of service and client without the second of processor time that imports and kernels take of a start.
 
 They are forked from one that has these loaded (`fork_server`); from `main` on they run what a start from a shell runs,
 with its own words, environment, files and signals. Tests that are about a start itself begin with a new interpreter.
@@ -47,7 +47,7 @@ def server() -> socket.socket:
 
 
 class Forked(subprocess.Popen[str]):
-    """`python -m optipmb_service` with the words given, as `subprocess.Popen` starts and ends it."""
+    """`python -m` with the module and the words given, as `subprocess.Popen` starts and ends it."""
 
     def _execute_child(self, args: Any, executable: Any, *given: Any) -> None:
         """Fork where `Popen` forks and calls exec; what it gives here has been the same since Python 3.9."""
@@ -63,7 +63,8 @@ class Forked(subprocess.Popen[str]):
         kernel = ctypes.CDLL(None, use_errno=True)
         kernel.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         try:
-            socket.send_fds(asking, [json.dumps(order).encode()], [stdin, stdout, stderr])
+            files = [own if one == -1 else one for own, one in enumerate((stdin, stdout, stderr))]
+            socket.send_fds(asking, [json.dumps(order).encode()], files)
             self.pid = int(asking.recv(32))
         finally:
             kernel.prctl(PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)

@@ -45,10 +45,9 @@ class ServiceProcess:
         clean = {name: value for name, value in os.environ.items() if not name.startswith("OPTIPMB_")}
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._errors: list[str] = []
-        words = (*options, *where)
-        fresh_command = [sys.executable, "-m", "optipmb_service", *words]
+        command = ("optipmb_service", *options, *where)
         self.process: subprocess.Popen[str] = (subprocess.Popen if fresh else Forked)(
-            fresh_command if fresh else words,
+            (sys.executable, "-m", *command) if fresh else command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
