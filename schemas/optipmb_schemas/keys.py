@@ -4,11 +4,11 @@
 <prefix>/<stream>/q/state | q/density | q/tracks | q/reset | q/parameters    queries
 <prefix>/owner/<stream>/<instance>                            liveliness: who tracks this stream
 <prefix>/service/<instance>/alive                             liveliness: which services are there
-<prefix>/service/<instance>/discovered/<stream>               liveliness: streams whose publishers say nothing
+<prefix>/service/<instance>/discovered/<streams>              liveliness: streams whose publishers say nothing
 <prefix>/service/<instance>/q/status | q/metrics | q/move | q/drain     queries
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
@@ -83,13 +83,21 @@ class Keys:
         """Return the key of the query for what an instance received lately and does not track; default: of all."""
         return f"{self.prefix}/service/{_instance(instance) if instance else '*'}/q/recent"
 
-    def discovered(self, stream: str, instance: str) -> str:
-        """Return the liveliness key by which an instance says that a stream exists, for its publisher does not."""
-        return f"{self.prefix}/service/{_instance(instance)}/discovered/{_stream(stream)}"
+    def discovered(self, streams: Iterable[str], instance: str) -> str:
+        """Return the liveliness key by which an instance says that streams exist, for their publishers do not."""
+        names = ",".join(_stream(stream).replace("/", "%") for stream in streams)
+        return f"{self.prefix}/service/{_instance(instance)}/discovered/{names}"
 
     def all_discovered(self) -> str:
         """Return the key expression of all streams that instances have discovered."""
-        return f"{self.prefix}/service/*/discovered/*/*/*"
+        return f"{self.prefix}/service/*/discovered/*"
+
+    def discovered_streams(self, key: str) -> list[str]:
+        """Return the streams that a key of `discovered` names."""
+        match self._chunks(key):
+            case ["service", _, "discovered", names]:
+                return [_named("key", check_stream, name.replace("%", "/")) for name in names.split(",")]
+        raise invalid("key", f"a key of discovered streams under {self.prefix}", key)
 
     def all_publishers(self) -> str:
         """Return the key expression of the tokens of publishers of detections with a cache, which Zenoh declares."""
@@ -130,7 +138,6 @@ class Keys:
         match self._chunks(key):
             case (
                 ["owner", site, node, sensor, _]
-                | ["service", _, "discovered", site, node, sensor]
                 | [site, node, sensor, _]
                 | [site, node, sensor, "q", _]
                 | [site, node, sensor, "detections", "@adv", "pub", *_]

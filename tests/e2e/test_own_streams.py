@@ -174,7 +174,9 @@ def test_a_publisher_without_a_token_is_tracked_from_its_first_frame(pair: Pair)
         until(lambda: len(distinct(node, sensor)) == 20, "all frames are tracked")  # noqa: B023 - called here
         assert distinct(node, sensor) == {seq: {one} for seq, one in enumerate(tracks)}
     tokens = node.alive(KEYS.all_discovered())
-    assert {KEYS.stream_of(token) for token in tokens} == {sensor.stream for sensor in SENSORS}
+    assert {stream for token in tokens for stream in KEYS.discovered_streams(token)} == {
+        sensor.stream for sensor in SENSORS
+    }
     (discoverer,) = {KEYS.instance_of(token) for token in tokens}
     left = "ab".replace(discoverer, "")
     pair.services[discoverer].process.kill()

@@ -153,7 +153,6 @@ class Service:
     def start(self, *, announce: bool = True) -> None:
         """Receive, answer, and say so."""
         self._transport.watch()
-        self._transport.watch_owners(self._registry.told_owner)
         self._persistence.start(self._registry.keep)
         self._member.start(self._intake.changed, self._registry.resume, self._registry.occupied)
         self._intake.start()

@@ -2,7 +2,7 @@
 
 Who publishes detections with a cache says so by a liveliness token, from before its first message to its end. A
 publisher without one is noticed by its messages: one member, the *discoverer*, subscribes to the detections of all
-streams, and announces each such stream by a token of its own, so all members know of it.
+streams, and announces such streams by tokens, so all members know of them.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def node_of(stream: str) -> str:
 class _Known:
     tokens: set[str] = field(default_factory=set)
     """Of publishers with a cache."""
-    discoverers: set[str] = field(default_factory=set)
-    """Instances that announce the stream."""
+    announcements: set[str] = field(default_factory=set)
+    """Tokens by which other instances announce the stream."""
     announced: bool = False
     """Whether this instance does."""
     seen_ns: int = 0
@@ -92,13 +92,15 @@ class StreamDirectory:
             self._awaited.pop(stream, None)
             return self._settled(known, now_ns)
 
-    def discovered(self, stream: str, instance: str, now_ns: int, *, present: bool) -> bool:
-        """Take in that a discoverer announces a stream, or does so no longer; True: that changes what is known."""
+    def discovered(self, stream: str, token: str, now_ns: int, *, present: bool) -> bool:
+        """Take in that a token announces a stream, or does so no longer; True: that changes what is known."""
         with self._lock:
             known = self._found(stream) if present else self._streams.get(stream)
-            if known is None or (instance in known.discoverers) is present:
+            if known is None or (token in known.announcements) is present:
                 return False
-            (known.discoverers.add if present else known.discoverers.discard)(instance)
+            (known.announcements.add if present else known.announcements.discard)(token)
+            if known.announcements - {token}:
+                return False  # it moves to another token of its discoverer, or is announced by two
             return self._settled(known, now_ns)
 
     def noticed(self, stream: str, now_ns: int, *, recoverable: bool) -> bool:
@@ -238,7 +240,7 @@ class StreamDirectory:
     @staticmethod
     def _settled(known: _Known, now_ns: int) -> bool:
         """Note whether anybody still speaks for a stream."""
-        if known.tokens or known.discoverers or known.announced:
+        if known.tokens or known.announcements or known.announced:
             known.left_ns = None
         elif known.left_ns is None:
             known.left_ns = now_ns

@@ -8,7 +8,7 @@ From the partitions that are held and the streams that are known follows a set o
 - detections of streams whose publishers have no cache, where nothing else would know what was sent when their member
   is killed (`standby`);
 - detections of all streams, where it is the discoverer: the member that holds partition 0. Those whose publishers have
-  tokens are dropped unread.
+  tokens are dropped unread. It alone watches who tracks which stream.
 
 New subscriptions are declared before old ones are withdrawn. A stream that comes here from another member is held until
 the others have answered what they have received of it lately; then its session goes on with that.
@@ -101,7 +101,10 @@ class Inputs(Protocol):
     def watch_streams(
         self, published: Callable[[str, str, bool], None], discovered: Callable[[str, str, bool], None]
     ) -> None:
-        """Tell of the tokens of publishers, and of what is discovered by whom; each True: it is there."""
+        """Tell of the tokens of publishers, and of streams that are announced, by whom; each True: it is there."""
+
+    def watch_owners(self, told: Callable[[str, str, bool], None] | None) -> None:
+        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more."""
 
     def discover(self, streams: set[str]) -> None:
         """Announce these streams, and no others."""
@@ -147,6 +150,8 @@ class Intake:
         self._aligned: object = None
         """What they follow from beside the streams: where it changes, all are looked at."""
         self._announced: set[str] = set()
+        self._watching = False
+        """Whether owners are watched."""
         self._lock = threading.Lock()
         self._came: set[int] = set()
         self._left: dict[int, int] = {}
@@ -273,11 +278,14 @@ class Intake:
             self._wake.set()
 
     def _discovered(self, key: str, instance: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
-        stream = self._stream(key)
-        if stream is None or instance == self._registry.instance:
+        if instance == self._registry.instance:
             return
-        if self._directory.discovered(stream, instance, time.monotonic_ns(), present=present):
-            self._wake.set()
+        now_ns = time.monotonic_ns()
+        for stream in self._registry.keys.discovered_streams(key):
+            if self._registry.fusion.is_session(stream):
+                continue
+            if self._directory.discovered(stream, key, now_ns, present=present):
+                self._wake.set()
 
     def _noticed(self, key: str, recoverable: bool) -> bool:  # noqa: FBT001 - as the network calls it
         """Take in detections of whatever stream; False: the publisher has a token, and its member receives them."""
@@ -336,6 +344,7 @@ class Intake:
             self._expires_ns = now_ns + round(EXPIRY_S * SECOND)
         elif discovering:
             self._directory.admit(now_ns)
+        self._watch_owners(discovering=discovering)
         if discovering and Input("discovery") not in self._subscribed and not everything:
             self._directory.adopt(now_ns)
         streams = self._directory.streams()
@@ -367,6 +376,12 @@ class Intake:
         self._known = streams
         if coming:
             self._take_up(coming)
+
+    def _watch_owners(self, *, discovering: bool) -> None:
+        if discovering is not self._watching:
+            told = self._registry.told_owners()
+            self._inputs.watch_owners(told if discovering else None)
+            self._watching = discovering
 
     def _later(
         self, looked: dict[str, bool], came: set[int], held: set[int], *, everything: bool, strained: bool

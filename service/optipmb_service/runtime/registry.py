@@ -112,8 +112,7 @@ class Registry:
         self._metrics = metrics
         self._sweep_ns = 0
         self._admission = Admission(settings, self._used, self._evict_for_another)
-        self._rivals = Rivals(settings.instance, round(RIVAL_LEASES * settings.lease_s * SECOND))
-        self.told_owner = self._rivals.told
+        self._rivals = Rivals(round(RIVAL_LEASES * settings.lease_s * SECOND))
         standby = ByteBudget(settings.standby_mb * MEGABYTE)
 
         def buffer() -> TakeoverBuffer:
@@ -265,6 +264,11 @@ class Registry:
         """Whether a session is there, here or elsewhere: something valid has come of it."""
         return self.actor(session) is not None or self._rivals.tracks(session)
 
+    def told_owners(self) -> Callable[[str, str, bool], None]:
+        """Forget who tracks what; return what takes in, from now on, that an instance does so, or no longer."""
+        self._rivals = Rivals(round(RIVAL_LEASES * self._settings.lease_s * SECOND))
+        return self._rivals.told
+
     def elsewhere(self, stream: str) -> bool:
         """Whether another instance tracks a stream, and answers for it."""
         return not self._member.holds(stream) and self.actor(stream) is None
@@ -312,8 +316,9 @@ class Registry:
                     log.warning("stream_stale", stream=stream, age_s=round(age_s, 3))
             if now_ns - actor.meter.active_ns > self._settings.idle_s * SECOND and actor.mailbox.idle:
                 self.command(actor.stream, self._close_idle, urgent=False)
-        for stream, other in self._rivals.contested([actor.stream for actor in actors], now_ns):
-            self._report("contested", stream, "one `store`, or `cluster`, for all instances", f"{other} tracks it too")
+        for stream, owners in self._rivals.contested(now_ns):
+            tracked = f"it is tracked by {' and '.join(owners)}"
+            self._report("contested", stream, "one `store`, or `cluster`, for all instances", tracked)
         self._evict(actors)
         self.untracked.trim(now_ns, round(self._settings.idle_s * SECOND))
 

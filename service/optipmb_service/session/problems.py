@@ -52,7 +52,7 @@ CODES: Final = {
         "Nothing. If it happens often, raise `lease_s`, or look for what stops the process.",
     ),
     "contested": (
-        "Another instance, without the same `store`, tracks the stream too.",
+        "Two instances without the same `store` track the stream.",
         "Give them one `store` or `cluster`, or routers of their own.",
     ),
     "cut": (

@@ -27,6 +27,13 @@ if TYPE_CHECKING:
 WAIT_BEFORE_DROP_US: Final = 50_000
 WAIT_BEFORE_DROP_FRAGMENTS_US: Final = 500_000
 
+WAIT_BEFORE_CLOSE_US: Final = 30_000_000
+"""How long a client waits to declare something where its router is slow to read, before Zenoh closes the link.
+
+Zenoh's own 5 s make it worse: all that was declared on the link is withdrawn, and declared again on the next one. A
+router that does not answer at all is left when its lease ends.
+"""
+
 RETRY_MS: Final = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2}
 
 RUNTIME_VARIABLE: Final = "ZENOH_RUNTIME"
@@ -116,6 +123,8 @@ def _configuration(settings: Settings) -> zenoh.Config:
     }
     if settings.is_router:
         values["connect/exit_on_failure"] = False  # a router starts without the routers that it looks for
+    else:
+        values["transport/link/tx/queue/congestion_control/block/wait_before_close"] = WAIT_BEFORE_CLOSE_US
     config = _base(settings.zenoh_config)
     for key, value in values.items():
         try:

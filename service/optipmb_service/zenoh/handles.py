@@ -105,7 +105,7 @@ class Readers:
     """What is read: each thing that was declared has a thread of its own, and no message ends the reading."""
 
     def __init__(self) -> None:
-        self._reading: list[tuple[Undeclared, Iterable[Any], threading.Thread]] = []
+        self._reading: list[tuple[str, Undeclared, Iterable[Any], threading.Thread]] = []
 
     def add(self, name: str, declared: Undeclared, handler: Iterable[_T], receive: Callable[[_T], None]) -> None:
         """Hand over what comes in, one after the other, until the end."""
@@ -120,17 +120,28 @@ class Readers:
 
         thread = threading.Thread(target=drain, name=f"reader-{name}", daemon=True)
         thread.start()
-        self._reading.append((declared, handler, thread))
+        self._reading.append((name, declared, handler, thread))
 
     def stop(self, timeout: float) -> None:
         """Withdraw everything; what was received before is handed over within `timeout` seconds each."""
-        for declared, handler, _ in self._reading:
-            undeclare(declared)
-            if isinstance(handler, Channel):
-                handler.close()
-        for _, _, thread in self._reading:
+        reading, self._reading = self._reading, []
+        for one in reading:
+            self._withdraw(*one[1:3])
+        for *_, thread in reading:
             thread.join(timeout)
-        self._reading.clear()
+
+    def end(self, name: str) -> None:
+        """Withdraw what has a name, if there is any; what was received before is handed over soon."""
+        left = [one for one in self._reading if one[0] == name]
+        self._reading = [one for one in self._reading if one[0] != name]
+        for one in left:
+            self._withdraw(*one[1:3])
+
+    @staticmethod
+    def _withdraw(declared: Undeclared, handler: Iterable[Any]) -> None:
+        undeclare(declared)
+        if isinstance(handler, Channel):
+            handler.close()
 
 
 def cached_publisher(
@@ -141,8 +152,18 @@ def cached_publisher(
     *,
     priority: zenoh.Priority = zenoh.Priority.DATA_HIGH,
     express: bool = True,
+    detected: bool = True,
 ) -> Putting:
     """Declare a publisher that keeps its newest messages for subscribers that lost some or come late.
+
+    Args:
+        session: to publish on.
+        key: of what is published.
+        kind: of its messages.
+        cache: how many it keeps.
+        priority: of its messages.
+        express: whether each is sent at once.
+        detected: whether a token says that it is there, from before its first message.
 
     Raises:
         TransportError: the session is closed.
@@ -157,7 +178,7 @@ def cached_publisher(
             express=express,
             cache=zenoh.ext.CacheConfig(cache),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
-            publisher_detection=True,
+            publisher_detection=detected,
         )
     except zenoh.ZError as error:
         raise TransportError(line(error)) from error

@@ -14,6 +14,7 @@ import zenoh
 import zenoh.ext
 
 from optipmb_service.runtime.ports import Packet, TransportError
+from optipmb_service.zenoh.announcements import Announcements
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.connection import close, line, opened
 from optipmb_service.zenoh.handles import (
@@ -72,7 +73,7 @@ class Transport:
         self._topics: dict[str, Topic] = {}
         self._discover: Callable[[zenoh.Sample], None] = lambda _: None
         self._all = False
-        self._discoveries: dict[str, Undeclared] = {}
+        self._announcements = Announcements(self._session, self._keys, self._instance)
         self._claims: set[Publisher] = set()
         self._lock = threading.Lock()
         self._alive: Undeclared | None = None
@@ -156,7 +157,7 @@ class Transport:
     def watch_streams(
         self, published: Callable[[str, str, bool], None], discovered: Callable[[str, str, bool], None]
     ) -> None:
-        """Tell of publishers of detections with a cache, by key and token, and of what is discovered by whom."""
+        """Tell of publishers of detections with a cache, by key and token, and of announcements, by token."""
         self._watch("publishers", self._keys.all_publishers(), lambda key, present: published(key, key, present))
         self._watch(
             "discovered",
@@ -166,14 +167,7 @@ class Transport:
 
     def discover(self, streams: set[str]) -> None:
         """Announce these streams, and no others."""
-        for stream in self._discoveries.keys() - streams:
-            undeclare(self._discoveries.pop(stream))
-        for stream in streams - self._discoveries.keys():
-            try:
-                token = self._session.liveliness().declare_token(self._keys.discovered(stream, self._instance))
-            except zenoh.ZError as error:
-                raise TransportError(line(error)) from error
-            self._discoveries[stream] = token
+        self._announcements.announce(streams)
 
     def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
         """Return what other instances have received lately of sessions, each packet with whether it is a frame.
@@ -315,7 +309,11 @@ class Transport:
         Raises:
             TransportError: the session is closed.
         """
-        publisher = cached_publisher(self._session, self._keys.tracks(stream), schemas.Tracks, TRACKS_CACHE)
+        # Who subscribes asks the caches, and hears by heartbeats of what it missed: nobody needs a token for that, and
+        # each costs the router more the more there are.
+        publisher = cached_publisher(
+            self._session, self._keys.tracks(stream), schemas.Tracks, TRACKS_CACHE, detected=False
+        )
         try:
             token = self._session.liveliness().declare_token(self._keys.owner(stream, self._instance))
         except zenoh.ZError as error:
@@ -329,18 +327,27 @@ class Transport:
         """Send a problem on its stream's key; one without a stream has no key and is not sent."""
         publish_problem(self._session, self._keys, problem)
 
-    def watch_owners(self, told: Callable[[str, str, bool], None]) -> None:
-        """Tell which instance tracks which stream, or does so no longer (False), from now on."""
-        self._watch(
-            "owners",
-            self._keys.all_owners(),
-            lambda key, present: told(self._keys.stream_of(key), self._keys.instance_of(key), present),
-        )
+    def watch_owners(self, told: Callable[[str, str, bool], None] | None) -> None:
+        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        self._readers.end("owners")
+        if told is not None:
+            self._watch(
+                "owners",
+                self._keys.all_owners(),
+                lambda key, present: told(self._keys.stream_of(key), self._keys.instance_of(key), present),
+            )
 
     def _watch(self, name: str, pattern: str, told: Callable[[str, bool], None]) -> None:
         """Tell of the tokens of a pattern, those that are there and those that come and go."""
         channel: Channel[zenoh.Sample] = Channel(CHANNEL)
-        tokens = self._session.liveliness().declare_subscriber(pattern, channel.handler, history=True)
+        try:
+            tokens = self._session.liveliness().declare_subscriber(pattern, channel.handler, history=True)
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
         self._readers.add(name, tokens, channel, lambda one: told(str(one.key_expr), one.kind == zenoh.SampleKind.PUT))
 
     # The end

@@ -47,7 +47,7 @@ class Network:
     def watch_streams(self, published: Callable[..., None], discovered: Callable[..., None]) -> None:
         """Tell of the streams that there are."""
         for stream in self._announced:
-            discovered(KEYS.discovered(stream, "other"), "other", True)
+            discovered(KEYS.discovered([stream], "other"), "other", True)
         for stream in self._published:
             published(f"{KEYS.detections(stream)}/@adv/pub/1/2/_", "token", True)
 
@@ -58,6 +58,9 @@ class Network:
     def unsubscribe(self, inputs: Iterable[object]) -> None:
         """Nothing is withdrawn here."""
         assert not list(inputs)
+
+    def watch_owners(self, told: Callable[..., None] | None) -> None:
+        """Nobody is heard of."""
 
     def discover(self, streams: set[str]) -> None:
         """Nothing is announced here."""
@@ -114,6 +117,7 @@ class Holding:
 def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
     """Return the intake of a member that holds some partitions and tracks nothing yet."""
     registry = SimpleNamespace(
+        told_owners=lambda: None,
         instance="m",
         keys=KEYS,
         fusion=Fusion(),
@@ -222,7 +226,7 @@ def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPat
             if chance.random() < 0.5:
                 intake._published(f"{KEYS.detections(stream)}/@adv/pub/1/2/_", "token", present)
             else:
-                intake._discovered(KEYS.discovered(stream, "other"), "other", present)
+                intake._discovered(KEYS.discovered([stream], "other"), "other", present)
         if chance.random() < 0.1:
             partition = chance.randrange(PARTITIONS)
             held ^= {partition}

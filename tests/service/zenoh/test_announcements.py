@@ -1,0 +1,87 @@
+"""Streams that a discoverer announces: which tokens there are, whatever came and went before."""
+
+import random
+from typing import Any
+
+from optipmb_schemas import Keys
+from optipmb_service.runtime.directory import StreamDirectory
+from optipmb_service.zenoh.announcements import MOST, Announcements
+
+KEYS = Keys()
+
+
+class Tokens:
+    """A session with its tokens, and a member that hears of them."""
+
+    def __init__(self) -> None:
+        self.now: set[str] = set()
+        self.heard = StreamDirectory("other", 1, lambda _: True)
+
+    def liveliness(self) -> "Tokens":
+        """Return what declares tokens."""
+        return self
+
+    def declare_token(self, key: str) -> "Token":
+        """Declare one, and have it heard of."""
+        assert key not in self.now
+        self.now.add(key)
+        self._tell(key, present=True)
+        return Token(self, key)
+
+    def withdraw(self, key: str) -> None:
+        """Withdraw one, and have that heard of."""
+        self.now.remove(key)
+        self._tell(key, present=False)
+
+    @property
+    def announced(self) -> list[str]:
+        """The streams of all tokens."""
+        return sorted(stream for key in self.now for stream in KEYS.discovered_streams(key))
+
+    def _tell(self, key: str, *, present: bool) -> None:
+        for stream in KEYS.discovered_streams(key):
+            self.heard.discovered(stream, key, 0, present=present)
+
+
+class Token:
+    """A token that is declared."""
+
+    def __init__(self, session: Tokens, key: str) -> None:
+        self._session, self._key = session, key
+
+    def undeclare(self) -> None:
+        """Withdraw it."""
+        self._session.withdraw(self._key)
+
+
+def test_each_stream_is_in_one_token_and_all_tokens_but_one_are_full() -> None:
+    """Whatever came and went; who hears of the tokens knows these streams, and none of them was away in between."""
+    chance = random.Random(1)
+    tokens = Tokens()
+    session: Any = tokens
+    announcements = Announcements(session, KEYS, "m0")
+    streams: set[str] = set()
+    away: list[str] = []
+    most = 0
+    settled = StreamDirectory._settled
+
+    def noted(known: Any, now_ns: int) -> bool:
+        changed = settled(known, now_ns)
+        away.extend(stream for stream in streams if tokens.heard._streams.get(stream) is known and known.left_ns == 0)
+        return changed
+
+    tokens.heard._settled = noted  # type: ignore[method-assign] - heard of at every change
+    for _ in range(200):
+        gone = set(chance.sample(sorted(streams), chance.randrange(len(streams) + 1) // 4))
+        new = {f"s/n{chance.randrange(300)}/lidar" for _ in range(chance.randrange(20))}
+        streams -= gone - new
+        announcements.announce(streams | new)
+        streams |= new
+        assert tokens.announced == sorted(streams)
+        assert sum(len(KEYS.discovered_streams(key)) < MOST for key in tokens.now) <= 1
+        assert {one for one, known in tokens.heard._streams.items() if known.left_ns is None} == streams
+        assert not away
+        most = max(most, len(tokens.now))
+    assert most > 3
+    announcements.announce(set())
+    assert not tokens.now
