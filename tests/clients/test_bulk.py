@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bulk_tasks import RECORDINGS, Dying, bytes_of, double, recordings, tracked_plainly
+from bulk_numbers import double
+from bulk_tasks import RECORDINGS, Dying, bytes_of, recordings, tracked_plainly
 from commands import run_here, start
 from optipmb_client.bulk import Executor, Failed, Here, executor_for, run, values
 from optipmb_client.bulk.executors import Processes

@@ -13,7 +13,6 @@ from typing import Any, Self
 import numpy as np
 from optipmb_client.bulk import Executor
 from optipmb_client.datasets import DatasetArguments
-from optipmb_client.errors import UsageError
 from optipmb_client.offline import profile_for
 from optipmb_client.table_files import write_table
 from optipmb_client.tracking import track
@@ -61,17 +60,6 @@ def dying(shared: tuple[Any, Any, Path, AbstractSet[str], AbstractSet[str]], tas
         while True:
             time.sleep(1.0)
     return function(given, task)
-
-
-def double(shared: int, task: int) -> int:
-    """A task: multiply, refuse one number, fail at another, and be killed at a third."""
-    if task == 13:
-        raise UsageError("thirteen")
-    if task == 14:
-        raise ZeroDivisionError("fourteen")
-    if task == 15:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return shared * task
 
 
 class Dying:
