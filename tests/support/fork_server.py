@@ -14,6 +14,7 @@ import os
 import runpy
 import socket
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,9 @@ def load() -> None:
 
     with collector_paused(), without("rich"):
         from optipmb_service.app import cli, worker  # noqa: F401, PLC0415
-        from optipmb_service.cluster import jetstream  # noqa: F401, PLC0415
         from optipmb_service.http import page  # noqa: F401, PLC0415
+    with suppress(ModuleNotFoundError):  # an extra that not all tests need
+        from optipmb_service.cluster import jetstream  # noqa: F401, PLC0415
     from optipmb_service.app.kernels import warm_up  # noqa: PLC0415
 
     warm_up()
