@@ -3,9 +3,14 @@
 A single box that lies beside its object, or a track that has drifted, leaves an object missed and a detection without
 an object. The paper starts a second track there, which then takes the object over. But a box that overlaps that of
 another by more than eta_iou is of the same object: so non-maximum suppression has it, and so it is between a detection
-and the predicted box of an object that is missed now and was detected within a nominal period. Such a first-time
-detection is the clutter hypothesis (eq. Clutter Hypothesis), r = 0, and announces a Poisson component (eq. HABM): what
-is there after all is born from it in the next frame.
+and the predicted box of an object that is missed now. Such a first-time detection is the clutter hypothesis (eq.
+Clutter Hypothesis), r = 0, and announces a Poisson component (eq. HABM), from which what is there after all is born
+later.
+
+How long a missed object forbids births depends on how sure it is. Many short tracks are false, and what is detected
+beside them may well be the first of an object: they forbid it for a nominal period after their last detection. A track
+of at least `LASTING` nominal periods forbids it as long as it is extracted without a detection, eta_cnt: a new track
+would stand beside it in the output, and a drifted state is found again by its detections.
 
 It is decided for the best global hypothesis, as pruning is, so that all costs remain those of the paper.
 """
@@ -34,6 +39,9 @@ if TYPE_CHECKING:
 
     Index = NDArray[np.int64]
 
+LASTING: Final = 10
+"""Nominal periods since its birth from which a track is not a short one: a second of a LiDAR at 10 Hz."""
+
 EVERYTHING: Final = 1.0
 """No two boxes overlap by more: no birth is forbidden."""
 
@@ -59,7 +67,7 @@ def forbid_births(
         missed_from_ns: (N,) stamps from which misses count.
         stamp_ns: stamp of the frame.
         period: nominal period, s.
-        classes: (C,) parameters: `birth_overlap`.
+        classes: (C,) parameters: `birth_overlap` and eta_cnt.
     """
     used = np.zeros(len(measurements.yaw), np.bool_)
     for m in assigned:
@@ -68,10 +76,13 @@ def forbid_births(
     predicted, detected = np.empty(5), np.empty(5)
     for k in range(hypotheses.row.shape[0]):
         n, m = hypotheses.row[k], hypotheses.measurement[k]
-        overlap = classes[objects.label[n]].birth_overlap
+        own = classes[objects.label[n]]
+        overlap = own.birth_overlap
         if overlap >= EVERYTHING or assigned[n] != UNASSIGNED or used[m] or hypotheses.first_kind[m] == CLUTTER:
             continue
-        if not objects.extracted[n] or whole_periods(missed_from_ns[n], stamp_ns, period) > 1:
+        lasting = whole_periods(objects.born_ns[n], stamp_ns, period) >= LASTING
+        longest = max(own.extract_misses, 1) if lasting else 1
+        if not objects.extracted[n] or whole_periods(missed_from_ns[n], stamp_ns, period) > longest:
             continue
         predicted[0], predicted[1], predicted[4] = objects.mean[n, X], objects.mean[n, Y], objects.mean[n, PHI]
         detected[0], detected[1] = measurements.position[m, 0], measurements.position[m, 1]

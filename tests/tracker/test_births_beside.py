@@ -36,8 +36,16 @@ def test_a_box_beside_its_car_starts_no_second_track() -> None:
     assert any(len(ids) > 1 for ids in follow("kitti-paper", beside))
 
 
-def test_what_is_there_after_all_is_born_a_frame_later() -> None:
-    """A box that stays beside a missed car is a track from the next frame on."""
-    ids = follow("kitti", [0.0] * 20 + [1.4] * 4)
-    assert ids[20] == [1]
-    assert 2 in ids[21]
+def test_beside_a_short_track_what_is_there_is_born_a_frame_later() -> None:
+    """A box that stays beside a car of half a second, which is missed, is a track from the next frame on."""
+    ids = follow("kitti", [0.0] * 5 + [1.4] * 4)
+    assert ids[5] == [1]
+    assert 2 in ids[6]
+
+
+def test_a_lasting_track_stays_alone_as_long_as_it_is_extracted() -> None:
+    """Beside a car of two seconds the same box starts none for five periods, as many as `extract_misses` says."""
+    assert optipmb.load_profile("kitti").classes["Car"].extract_misses == 5
+    ids = follow("kitti", [0.0] * 20 + [1.4] * 12)
+    assert not any(2 in now for now in ids[:25])
+    assert 2 in ids[25]

@@ -221,27 +221,33 @@ def test_objects_survive_by_existence_and_misses(seed: int) -> None:
 
 @SEEDS
 def test_births_are_forbidden_as_set_logic_says(seed: int) -> None:
-    """A detection without an object is clutter if its box overlaps that of a gated, extracted, newly missed one."""
+    """A detection without an object is clutter if its box overlaps that of a gated, extracted, missed one.
+
+    It was detected a period ago at most, or is at least ten old and was detected at most as many ago as its class says.
+    """
     rng = np.random.default_rng(seed)
-    n, m = 25, 20
-    label, extracted, seen = rng.integers(0, 2, n), rng.random(n) < 0.7, NOW - rng.integers(0, 5, n) * 50_000_000
+    n, m = 60, 20
+    label, extracted, seen = rng.integers(0, 2, n), rng.random(n) < 0.7, NOW - rng.integers(0, 12, n) * 50_000_000
+    born, misses = NOW - rng.integers(15, 25, n) * 50_000_000, np.array([rng.integers(2, 6), 5])
     mean, auxiliary = rng.normal(0, 2, (n, 6)), rng.uniform(1, 5, (n, 4))
-    assigned = np.where(rng.random(n) < 0.4, rng.integers(0, m, n), UNASSIGNED)
+    assigned = np.where(rng.random(n) < 0.3, rng.integers(0, m // 2, n), UNASSIGNED)
     z = random_measurements(rng, m)
     row, measurement = np.nonzero(rng.random((n, m)) < 0.5)
     kind, first = rng.choice([FROM_POISSON, CLUTTER, NEWBORN], m), rng.uniform(0.1, 1, m)
-    objects = objects_of(label=label, extracted=extracted, mean=mean, auxiliary=auxiliary)
+    objects = objects_of(label=label, extracted=extracted, mean=mean, auxiliary=auxiliary, born_ns=born)
     limit = np.array([0.1, 1.0])
     overlap = bev_iou(
         np.column_stack([mean[:, :2], auxiliary[:, :2], mean[:, 3]]),
         np.column_stack([z.position, z.auxiliary[:, :2], z.yaw]),
     )
-    active = (assigned == UNASSIGNED) & extracted & (periods(seen) <= 1)
+    longest = np.where(periods(born) >= 10, np.maximum(misses[label], 1), 1)
+    active = (assigned == UNASSIGNED) & extracted & (periods(seen) <= longest)
     taken = active[row] & (overlap[row, measurement] > limit[label[row]])
     forbidden = np.isin(np.arange(m), measurement[taken]) & ~np.isin(np.arange(m), assigned)
     assert 0 < forbidden.sum() < m
     hypotheses = hypotheses_of(row=row, measurement=measurement, first_kind=kind.copy(), first_existence=first.copy())
-    forbid_births(objects, assigned, hypotheses, z, seen, NOW, PERIOD, class_rows(2, birth_overlap=limit))
+    classes = class_rows(2, birth_overlap=limit, extract_misses=misses)
+    forbid_births(objects, assigned, hypotheses, z, seen, NOW, PERIOD, classes)
     np.testing.assert_array_equal(hypotheses.first_kind, np.where(forbidden, CLUTTER, kind))
     forgotten = forbidden & (kind != CLUTTER)
     np.testing.assert_array_equal(hypotheses.first_existence, np.where(forgotten, 0.0, first))
