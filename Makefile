@@ -47,7 +47,7 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 	$(BIN)/python -m pip install --quiet --constraint requirements.lock --editable ".[dev]"
 	touch $@
 
-# Kernels are compiled here, once, for who imports the package would compile them otherwise.
+# Kernels are compiled here, once, otherwise each program that imports the package would compile them.
 install: kernels
 
 # What the demo needs, and no tools of developers; in the environment of developers it is all there.

@@ -7,6 +7,7 @@ import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import forked
 import hypothesis
 import pytest
 
@@ -17,6 +18,8 @@ HERE = Path(__file__).parent
 
 # What a shell starts in the background ignores it, and hands that on to what it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+forked.ALLOWED = True
 
 OTHERS = {
     "alone": ("e2e/test_cluster.py", "e2e/test_load.py", "e2e/test_soak.py"),

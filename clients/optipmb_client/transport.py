@@ -150,7 +150,8 @@ class Sender:
     @property
     def wanted(self) -> bool:
         """Whether somebody is known to listen. Always True with a cache: that also serves those who come later."""
-        return self._matching is None or self._matching.matching_status.matching
+        matching = self._matching  # `close` may take it away meanwhile
+        return matching is None or matching.matching_status.matching
 
     def pack(self, message: Message) -> bytes:
         """Return a message as it is sent."""
@@ -173,8 +174,9 @@ class Sender:
     def close(self) -> None:
         """Withdraw the publisher.
 
-        It is let go of. What Zenoh calls `undeclare` waits for the heartbeats to end with the lock of the interpreter
-        held; while the thread that sends them waits for that lock, the whole process would stand still for ten seconds.
+        It is let go of; a message that another thread is sending may still go out. What Zenoh calls `undeclare` waits
+        for the heartbeats to end with the lock of the interpreter held; while the thread that sends them waits for that
+        lock, the whole process would stand still for ten seconds.
         """
         self._publisher = self._matching = None
 

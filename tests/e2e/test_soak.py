@@ -69,7 +69,7 @@ def test_nothing_grows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
         Connection(fleet.endpoint) as connection,
         ThreadPoolExecutor() as pool,
     ):
-        service = fleet.service("soak")
+        service = fleet.service("soak", fresh=True)
         running = [pool.submit(run_load, connection, load, frames) for load, frames in loads.items()]
         samples, extra = _watched(connection, service.process.pid, running, capsys)
         runs = [one.result() for one in running]

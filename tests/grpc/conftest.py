@@ -25,8 +25,8 @@ def service() -> Iterator[ServiceProcess]:
 
 @pytest.fixture(scope="session")
 def gateway(service: ServiceProcess) -> Iterator[GatewayProcess]:
-    """A gateway of that service."""
-    with GatewayProcess(service.endpoint) as process:
+    """A gateway of that service; a new interpreter, for the memory that it takes is measured."""
+    with GatewayProcess(service.endpoint, fresh=True) as process:
         process.wait_ready()
         yield process
 

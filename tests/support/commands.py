@@ -6,8 +6,8 @@ import subprocess
 import sys
 from typing import Any
 
+import forked
 import pytest
-from forked import Forked
 from optipmb_client.cli import run
 
 
@@ -29,8 +29,7 @@ def run_here(capsys: pytest.CaptureFixture[str], *arguments: object) -> "subproc
 def start(*arguments: object, fresh: bool = False) -> "subprocess.Popen[str]":
     """Start the client's command and return the running process; a new interpreter where a start is the claim."""
     command = ("optipmb_client", *map(str, arguments))
-    whole = (sys.executable, "-m", *command) if fresh else command
-    return (subprocess.Popen if fresh else Forked)(whole, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return forked.start(*command, fresh=fresh, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 def result_of(done: "subprocess.CompletedProcess[str]") -> Any:

@@ -109,13 +109,16 @@ class Fleet:
         """Where the router listens."""
         return self.router.endpoint
 
-    def service(self, instance: str, *, wait: bool = True, endpoint: str = "", **environment: object) -> ServiceProcess:
+    def service(
+        self, instance: str, *, wait: bool = True, endpoint: str = "", fresh: bool = False, **environment: object
+    ) -> ServiceProcess:
         """Start a service, at another router's endpoint if one is given; it is killed at the end, if it still runs."""
         extra = {f"OPTIPMB_{name.upper()}": str(value) for name, value in environment.items()}
         process = ServiceProcess(
             *("--connect", endpoint or self.endpoint, "--instance", instance),
             environment=self._environment | extra,
             listen=False,
+            fresh=fresh,
         )
         self._context.enter_context(process)
         if wait:

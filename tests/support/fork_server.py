@@ -59,9 +59,10 @@ def serve(asking: socket.socket) -> str:
                 return become(json.loads(packet), files)
             os.write(writing, str(child).encode())
             os._exit(0)
+        os.close(writing)
         os.waitpid(between, 0)  # before the answer: from here on the new process belongs to whoever asked
         asking.send(os.read(reading, 32))
-        for one in (reading, writing, *files):
+        for one in (reading, *files):
             os.close(one)
 
 
@@ -73,6 +74,7 @@ def become(order: dict[str, Any], files: list[int]) -> str:
     os.environ.clear()
     os.environ.update(order["environment"])
     os.chdir(order["folder"])
+    sys.path[0] = order["folder"]
     module, *sys.argv[1:] = order["words"]
     return str(module)
 

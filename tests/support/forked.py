@@ -14,11 +14,17 @@ import os
 import socket
 import subprocess
 import sys
-from pathlib import Path
+import threading
 from typing import Any
 
-SERVER = Path(__file__).with_name("fork_server.py")
+import fork_server
+
 PR_SET_CHILD_SUBREAPER = 36
+
+ALLOWED = False
+"""Set by the tests; a benchmark compares checkouts, and measures processes as users start them."""
+
+ONE_AT_A_TIME = threading.Lock()
 
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
 """numpy's linear algebra starts others when it is imported."""
@@ -31,7 +37,7 @@ def server() -> socket.socket:
     number = theirs.fileno()
     clean = {name: value for name, value in os.environ.items() if not name.startswith("OPTIPMB_")}
     process = subprocess.Popen(
-        [sys.executable, str(SERVER), str(number)], pass_fds=(number,), env=clean | ONE_THREAD,
+        [sys.executable, fork_server.__file__, str(number)], pass_fds=(number,), env=clean | ONE_THREAD,
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
     )  # fmt: skip
     theirs.close()
@@ -42,8 +48,16 @@ def server() -> socket.socket:
 
     atexit.register(end)
     threads = asking.recv(32)
+    assert threads, "the process that is to be forked has ended at its start"
     assert threads == b"1", f"with {threads!r} threads a fork would copy locks that others hold"
     return asking
+
+
+def start(*command: str, fresh: bool = False, **how: Any) -> subprocess.Popen[str]:
+    """Start `python -m` with a module and words, by fork where that is allowed; `how` as for `subprocess.Popen`."""
+    if fresh or not ALLOWED:
+        return subprocess.Popen((sys.executable, "-m", *command), text=True, **how)
+    return Forked(command, text=True, **how)
 
 
 class Forked(subprocess.Popen[str]):
@@ -59,14 +73,19 @@ class Forked(subprocess.Popen[str]):
             "environment": dict(os.environ if environment is None else environment),
             "folder": folder or os.getcwd(),  # noqa: PTH109 - a text is needed
         }
-        asking = server()
         kernel = ctypes.CDLL(None, use_errno=True)
-        kernel.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
-        try:
-            files = [own if one == -1 else one for own, one in enumerate((stdin, stdout, stderr))]
-            socket.send_fds(asking, [json.dumps(order).encode()], files)
-            self.pid = int(asking.recv(32))
-        finally:
-            kernel.prctl(PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)
+        with ONE_AT_A_TIME:
+            asking = server()
+            kernel.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+            try:
+                files = [own if one == -1 else one for own, one in enumerate((stdin, stdout, stderr))]
+                socket.send_fds(asking, [json.dumps(order).encode()], files)
+                self.pid = int(asking.recv(32))
+            except BaseException:  # the answer may still come: it must not be taken for that of the next order
+                asking.close()
+                server.cache_clear()
+                raise
+            finally:
+                kernel.prctl(PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)
         self._child_created = True
         self._close_pipe_fds(*pipes)

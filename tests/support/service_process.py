@@ -6,12 +6,11 @@ import os
 import queue
 import signal
 import subprocess
-import sys
 import threading
 import time
 from typing import TYPE_CHECKING, Self
 
-from forked import Forked
+from forked import start
 from routers import free_endpoint
 
 if TYPE_CHECKING:
@@ -46,12 +45,12 @@ class ServiceProcess:
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._errors: list[str] = []
         command = ("optipmb_service", *options, *where)
-        self.process: subprocess.Popen[str] = (subprocess.Popen if fresh else Forked)(
-            (sys.executable, "-m", *command) if fresh else command,
+        self.process = start(
+            *command,
+            fresh=fresh,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            text=True,
             # Tests that want state say where it is to be kept; nobody's own is touched.
             env=clean | {"OPTIPMB_STORE": "none"} | dict(environment or {}),
         )

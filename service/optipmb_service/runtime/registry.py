@@ -425,12 +425,11 @@ class Registry:
 
     def _let_in(self) -> None:
         """Hand over what was put off, as far as there is room."""
-        waits = True
-        while waits:
+        while self.untracked.newcomers:
             with self._lock:
                 if self._crowded():
                     return
-            waits = self.untracked.hand_over_newcomer(self._take_up)
+            self.untracked.hand_over_newcomer(self._take_up)
 
     def _discard(self, actor: Actor) -> None:
         with self._lock:

@@ -93,7 +93,8 @@ class StreamQueries:
 
         def answer(actor: StreamActor) -> None:
             if name == "state" and not actor.elsewhere:
-                self._later(self._state(actor), lambda state: guarded(request, lambda: self._say(request, state)))
+                state = self._state(actor)
+                self._digests.submit(guarded, request, lambda: self._tell(request, state))
                 return
             # Where several instances run, the one that tracks the stream answers.
             guarded(request, lambda: None if actor.elsewhere else command(actor, request))
@@ -133,37 +134,29 @@ class StreamQueries:
                 left.one()
 
     def _one_of_many(self, request: Request, left: _Countdown) -> Callable[[StreamActor], None]:
-        def command(actor: StreamActor) -> None:
-            def say(state: schemas.SessionState) -> None:
-                try:
-                    self._say(request, state)
-                except TransportError as error:
-                    log.warning("reply_failed", key=request.key, error=str(error))
-                finally:
-                    left.one()
+        def tell(state: tuple[schemas.SessionState, Checkpoint | None]) -> None:
+            try:
+                self._tell(request, state)
+            except TransportError as error:
+                log.warning("reply_failed", key=request.key, error=str(error))
+            finally:
+                left.one()
 
-            self._later(self._state(actor), say)
+        def command(actor: StreamActor) -> None:
+            self._digests.submit(tell, self._state(actor))
 
         return command
 
-    def _say(self, request: Request, state: schemas.SessionState) -> None:
-        request.answer(self._keys.query(state.stream, "state"), state)
-
-    def _later(
-        self, state: tuple[schemas.SessionState, Checkpoint | None], then: Callable[[schemas.SessionState], None]
-    ) -> None:
-        """Go on with a state that has its digest, on the thread that makes digests: it encodes a whole checkpoint."""
-
-        def work() -> None:
-            said, checkpoint = state
-            if checkpoint is not None:
-                try:
-                    said = said.model_copy(update={"digest": digest_of(checkpoint)})
-                except Exception:
-                    log.exception("internal_error", stream=said.stream)  # who asked must not wait for a timeout
-            then(said)
-
-        self._digests.submit(work)
+    def _tell(self, request: Request, state: tuple[schemas.SessionState, Checkpoint | None]) -> None:
+        """Answer with a state and its digest, on the thread that makes digests: it encodes a whole checkpoint."""
+        said, checkpoint = state
+        if checkpoint is not None:
+            try:
+                said = said.model_copy(update={"digest": digest_of(checkpoint)})
+            except Exception:
+                log.exception("internal_error", stream=said.stream)
+                raise
+        request.answer(self._keys.query(said.stream, "state"), said)
 
     # Run by the tracking thread
 

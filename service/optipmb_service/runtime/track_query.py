@@ -11,7 +11,6 @@ import structlog
 
 from optipmb_service.runtime.kept_tracks import TracksRange
 from optipmb_service.runtime.ports import TransportError
-from optipmb_service.runtime.requests import guarded
 from optipmb_service.session.problems import problem_of
 
 if TYPE_CHECKING:
@@ -112,7 +111,13 @@ class TrackQuery:
         self._finish(request, last)
 
     def _finish(self, request: Request, problem: schemas.Problem | None) -> None:
-        guarded(request, lambda: None if problem is None else request.refuse(problem))
+        try:
+            if problem is not None:
+                request.refuse(problem)
+        except TransportError as error:
+            log.warning("reply_failed", key=request.key, error=str(error))
+        finally:
+            request.finish()
 
     def _problem(
         self, code: str, stream: str, path: str, expected: str, received: str, stamp_ns: int | None = None

@@ -131,14 +131,18 @@ class UntrackedMessages:
         with self._lock:
             self._hand_over(session, packets, take_up)
 
-    def hand_over_newcomer(self, take_up: TakeUp) -> bool:
-        """Hand over the session that has waited longest for room; False when none waits."""
+    @property
+    def newcomers(self) -> int:
+        """How many sessions wait for room."""
+        return len(self._newcomers)
+
+    def hand_over_newcomer(self, take_up: TakeUp) -> None:
+        """Hand over the session that has waited longest for room."""
         with self._lock:
             # At once: a session that the intake holds meanwhile it takes up itself, with what others received.
             session = next(iter(self._newcomers), None)
             if session is not None:
                 self._hand_over(session, [], take_up)
-            return session is not None
 
     # Caches of publishers
 

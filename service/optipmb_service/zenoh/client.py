@@ -88,7 +88,8 @@ class Outgoing:
     @property
     def points_wanted(self) -> bool:
         """Whether anybody is known to take clouds; always with a cache, which serves those who come later."""
-        return self._matching is None or bool(self._matching.matching_status.matching)
+        matching = self._matching  # `close` may take it away meanwhile
+        return matching is None or bool(matching.matching_status.matching)
 
     def detections(self, payload: bytes) -> None:
         """Send encoded detections.
