@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -13,16 +14,13 @@ from hypothesis import strategies as st
 from optipmb_client import dumps as client
 from optipmb_client.cli import run
 from optipmb_client.errors import UsageError
-from optipmb_service.runtime.dumps import save
+from optipmb_service.runtime.dumps import FOLDER, MOST, save
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from router import Sensor
 from sessions import Failing, Merged, begun, dumps, feed, problems, tracks
 
 import optipmb
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 NUSCENES = optipmb.load_profile("nuscenes")
 SENSOR = Sensor()
@@ -149,11 +147,12 @@ def test_what_is_no_dump_is_refused(data: bytes) -> None:
 
 def test_dumps_are_written_whole_and_bounded(tmp_path: Path) -> None:
     """The newest stay, nothing else is left in the folder, and names say which stream it was."""
-    folder = tmp_path / "dumps"
-    files = [save(folder, "a/b/c", b"%d" % number, most=3) for number in range(5)]
-    assert [file.name for file in sorted(folder.iterdir())] == [file.name for file in files[2:]]
+    files = [Path(save(tmp_path, "a/b/c", b"%d" % number)) for number in range(MOST + 2)]
+    assert [file.name for file in sorted((tmp_path / FOLDER).iterdir())] == [file.name for file in files[2:]]
     assert files[4].name == "a_b_c-000005.dump"
     assert files[4].read_bytes() == b"4"
+    (tmp_path / "file").touch()
+    assert save(None, "a/b/c", b"") == save(tmp_path / "file", "a/b/c", b"") == ""
 
 
 def test_the_command_replays_a_dump(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
