@@ -176,7 +176,7 @@ class Sender:
 
         It is let go of; a message that another thread is sending may still go out. What Zenoh calls `undeclare` waits
         for the heartbeats to end with the lock of the interpreter held; while the thread that sends them waits for that
-        lock, the whole process would stand still for ten seconds.
+        lock, the whole process would be blocked for ten seconds.
         """
         self._publisher = self._matching = None
 

@@ -4,17 +4,15 @@
 
 From the outside in:
 
-    cli, settings, logs     the command
-    supervisor, child, whole, worker, share    several processes as one instance
-    service, loops          the control loop: start, signals, timers, end
-    health, metrics, figures, http, health    how it is, for those who ask from outside
-    transport/              Zenoh, behind the protocols of ports
-    registry, queries       streams and questions, found and sorted
-    actor, mailbox             one stream: its queue, its worker's turn
-    session, timing         one density and all decisions about it; pure
-    convert, clouds, records, profiles, problems, meter
+    app             the command, processes, the parts of a service put together, start and end
+    http, grpc, ros2    edges: health, metrics, page; gateway; bridge
+    zenoh           the network, behind the protocols of `runtime.ports`
+    cluster         leases, checkpoints and the log: SQLite or NATS
+    runtime         streams and queries, found and sorted; one actor for each stream
+    session         one density and all decisions about it
+    observability   metrics, health, problems, logs
 
-Only `transport` knows Zenoh, only `session` knows the filter.
+Only `zenoh` knows Zenoh, only `session` knows the filter.
 """
 
 from importlib.metadata import version

@@ -1,6 +1,6 @@
 """A process that has imported service and client and loaded the kernels, and forks for each start asked of it.
 
-Run by `forked`, as `fork_server.py FD`. An order comes as one packet with the three files that the new process is to
+Run by `forked`, as `fork_server.py FD`. A request comes as one packet with the three files that the new process is to
 have. The packet is JSON: the module that is run and its words, the environment, the folder. The answer is the number
 of the new process. That one is forked twice, so that it has no parent here; whoever asked takes it as a child of its
 own.
@@ -15,35 +15,33 @@ import runpy
 import socket
 import sys
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from optipmb_service.app.optional import without
+
 LARGEST = 1 << 18
 FILES = 3
+SERVICE = ("optipmb_service.app.cli", "optipmb_service.app.worker", "optipmb_service.http.page")
 TASKS = Path("/proc/self/task")
 
 
 def load() -> None:
     """Import what a service imports until it is ready, as it does, and the client; load the kernels."""
-    from optipmb_service.app.collector import collector_paused  # noqa: PLC0415 - as the command does it
-    from optipmb_service.app.optional import without  # noqa: PLC0415
-
-    with collector_paused(), without("rich"):
-        from optipmb_service.app import cli, worker  # noqa: F401, PLC0415
-        from optipmb_service.http import page  # noqa: F401, PLC0415
+    with without("rich"):
+        for name in SERVICE:
+            import_module(name)
     with suppress(ModuleNotFoundError):  # an extra that not all tests need
-        from optipmb_service.cluster import jetstream  # noqa: F401, PLC0415
-    from optipmb_service.app.kernels import warm_up  # noqa: PLC0415
-
-    warm_up()
-    import optipmb_client.cli  # noqa: F401, PLC0415 - after the service, which does without rich
-
+        import_module("optipmb_service.cluster.jetstream")
+    import_module("optipmb_service.app.kernels").warm_up()
+    import_module("optipmb_client.cli")  # after the service, which does without rich
     gc.collect()
     gc.freeze()
 
 
 def serve(asking: socket.socket) -> str:
-    """Fork for every order, until nobody is there to give one; returns in a new process: what it is to run."""
+    """Fork for every request, until nobody can send one; returns in a new process the module that it is to run."""
     while True:
         packet, files, _, _ = socket.recv_fds(asking, LARGEST, FILES)
         if not packet:
@@ -66,16 +64,16 @@ def serve(asking: socket.socket) -> str:
             os.close(one)
 
 
-def become(order: dict[str, Any], files: list[int]) -> str:
-    """Take over files, environment, folder and words of the order; returns its module."""
+def become(request: dict[str, Any], files: list[int]) -> str:
+    """Take over files, environment, folder and words of the request; returns its module."""
     for number, one in enumerate(files):
         os.dup2(one, number)
         os.close(one)
     os.environ.clear()
-    os.environ.update(order["environment"])
-    os.chdir(order["folder"])
-    sys.path[0] = order["folder"]
-    module, *sys.argv[1:] = order["words"]
+    os.environ.update(request["environment"])
+    os.chdir(request["folder"])
+    sys.path[0] = request["folder"]
+    module, *sys.argv[1:] = request["words"]
     return str(module)
 
 

@@ -15,6 +15,7 @@ import socket
 import subprocess
 import sys
 import threading
+from pathlib import Path
 from typing import Any
 
 import fork_server
@@ -32,7 +33,7 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
 
 @functools.cache
 def server() -> socket.socket:
-    """The one server of this process, started when first needed: where it takes orders."""
+    """The one server of this process, started when first needed: where it takes requests."""
     asking, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     number = theirs.fileno()
     clean = {name: value for name, value in os.environ.items() if not name.startswith("OPTIPMB_")}
@@ -68,10 +69,10 @@ class Forked(subprocess.Popen[str]):
         del executable
         _, _, _, folder, environment, _, _, _, *pipes = given[:14]
         stdin, _, _, stdout, _, stderr = pipes
-        order = {
+        request = {
             "words": list(args),
             "environment": dict(os.environ if environment is None else environment),
-            "folder": folder or os.getcwd(),  # noqa: PTH109 - a text is needed
+            "folder": str(folder or Path.cwd()),
         }
         kernel = ctypes.CDLL(None, use_errno=True)
         with ONE_AT_A_TIME:
@@ -79,9 +80,9 @@ class Forked(subprocess.Popen[str]):
             kernel.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
             try:
                 files = [own if one == -1 else one for own, one in enumerate((stdin, stdout, stderr))]
-                socket.send_fds(asking, [json.dumps(order).encode()], files)
+                socket.send_fds(asking, [json.dumps(request).encode()], files)
                 self.pid = int(asking.recv(32))
-            except BaseException:  # the answer may still come: it must not be taken for that of the next order
+            except BaseException:  # the answer may still come: it must not be taken for that of the next request
                 asking.close()
                 server.cache_clear()
                 raise

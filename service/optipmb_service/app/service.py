@@ -135,13 +135,11 @@ class Service:
             idle_s=settings.idle_s,
         )
         self._metrics.add(self._figures)
-        limits = settings.limits.limits()
-        self._stream_queries = StreamQueries(self._registry, TrackQuery([*logged, recent], settings.instance, limits))
+        self._stream_queries = StreamQueries(
+            self._registry, TrackQuery([*logged, recent], settings.instance, settings.limits.limits())
+        )
         self._service_queries = ServiceQueries(
-            settings.instance,
-            self._registry.keys,
-            limits,
-            self._registry.fusion,
+            self._registry,
             status=self.status,
             metrics=self._metrics.text,
             samples=self._metrics.samples,

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from optipmb_service.cluster.leases import MemberLease
     from optipmb_service.cluster.member import Member
-    from optipmb_service.runtime.fusion import Fusion
     from optipmb_service.runtime.ports import Packet, Request
+    from optipmb_service.runtime.registry import Registry
 
 TEXT = "text/plain;version=0.0.4"
 """Zenoh encoding of the metrics."""
@@ -39,10 +39,7 @@ class ServiceQueries:
     """Answers every request about the service, and finishes it whatever happens.
 
     Args:
-        instance: name of the service.
-        keys: of the network.
-        limits: bounds on messages.
-        fusion: which streams share a session.
+        registry: the streams.
         status: makes the status of the service.
         metrics: makes its metrics, in Prometheus' text format.
         samples: makes its metrics as data for the parent of this process.
@@ -51,12 +48,9 @@ class ServiceQueries:
         workers: how many processes the service has.
     """
 
-    def __init__(  # noqa: PLR0913 - the parts that it brings together
+    def __init__(
         self,
-        instance: str,
-        keys: schemas.Keys,
-        limits: schemas.Limits,
-        fusion: Fusion,
+        registry: Registry,
         *,
         status: Callable[[], schemas.ServiceStatus],
         metrics: Callable[[], bytes],
@@ -65,10 +59,10 @@ class ServiceQueries:
         hand_over: Callable[[Iterable[str], Callable[[Packet], None]], None],
         workers: int,
     ) -> None:
-        self._instance = instance
-        self._keys = keys
-        self._limits = limits
-        self._fusion = fusion
+        self._instance = registry.instance
+        self._keys = registry.keys
+        self._limits = registry.limits
+        self._fusion = registry.fusion
         self._status = status
         self._metrics = metrics
         self._samples = samples

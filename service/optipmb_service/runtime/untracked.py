@@ -66,7 +66,7 @@ class UntrackedMessages:
         with self._lock:
             if session not in self._buffers and self._holds(session):
                 return False
-            buffer = self._heard_of(session, packet.now_ns)
+            buffer = self._buffer_of(session, packet.now_ns)
             buffer.unasked |= own
             lost = buffer.add(packet, frame=frame, own=own)
         self._lose(session, lost)
@@ -77,10 +77,10 @@ class UntrackedMessages:
         lost = [frame]
         with self._lock:
             if session not in self._buffers and len(self._newcomers) < MAX_NEWCOMERS:
-                self._heard_of(session, packet.now_ns).unasked = True
+                self._buffer_of(session, packet.now_ns).unasked = True
                 self._newcomers[session] = None
             if session in self._buffers:
-                buffer = self._heard_of(session, packet.now_ns)
+                buffer = self._buffer_of(session, packet.now_ns)
                 lost = buffer.add(packet, frame=frame, own=True)
                 if not buffer and session in self._newcomers:
                     self._forget(session)
@@ -90,13 +90,13 @@ class UntrackedMessages:
         """Keep what comes of a session that is new to all members until its own has asked for it."""
         with self._lock:
             if session not in self._buffers and not self._holds(session):
-                self._heard_of(session).unasked = True
+                self._buffer_of(session).unasked = True
 
     def hold(self, session: str) -> None:
         """Keep what comes of a session until it is taken up."""
         with self._lock:
             self._newcomers.pop(session, None)
-            self._heard_of(session)
+            self._buffer_of(session)
 
     def leave(self, session: str, *, asked_for: bool) -> None:
         """Keep what comes of a session from now on that is about to end here, where another member is to have it.
@@ -107,7 +107,7 @@ class UntrackedMessages:
         """
         with self._lock:
             if not self._holds(session):
-                self._heard_of(session).unasked |= asked_for
+                self._buffer_of(session).unasked |= asked_for
 
     # Who asks for it
 
@@ -178,7 +178,7 @@ class UntrackedMessages:
         self._newcomers.pop(session, None)
         if session not in self._buffers and not packets:
             return
-        buffer = self._heard_of(session)
+        buffer = self._buffer_of(session)
         if not self._holds(session):
             for packet, frame in packets:
                 buffer.add(packet, frame=frame)
@@ -188,7 +188,7 @@ class UntrackedMessages:
         take_up(session, packets, buffer.answered.copy())
         self._forget(session)  # from now on readers hand over newer ones
 
-    def _heard_of(self, session: str, now_ns: int | None = None) -> TakeoverBuffer:
+    def _buffer_of(self, session: str, now_ns: int | None = None) -> TakeoverBuffer:
         buffer = self._buffers.get(session)
         if buffer is None:
             buffer = self._buffers[session] = self._buffer()

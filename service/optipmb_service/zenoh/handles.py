@@ -202,7 +202,7 @@ class Publisher:
     """A publisher of Zenoh's own, and the token that goes with it.
 
     It is withdrawn by letting go of it: what Zenoh calls `undeclare` waits for the heartbeats to end with the lock of
-    the interpreter held. While the thread that sends them waits for that lock, the whole process would stand still
+    the interpreter held. While the thread that sends them waits for that lock, the whole process would be blocked
     until Zenoh gives up, after ten seconds.
     """
 
