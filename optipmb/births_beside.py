@@ -9,8 +9,8 @@ later.
 
 How long a missed object forbids births depends on how sure it is. Many short tracks are false, and what is detected
 beside them may well be the first of an object: they forbid it for a nominal period after their last detection. A track
-of at least `LASTING` nominal periods forbids it for as many periods as it is extracted without a detection, eta_cnt: a
-new track would stand beside it in the output, and a drifted state is found again by its detections.
+of at least `LASTING` nominal periods forbids it as long as it is extracted without a detection, for fewer periods than
+eta_cnt: a new track would stand beside it in the output, and a drifted state is found again by its detections.
 
 It is decided for the best global hypothesis, as pruning is, so that all costs remain those of the paper.
 """
@@ -81,7 +81,7 @@ def forbid_births(
         if overlap >= EVERYTHING or assigned[n] != UNASSIGNED or used[m] or hypotheses.first_kind[m] == CLUTTER:
             continue
         lasting = whole_periods(objects.born_ns[n], stamp_ns, period) >= LASTING
-        longest = max(own.extract_misses, 1) if lasting else 1
+        longest = max(own.extract_misses - 1, 1) if lasting else 1
         if not objects.extracted[n] or whole_periods(missed_from_ns[n], stamp_ns, period) > longest:
             continue
         predicted[0], predicted[1], predicted[4] = objects.mean[n, X], objects.mean[n, Y], objects.mean[n, PHI]

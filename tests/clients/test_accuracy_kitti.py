@@ -1,17 +1,20 @@
 """How accurate the profile that ships is on KITTI: below these figures something has been lost."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from accuracy import figures, material
 from greedy import greedy_tracks
 from kalman import kalman_tracks
 from optipmb_client.cli import run
-from optipmb_client.datasets import open_dataset
+from optipmb_client.datasets import Regions, Truth, open_dataset
 from optipmb_client.evaluation.calibration import CalibrationResult
 from optipmb_client.evaluation.errors import evaluate_errors
 from optipmb_client.tuning.calibrate import cross_calibration
-from optipmb_client.tuning.material import track_fully
+from optipmb_client.tuning.material import Clip, track_clip, track_fully
 from optipmb_client.tuning.values import only
 from real_data import kitti_root
 
@@ -59,11 +62,41 @@ def test_car_tracks_know_themselves() -> None:
 
 @pytest.mark.parametrize("detections", ["pointrcnn", "second_iou", "pvrcnn", "casa", "virconv"])
 def test_cars_of_every_detector_are_tracked_as_well_as_with_the_papers_values(detections: str) -> None:
-    """sAMOTA, AMOTA and MOTA of `kitti` are at most 0.003 less than those of the paper's table, with each of five."""
+    """sAMOTA, AMOTA and MOTA of `kitti` are at most 0.002 less than with the paper's table, and no id switches."""
     tuned, paper = figures("kitti", detections, "Car"), figures("kitti-paper", detections, "Car")
-    assert tuned.samota >= paper.samota - 0.003
-    assert tuned.amota >= paper.amota - 0.003
-    assert tuned.mota >= paper.mota - 0.003
+    assert tuned.samota >= paper.samota - 0.002
+    assert tuned.amota >= paper.amota - 0.002
+    assert tuned.mota >= paper.mota - 0.002
+    assert tuned.ids == 0
+
+
+@pytest.mark.parametrize(("name", "every", "most"), [("0004", 3, 1), ("0020", 5, 7)])
+def test_cars_keep_their_ids_in_slow_streams(name: str, every: int, most: int) -> None:
+    """With every third or fifth frame of a sequence the gates grow with the time between frames."""
+    scorers, clips = material("kitti", "pointrcnn")
+    (clip,) = (thinned(one, every) for one in clips["Car"] if one.name == name)
+    tracks = track_clip(clip, only(optipmb.load_profile("kitti"), "Car"))
+    found = scorers["Car"].figures([scorers["Car"].measure(clip, tracks)])
+    assert found.mota > 0.7
+    assert found.ids <= most
+
+
+def thinned(clip: Clip, every: int) -> Clip:
+    """Return a clip with each so many frames."""
+
+    def rows_of(truth: Truth) -> Truth:
+        kept, shown = truth.take(truth.frame % every == 0), truth.regions.frame % every == 0
+        regions = Regions(truth.regions.frame[shown] // every, truth.regions.box2d[shown])
+        return replace(kept, frame=kept.frame // every, regions=regions)
+
+    return replace(
+        clip,
+        frames=clip.frames[::every],
+        rotation=clip.rotation[::every],
+        translation=clip.translation[::every],
+        truth=rows_of(clip.truth),
+        world=rows_of(clip.world),
+    )
 
 
 @pytest.mark.parametrize(
@@ -71,7 +104,11 @@ def test_cars_of_every_detector_are_tracked_as_well_as_with_the_papers_values(de
     [("pointrcnn", 0.7617), ("second_iou", 0.7765), ("pvrcnn", 0.7686), ("casa", 0.7887), ("virconv", 0.8273)],
 )
 def test_boxes_of_cars_lie_nearer_than_those_of_their_detector(detections: str, motp: float) -> None:
-    """In no direction is the error above that of the detections; MOTP is 0.015 above that of the state's own boxes."""
+    """In no direction is the error above that of the detections; MOTP is 0.015 above that of the state's own boxes.
+
+    Headings are backward at most 1.2 times as often as the detector's, and 90 to 98 % of their errors lie within the
+    interval of 95 %.
+    """
     parameters = only(optipmb.load_profile("kitti"), "Car")
     sequences = open_dataset("kitti", kitti_root(), detections, clouds=False).sequences(["all"])
     scorers, clips = material("kitti", detections)
@@ -80,10 +117,13 @@ def test_boxes_of_cars_lie_nearer_than_those_of_their_detector(detections: str, 
         (one, clip.world, *track_fully(clip, parameters)) for one, clip in zip(sequences, clips["Car"], strict=True)
     ]
     found = evaluate_errors(parts, "Car", near)
-    figures_of = found.figures(found.detected)
+    figures_of: Any = found.figures(found.detected)
     for direction in ("along", "across", "height", "heading"):
         assert figures_of["track"][direction] <= figures_of["detection"][direction], direction
     assert figures("kitti", detections, "Car").to_json()["MOTP"] >= motp + 0.015
+    assert figures_of["backward"]["track"] <= 1.2 * figures_of["backward"]["detection"]
+    all_boxes: Any = found.figures(np.ones(len(found.speed), dtype=bool))
+    assert 0.90 <= all_boxes["heading"]["coverage"] <= 0.98
 
 
 @pytest.mark.parametrize("name", ["kitti-second-iou", "kitti-virconv"])

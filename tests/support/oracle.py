@@ -285,10 +285,10 @@ class Oracle:
         return {int(i): int(m) for m, i in zip(rows, columns, strict=True) if i < n}
 
     def _forbid_births(self, zs: list[Measurement], chosen: dict[int, int], new: list[NewObject], now: int) -> None:
-        """No second track on the box of a missed track: for a nominal period, or eta_cnt of them if it is ten old."""
+        """No second track on the box of a missed one: for a nominal period, fewer than eta_cnt if it is ten old."""
         for i, b in enumerate(self.bernoulli):
             c = self.classes[b.label]
-            longest = max(c.extract_misses, 1) if periods(b.born_ns, now, self.nominal) >= 10 else 1
+            longest = max(c.extract_misses - 1, 1) if periods(b.born_ns, now, self.nominal) >= 10 else 1
             misses = periods(b.seen_ns, now, self.nominal)
             if c.birth_overlap < 1 and b.extracted and i not in chosen and misses <= longest:
                 box = np.array([*b.mean[:2], *b.auxiliary[:2], b.mean[3]])

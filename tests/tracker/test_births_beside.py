@@ -44,8 +44,8 @@ def test_beside_a_short_track_what_is_there_is_born_a_frame_later() -> None:
 
 
 def test_a_lasting_track_stays_alone_as_long_as_it_is_extracted() -> None:
-    """Beside a car of two seconds the same box starts none for five periods, as many as `extract_misses` says."""
+    """Beside a car of two seconds the same box starts none while the car is extracted: `extract_misses` less one."""
     assert optipmb.load_profile("kitti").classes["Car"].extract_misses == 5
     ids = follow("kitti", [0.0] * 20 + [1.4] * 12)
-    assert not any(2 in now for now in ids[:25])
-    assert 2 in ids[25]
+    assert not any(2 in now for now in ids[:24])
+    assert 2 in ids[24]

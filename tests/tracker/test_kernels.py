@@ -223,7 +223,7 @@ def test_objects_survive_by_existence_and_misses(seed: int) -> None:
 def test_births_are_forbidden_as_set_logic_says(seed: int) -> None:
     """A detection without an object is clutter if its box overlaps that of a gated, extracted, missed one.
 
-    It was detected a period ago at most, or is at least ten old and was detected at most as many ago as its class says.
+    It was detected a period ago at most, or is at least ten old and has missed fewer periods than its class says.
     """
     rng = np.random.default_rng(seed)
     n, m = 60, 20
@@ -240,7 +240,7 @@ def test_births_are_forbidden_as_set_logic_says(seed: int) -> None:
         np.column_stack([mean[:, :2], auxiliary[:, :2], mean[:, 3]]),
         np.column_stack([z.position, z.auxiliary[:, :2], z.yaw]),
     )
-    longest = np.where(periods(born) >= 10, np.maximum(misses[label], 1), 1)
+    longest = np.where(periods(born) >= 10, np.maximum(misses[label] - 1, 1), 1)
     active = (assigned == UNASSIGNED) & extracted & (periods(seen) <= longest)
     taken = active[row] & (overlap[row, measurement] > limit[label[row]])
     forbidden = np.isin(np.arange(m), measurement[taken]) & ~np.isin(np.arange(m), assigned)
