@@ -3,6 +3,7 @@
 import contextlib
 import re
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,16 +15,21 @@ from mcap.reader import make_reader
 from optipmb_client import Connection, Subscriber
 from optipmb_client.child import ServiceProcess
 from optipmb_client.cli import run
+from optipmb_client.datasets import open_dataset
 from optipmb_client.mcap_files.reading import RecordingFile
+from optipmb_client.replay import Pace, replay
 from optipmb_schemas import Tracks, decode, encode
 from real_data import kitti_root
 
 if TYPE_CHECKING:
     import subprocess
 
+    from optipmb_client.datasets import Dataset
+
 FRAMES = 15
-SCENE = ("--dataset", "scene", "--option", f"frames={FRAMES}", "--option", "vehicles=8", "--option", "pedestrians=2")
-FOUR = ("--sequences", "0000", "0001", "0002", "0003", "--streams", 4)
+VALUES = {"frames": FRAMES, "vehicles": 8, "pedestrians": 2}
+SCENE = ("--dataset", "scene", *(f"--option={name}={value}" for name, value in VALUES.items()))
+FOUR = ("0000", "0001", "0002", "0003")
 DEADLINE_S = 120.0
 
 PATIENT = {"OPTIPMB_CLOUD_WAIT_S": "5"}
@@ -74,16 +80,36 @@ def newest_tracks(path: Path) -> dict[tuple[str, int], bytes]:
     return {key: encode(tracks.model_copy(update={"delivery": None})) for key, tracks in found.items()}
 
 
-def here(*arguments: object) -> int:
-    """Run the client's command in this process, where no output is looked at."""
-    return run([str(one) for one in arguments])
+def recorded_replay(service: ServiceProcess, folder: Path, dataset: "Dataset", *names: str) -> Path:
+    """Replay sequences through a service while they are recorded, all at once; give the recording.
 
-
-def recorded_replay(service: ServiceProcess, folder: Path, data: tuple[object, ...]) -> Path:
-    """Replay data through a service while it is recorded; give the recording."""
+    After its first frame each waits until the recording has the parameters of all: they are gone with the sessions.
+    """
     path = folder / "incident.mcap"
+    asked = threading.Event()
+
+    def has_parameters() -> bool:
+        return sum(one.topic == "parameters" for one in RecordingFile(path)) == len(names)
+
+    def hold() -> None:
+        if not asked.is_set():
+            wait_for(has_parameters, service)
+            asked.set()
+
     with recording(service, path) as process:
-        assert here("replay", *data, "--connect", service.endpoint, "--out", folder / "replay") == 0
+        with Connection(service.endpoint) as connection:
+            pace = Pace(patience_s=2 * DEADLINE_S)
+            replayed = replay(
+                connection,
+                dataset,
+                dataset.sequences(names),
+                folder / "replay",
+                profile=dataset.profile,
+                pace=pace,
+                streams=len(names),
+                on_frame=hold,
+            )
+        assert not any(one.missing or one.clouds_missed for one in replayed)
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=DEADLINE_S)
         assert process.returncode == 0, err
@@ -117,7 +143,7 @@ def test_four_streams_played_into_a_fresh_service(
     service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Ids, sessions, numbers, stamps and every byte of the tracks are those of the recording; offline, too."""
-    path = recorded_replay(service, tmp_path, (*SCENE, *FOUR))
+    path = recorded_replay(service, tmp_path, open_dataset("scene", **VALUES), *FOUR)
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -138,7 +164,7 @@ def test_four_streams_played_into_a_fresh_service(
 @pytest.fixture(scope="module")
 def incident(service: ServiceProcess, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of one stream."""
-    return recorded_replay(service, tmp_path_factory.mktemp("incident"), SCENE)
+    return recorded_replay(service, tmp_path_factory.mktemp("incident"), open_dataset("scene", **VALUES), "0000")
 
 
 def test_a_recording_is_played_again_and_again(
@@ -153,6 +179,23 @@ def test_a_recording_is_played_again_and_again(
         assert f"{FRAMES} of {FRAMES} equal to the recorded tracks" in done.stdout
     (one,), (two,) = ((tmp_path / folder).glob("*.txt") for folder in ("one", "two"))
     assert one.read_bytes() == two.read_bytes() == (incident.parent / "replay" / "0000.txt").read_bytes()
+
+
+def test_parameters_of_another_session_are_not_recorded(
+    service: ServiceProcess, incident: Path, tmp_path: Path
+) -> None:
+    """Of a session that has ended when the service is asked, nothing is recorded that its tracks were not made with."""
+    first = next(one for one in RecordingFile(incident) if one.topic == "tracks")
+    path = tmp_path / "ended.mcap"
+    with recording(service, path) as process:
+        with Connection(service.endpoint) as connection:
+            sender = connection.plain_sender(f"optipmb/v1/{first.stream}/tracks", first.encoding)
+            wait_for(lambda: sender.wanted, service)
+            sender.put(first.payload)
+            wait_for(lambda: any(one.topic == "tracks" for one in RecordingFile(path)), service)
+        process.send_signal(signal.SIGTERM)  # it ends with the answer
+        process.communicate(timeout=DEADLINE_S)
+    assert {one.topic for one in RecordingFile(path)} == {"tracks"}
 
 
 def test_tracks_that_differ_are_told(
@@ -185,13 +228,13 @@ def test_a_killed_recording_still_plays(
     """SIGKILL in the middle of a stream: what was written until a second before is there, and plays the same."""
     path = tmp_path / "cut.mcap"
     with recording(service, path) as process, Subscriber("replay/*/0000", service.endpoint) as tracks:
-        replay = start("replay", *SCENE, "--option", "frames=60", "--speed", 1, "--connect", service.endpoint)
+        replaying = start("replay", *SCENE, "--option", "frames=60", "--speed", 1, "--connect", service.endpoint)
         try:
             for _ in range(30):
                 assert tracks.receive(DEADLINE_S) is not None
         finally:
             kill(process)
-            kill(replay)
+            kill(replaying)
     cut = RecordingFile(path)
     assert sum(one.topic == "tracks" for one in cut) >= 30 - 25  # at 10 Hz, a flush a second on a busy machine
     assert cut.cut
@@ -203,8 +246,7 @@ def test_a_killed_recording_still_plays(
 
 def test_kitti(service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Real detections, with the clouds that there are."""
-    data = ("--dataset", "kitti", "--root", kitti_root(), "--detections", "pointrcnn")
-    path = recorded_replay(service, tmp_path, (*data, "--sequences", "0002"))
+    path = recorded_replay(service, tmp_path, open_dataset("kitti", kitti_root(), "pointrcnn"), "0002")
     play_into_another(path, tmp_path, capsys)
 
 

@@ -35,6 +35,8 @@ class Proxy:
         self._threads: list[threading.Thread] = []
         self.delivered = 0
         """Bytes passed on to those that connected here."""
+        self.accepted = 0
+        """Connections so far."""
         self.endpoint = free_endpoint()
         self.address = self.endpoint.removeprefix("tcp/")
 
@@ -76,6 +78,7 @@ class Proxy:
         with contextlib.suppress(OSError):  # closed
             while True:
                 near, _ = listener.accept()
+                self.accepted += 1
                 self._whole.wait()
                 self._sockets.append(near)
                 try:

@@ -2,7 +2,7 @@
 
 A thread per kind of message, small ones and clouds, moves what comes into the file; once a second everything is
 flushed. Of each stream the parameters in force are asked for and recorded too, when it appears and whenever its session
-starts anew: they belong to what made the tracks.
+starts anew: they belong to what made the tracks. Those of a session that ended before it could be asked are not known.
 """
 
 import concurrent.futures
@@ -142,19 +142,21 @@ class _Task:
             self._count(arrival.key)
             if isinstance(message, Tracks) and self._sessions.get(message.stream) != message.session:
                 self._sessions[message.stream] = message.session
-                self._questions.submit(self._ask, message.stream)
+                self._questions.submit(self._ask, message.stream, message.session)
 
     def finish(self) -> None:
         """Wait for the answers that are still under way."""
         self._questions.shutdown()
 
-    def _ask(self, stream: str) -> None:
+    def _ask(self, stream: str, session: str) -> None:
         try:
             answer = set_parameters(
                 self._connection, stream, SessionParameters(), prefix=self._keys.prefix, patience_s=PARAMETERS_S
             )
         except ClientError:
             return  # the service has gone; its messages are recorded all the same
+        if answer.session != session:
+            return
         key = self._keys.query(stream, "parameters")
         self._writer.add(key, encode(answer), encoding_of(answer), time.monotonic_ns() + self._offset_ns)
         self._count(key)

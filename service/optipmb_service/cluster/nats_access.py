@@ -17,6 +17,8 @@ from optipmb_service.cluster.store import StoreError
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from nats.aio.client import Srv
+
 CA: Final = "ca.pem"
 CERTIFICATE: Final = "cert.pem"
 KEY: Final = "key.pem"
@@ -66,7 +68,14 @@ class SecuredClient(Client):
 
     A server tells in the clear whether it wants TLS, and whoever stands in between could leave that out: the client
     would go on without, and send the password.
+
+    It also closes a connection that a server ended before it had greeted the client, before it tries the next one.
     """
+
+    async def _connect_to_server(self, s: Srv) -> None:
+        if self._transport is not None:
+            self._transport.close()  # type: ignore[no-untyped-call]  # it has no types
+        await super()._connect_to_server(s)
 
     def _connect_command(self) -> bytes:
         server = self._current_server

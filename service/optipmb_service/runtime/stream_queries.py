@@ -231,6 +231,7 @@ class StreamQueries:
             cloud_wait_s=session.cloud_wait_s if session else self._registry.cloud_wait_s,
             horizons=np.array(parameters.horizons, np.float64),
             values=parameters.model_dump(mode="json"),
+            session=session.session if session else None,
         )
 
     def _nothing(self, stream: str, state: Literal["new", "closed"]) -> schemas.SessionState:
