@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from optipmb_client import Connection, Subscriber
 from optipmb_client.child import ServiceProcess
 from optipmb_client.cli import run
-from optipmb_client.datasets import open_dataset
+from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.mcap_files.reading import RecordingFile
 from optipmb_client.replay import Pace, replay
 from optipmb_schemas import Tracks, decode, encode
@@ -68,6 +68,14 @@ def wait_for(condition: object, service: ServiceProcess) -> None:
         time.sleep(0.02)  # a file and a matching status cannot be waited on
 
 
+def count(path: Path, topic: str) -> int:
+    """Messages of a topic in a recording that may still grow; 0 when it grew while it was read to its end."""
+    try:
+        return sum(one.topic == topic for one in RecordingFile(path))
+    except DatasetError:
+        return 0
+
+
 def newest_tracks(path: Path) -> dict[tuple[str, int], bytes]:
     """Tracks of a recording without what tells of their delivery, by stream and number."""
     found: dict[tuple[str, int], Tracks] = {}
@@ -88,12 +96,9 @@ def recorded_replay(service: ServiceProcess, folder: Path, dataset: "Dataset", *
     path = folder / "incident.mcap"
     asked = threading.Event()
 
-    def has_parameters() -> bool:
-        return sum(one.topic == "parameters" for one in RecordingFile(path)) == len(names)
-
     def hold() -> None:
         if not asked.is_set():
-            wait_for(has_parameters, service)
+            wait_for(lambda: count(path, "parameters") == len(names), service)
             asked.set()
 
     with recording(service, path) as process:
@@ -192,7 +197,7 @@ def test_parameters_of_another_session_are_not_recorded(
             sender = connection.plain_sender(f"optipmb/v1/{first.stream}/tracks", first.encoding)
             wait_for(lambda: sender.wanted, service)
             sender.put(first.payload)
-            wait_for(lambda: any(one.topic == "tracks" for one in RecordingFile(path)), service)
+            wait_for(lambda: count(path, "tracks"), service)
         process.send_signal(signal.SIGTERM)  # it ends with the answer
         process.communicate(timeout=DEADLINE_S)
     assert {one.topic for one in RecordingFile(path)} == {"tracks"}
