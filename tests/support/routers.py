@@ -35,9 +35,10 @@ def free_endpoint() -> str:
     raise AssertionError("no port is free")
 
 
-def open_router(endpoint: str, *others: str) -> zenoh.Session:
+def open_router(endpoint: str, *others: str, adminspace: bool = False) -> zenoh.Session:
     """A router that listens at `endpoint`, linked to others; close it (it is a context manager)."""
-    return _open({"mode": "router", "listen/endpoints": [endpoint], "connect/endpoints": list(others)})
+    values: dict[str, object] = {"mode": "router", "listen/endpoints": [endpoint], "connect/endpoints": list(others)}
+    return _open(values | {"adminspace/enabled": adminspace})
 
 
 def open_client(endpoint: str) -> zenoh.Session:

@@ -15,6 +15,7 @@ import os
 import re
 from typing import TYPE_CHECKING, Final, Protocol, cast
 
+import optipmb_schemas as schemas
 import zenoh
 
 from optipmb_service.runtime.ports import TransportError
@@ -126,6 +127,11 @@ def _configuration(settings: Settings) -> zenoh.Config:
     else:
         values["transport/link/tx/queue/congestion_control/block/wait_before_close"] = WAIT_BEFORE_CLOSE_US
     config = _base(settings.zenoh_config)
+    # One interest in the subscribers of all tracks, and one in those of heartbeats, in place of two for each stream:
+    # a router compares every subscription with all interests.
+    tracks = schemas.Keys(settings.prefix).all("tracks")
+    aggregated = json.loads(config.get_json("aggregation/publishers"))
+    values["aggregation/publishers"] = [*aggregated, tracks, f"{tracks}/@adv/**"]
     for key, value in values.items():
         try:
             config.insert_json5(key, json.dumps(value))

@@ -1,0 +1,90 @@
+"""The Zenoh session of a service: what its configuration makes of publishers and subscribers."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from optipmb_schemas import Keys, Tracks
+from optipmb_service.settings import load
+from optipmb_service.zenoh.connection import opened
+from optipmb_service.zenoh.handles import Publisher, cached_publisher
+from optipmb_service.zenoh.subscription import Subscription
+from router import until
+from routers import free_endpoint, open_client, open_router
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    import zenoh
+
+KEYS = Keys()
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    """Where a router listens that tells of what is declared at it."""
+    endpoint = free_endpoint()
+    with open_router(endpoint, adminspace=True):
+        yield endpoint
+
+
+def connected(endpoint: str, file: Path | None = None) -> zenoh.Session:
+    """The session of a member."""
+    given = {"connect": [endpoint], "instance": "member", "store": "none"}
+    return opened(load(None, given | ({} if file is None else {"zenoh_config": str(file)})).settings)
+
+
+def claimed(member: zenoh.Session, stream: str) -> Publisher:
+    """The publisher of a stream's tracks."""
+    return Publisher(cached_publisher(member, KEYS.tracks(stream), Tracks, 8, detected=False))
+
+
+def interests(asker: zenoh.Session) -> set[str]:
+    """The keys in whose subscribers publishers are interested, as the router tells; of heartbeats it tells nothing."""
+    found = [reply.ok for reply in asker.get("@/*/router/publisher/**")]
+    return {str(one.key_expr).partition("/publisher/")[2] for one in found if one is not None}
+
+
+def test_a_router_knows_one_interest_however_many_streams_there_are(endpoint: str, tmp_path: Path) -> None:
+    """It compares each subscription with every interest, so these must not grow with the streams' number.
+
+    What a file of Zenoh aggregates more stays aggregated.
+    """
+    file = tmp_path / "zenoh.json5"
+    file.write_text(json.dumps({"aggregation": {"publishers": ["others/**"]}}))
+    with connected(endpoint, file) as member, open_client(endpoint) as asker:
+        claims = [claimed(member, f"site/node/lidar{number}") for number in range(5)]
+        others = [member.declare_publisher(f"others/{number}") for number in range(2)]
+        until(lambda: interests(asker) == {KEYS.all("tracks"), "others/**"}, "the interests")
+        assert len(claims) + len(others) == 5 + 2
+
+
+def test_tracks_come_whichever_publisher_was_declared_first(endpoint: str) -> None:
+    """The interest is that of all publishers: it ends with the last one, and begins again with the next.
+
+    Who subscribes late gets what the cache holds, too.
+    """
+    with connected(endpoint) as member, open_client(endpoint) as viewer:
+        claims = [claimed(member, f"site/node/lidar{number}") for number in range(3)]
+
+        def heard(number: int, payload: bytes) -> None:
+            """A new subscriber of a stream gets a message, sent before it came, and one that is sent after."""
+            got: list[bytes] = []
+            claims[number].publish(payload)
+            key = KEYS.tracks(f"site/node/lidar{number}")
+            subscription = Subscription(viewer, key, lambda sample: got.append(sample.payload.to_bytes()))
+            until(lambda: payload in got, "a message of the cache")
+            claims[number].publish(payload + b" and on")
+            until(lambda: payload + b" and on" in got, "a message")
+            subscription.close()
+
+        heard(0, b"of the first")
+        claims[0].release()
+        heard(1, b"of the second")
+        claims[1].release()
+        claims[2].release()
+        claims[1] = claimed(member, "site/node/lidar1")
+        heard(1, b"of the first again")
