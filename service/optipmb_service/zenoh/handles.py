@@ -71,7 +71,7 @@ class Channel(Generic[_T]):
     @property
     def handler(self) -> tuple[Any, None]:
         """What Zenoh is to be given."""
-        return directly(self._put)
+        return directly(self.put)
 
     def __iter__(self) -> Iterator[_T]:
         """Yield what comes until the end."""
@@ -86,9 +86,14 @@ class Channel(Generic[_T]):
         self._closed = True
         self._waiting.put(None)
 
-    def _put(self, item: _T) -> None:
+    def put(self, item: _T) -> None:
+        """Put something last; waits for room."""
         while self._waiting.qsize() >= self._most and not self._closed:
             time.sleep(FULL_S)
+        self._waiting.put(item)
+
+    def put_at_once(self, item: _T) -> None:
+        """Put something last, whether there is room or not: the reader itself must not wait for room."""
         self._waiting.put(item)
 
 

@@ -9,9 +9,7 @@ is what a new subscription asks Zenoh for. What caches hold from before is asked
 
 from __future__ import annotations
 
-import queue
 import threading
-import time
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -23,7 +21,7 @@ from optipmb_schemas.late_join import LateJoin
 from optipmb_service.runtime.intake import ALL
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import line
-from optipmb_service.zenoh.handles import FULL_S, directly, undeclare
+from optipmb_service.zenoh.handles import Channel, directly, undeclare
 from optipmb_service.zenoh.subscription import ask_cache
 
 if TYPE_CHECKING:
@@ -65,9 +63,7 @@ class Topic:
         self._name = name
         self._session = session
         self._receive = receive
-        self._most = most
-        # To put into this queue and to wake its reader takes half of what `queue.Queue` takes. It has no bound.
-        self._waiting: queue.SimpleQueue[zenoh.Sample | Callable[[], object] | None] = queue.SimpleQueue()
+        self._waiting: Channel[zenoh.Sample | Callable[[], object]] = Channel(most)
         self._subscribers: dict[str, tuple[str, Undeclared]] = {}
         self._late_join: LateJoin[zenoh.Sample] = LateJoin(
             self._hand_over, lambda *asked: ask_cache(session, *asked), answered
@@ -90,7 +86,7 @@ class Topic:
         Raises:
             TransportError: the session is closed.
         """
-        put = self._put  # all that is done on the thread of the network
+        put = self._waiting.put  # all that is done on the thread of the network
         try:
             if passing is None and cached:
                 subscriber: Undeclared = zenoh.ext.declare_advanced_subscriber(
@@ -113,29 +109,24 @@ class Topic:
             undeclare(subscriber)
         if left and ALL not in self._subscribers:
             kept = frozenset(key for key, _ in self._subscribers.values())
-            self._waiting.put(partial(self._late_join.keep, kept))  # after what waits, which would be known again
+            # After what waits, which would be known again.
+            self._waiting.put_at_once(partial(self._late_join.keep, kept))
 
     def pass_through(self, then: Callable[[], object]) -> None:
         """Call `then`, on the thread, when all that has come until now is handed over."""
-        self._waiting.put(then)
+        self._waiting.put_at_once(then)
 
     def close(self, timeout: float) -> None:
         """End it; what came before is handed over within `timeout` seconds, and nothing afterwards."""
         for _, subscriber in self._subscribers.values():
             undeclare(subscriber)
         self._subscribers.clear()
-        if self._thread.is_alive():
-            self._waiting.put(None)
-            self._thread.join(timeout)
+        self._waiting.close()
+        self._thread.join(timeout)
         self._late_join.close()
 
-    def _put(self, item: zenoh.Sample | Callable[[], object]) -> None:
-        while self._waiting.qsize() >= self._most and self._thread.is_alive():
-            time.sleep(FULL_S)
-        self._waiting.put(item)
-
     def _drain(self) -> None:
-        while (item := self._waiting.get()) is not None:
+        for item in self._waiting:
             if not isinstance(item, zenoh.Sample):
                 self._guarded(item)
             elif item.kind == zenoh.SampleKind.PUT:
