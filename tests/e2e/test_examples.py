@@ -1,5 +1,6 @@
 """The examples run as they stand, and the README shows them as they are."""
 
+import itertools
 import re
 import subprocess
 import sys
@@ -40,13 +41,16 @@ def test_publisher_and_subscriber(service: ServiceProcess, tmp_path: Path, *, nu
 
     Both need no numpy.
     """
+    stream = f"garage/robot-{1 if numpy else 2}/lidar"
     lines: list[str] = []
-    listening = threading.Event()
+    listening, seen = threading.Event(), threading.Event()
 
     def read(output: IO[str]) -> None:
         for line in output:
             lines.append(line)
             listening.set()
+            if line.startswith(stream):
+                seen.set()
 
     with (
         Publisher("garage/test/probe", service.endpoint, frame="world") as probe,
@@ -57,15 +61,23 @@ def test_publisher_and_subscriber(service: ServiceProcess, tmp_path: Path, *, nu
         assert subscriber.stdout is not None
         reader = threading.Thread(target=read, args=(subscriber.stdout,))
         reader.start()
+        numbers = itertools.count()
         box = {"label": ["car"], "center": [[0, 0, 1]], "size": [[4, 2, 1.5]], "yaw": [0], "score": [0.9]}
-        for number in range(600):  # a car of another stream, until the subscriber is seen to listen
-            probe.publish(stamp_ns=number * 100_000_000, **box)
-            if listening.wait(0.1):
-                break
-        subprocess.run(example("publisher.py", service, tmp_path, numpy=numpy), check=True, timeout=200)
+
+        def drive_until(event: threading.Event) -> None:
+            """Publish a car of another stream, so that the subscriber goes on listening."""
+            for _ in range(600):
+                probe.publish(stamp_ns=next(numbers) * 100_000_000, **box)
+                if event.wait(0.1):
+                    return
+
+        drive_until(listening)
+        with subprocess.Popen(example("publisher.py", service, tmp_path, numpy=numpy)) as publisher:
+            drive_until(seen)
+            assert publisher.wait(200) == 0
         reader.join(60.0)
         assert subscriber.wait(120) == 0
-    rows = [line.split() for line in lines if line.startswith(f"garage/robot-{1 if numpy else 2}/lidar ")]
+    rows = [line.split() for line in lines if line.startswith(f"{stream} ")]
     assert len(rows) >= 45
     assert {(row[2], row[3]) for row in rows} == {(rows[0][2], "car")}
     x = [float(row[5]) for row in rows]

@@ -115,6 +115,8 @@ def recorded_replay(service: ServiceProcess, folder: Path, dataset: "Dataset", *
                 on_frame=hold,
             )
         assert not any(one.missing or one.clouds_missed for one in replayed)
+        # The recording hears of the newest tracks after the replay.
+        wait_for(lambda: count(path, "tracks") >= sum(one.frames for one in replayed), service)
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=DEADLINE_S)
         assert process.returncode == 0, err
@@ -130,6 +132,8 @@ def play_into_another(path: Path, folder: Path, capsys: pytest.CaptureFixture[st
             result = result_of(
                 run_here(capsys, "play", path, "--as-recorded", "--connect", fresh.endpoint, "--json"),
             )
+            returned = sum(stream["returned"] for stream in result["streams"])
+            wait_for(lambda: count(folder / "again.mcap", "tracks") >= returned, fresh)
             process.send_signal(signal.SIGINT)
             process.communicate(timeout=DEADLINE_S)
     names = {stream["name"] for stream in result["streams"]}
