@@ -156,7 +156,7 @@ class _Task:
         except ClientError:
             return  # the service has gone; its messages are recorded all the same
         if answer.session != session:
-            return
+            return  # of no session, or of a later one: these tracks were made with others
         key = self._keys.query(stream, "parameters")
         self._writer.add(key, encode(answer), encoding_of(answer), time.monotonic_ns() + self._offset_ns)
         self._count(key)

@@ -74,7 +74,7 @@ class SecuredClient(Client):
 
     async def _connect_to_server(self, s: Srv) -> None:
         if self._transport is not None:
-            self._transport.close()  # type: ignore[no-untyped-call]  # it has no types
+            self._transport.close()  # type: ignore[no-untyped-call]  # NATS' client annotates no `close`
         await super()._connect_to_server(s)
 
     def _connect_command(self) -> bytes:
