@@ -163,10 +163,13 @@ def measured(objects: int, points: int) -> dict[str, float]:
     warm_up()
     parts = Parts()
     network: Any = Network()  # in the place of several parts
+    decoding: Any = stream_actor
+    with contextlib.suppress(ModuleNotFoundError):  # an earlier checkout decodes in the actor
+        decoding = import_module("optipmb_service.runtime.stream_tracking")
     for part, owner, name in (
         ("handing over", Registry, "frame"),
         ("handing over", Registry, "cloud"),
-        ("decoding", stream_actor, "message_of"),
+        ("decoding", decoding, "message_of"),
         ("session", Session, "on_detections"),
         ("session", Session, "on_points"),
         ("conversion", convert, "frame_of"),

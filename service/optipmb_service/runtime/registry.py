@@ -309,11 +309,7 @@ class Registry:
             session = actor.session  # the worker may end it at any moment
             if actor.fused and session is not None and session.awaits_caches and actor.mailbox.idle:
                 self.command(actor.stream, StreamActor.on_caches_answered, urgent=False)  # or a publisher may be gone
-            for stream, meter in tuple(actor.sensors.items()):
-                age_s = meter.age_s(now_ns)
-                if age_s is not None and age_s > self._settings.stale_s and stream not in actor.stale:
-                    actor.stale.add(stream)
-                    log.warning("stream_stale", stream=stream, age_s=round(age_s, 3))
+            actor.sensors.look_for_silent(now_ns, self._settings.stale_s)
             if now_ns - actor.meter.active_ns > self._settings.idle_s * SECOND and actor.mailbox.idle:
                 self.command(actor.stream, self._close_idle, urgent=False)
         for stream, owners in self._rivals.contested(now_ns):

@@ -7,8 +7,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import optipmb_service.runtime.awaited_caches
 import optipmb_service.runtime.directory
-import optipmb_service.runtime.stream_actor
 import pytest
 from fusing import FRONT, FUSED, REAR, drive
 from optipmb_schemas import Keys, SessionParameters, SessionState, Tracks, decode
@@ -127,7 +127,7 @@ def test_a_sensor_that_is_heard_of_after_the_session_began_loses_no_frame(
 ) -> None:
     """While its token may be on its way, what a cache holds of another sensor goes no second ahead of its frames."""
     monkeypatch.setattr(optipmb_service.runtime.directory, "BACK_NS", 0)
-    monkeypatch.setattr(optipmb_service.runtime.stream_actor, "BACK_NS", 600 * SECOND)
+    monkeypatch.setattr(optipmb_service.runtime.awaited_caches, "BACK_NS", 600 * SECOND)
     frames = drive(40)
     service, endpoint = start(fuse=["site/node/*"], recovery_wait_s=60)
     with Node(endpoint) as node:
@@ -144,7 +144,7 @@ def test_a_sensor_that_is_heard_of_after_the_session_began_loses_no_frame(
         until(lambda: heard_of(REAR.stream) and reached(1), "the rear sensor is heard of")
         node.send(*(one for one in frames if one.stream == FRONT.stream))
         until(lambda: heard_of(FRONT.stream, REAR.stream), "the front sensor is heard of")
-        monkeypatch.setattr(optipmb_service.runtime.stream_actor, "BACK_NS", 0)
+        monkeypatch.setattr(optipmb_service.runtime.awaited_caches, "BACK_NS", 0)
         until(lambda: reached(80), "all are tracked")
         state = node.ask(KEYS.query(FUSED, "state"), SessionState)
     assert (state.digest, state.late, state.gaps) == (undisturbed_digest(frames), 0, 0)
