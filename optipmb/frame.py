@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -119,7 +119,7 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Frame:
-    """Detections of one stamp in the world frame; made by `make_frame`, which checks them.
+    """Detections of one stamp in the world frame; made by `make_frame`, which checks and copies them.
 
     Attributes:
         stamp_ns: sensor time, nanoseconds.
@@ -136,7 +136,7 @@ class Frame:
         position_covariance: (M, 3) R_xx, R_xy and R_yy of each position, m^2; NaN, or None: those of the class.
         pose: world from sensor; None: the sensor stands at the origin of the world.
 
-    The arrays are copied and cannot be written to, so that what was checked stays as it was.
+    The arrays cannot be written to, so that what was checked stays as it was.
 
     Raises:
         FrameError: wrong shapes, types or values.
@@ -174,8 +174,7 @@ class Frame:
         given = indices["label"], len(self.labels), center, size, yaw, score, velocity
         if not allowed(*given):
             _refuse(*given)
-        for name, array in (arrays | indices).items():  # after the check: read-only arrays would compile it once more
-            object.__setattr__(self, name, _sealed(array))
+        self.__dict__.update(arrays | indices)
 
 
 _COLUMNS: Final[tuple[tuple[str, tuple[int, ...]], ...]] = (
@@ -238,12 +237,39 @@ def make_frame(
     m = which.shape[0]
     center, size = _shaped("center", center, (m, 3)), _shaped("size", size, (m, 3))
     yaw, score = _shaped("yaw", yaw, (m,)), _shaped("score", score, (m,))
-    velocity = np.full((m, 2), np.nan) if velocity is None else _shaped("velocity", velocity, (m, 2))
-    scored = score.copy()
-    scored[score == 0.0] = 1.0  # those are left out, whatever they are
-    if not allowed(which, len(labels), center, size, yaw, scored, velocity):
-        _refuse(which, len(labels), center, size, yaw, scored, velocity)
+    velocity = _unknown(m) if velocity is None else _shaped("velocity", velocity, (m, 2))
+    scored = _sealed(np.where(score == 0.0, 1.0, score))  # those are left out, whatever they are
+    given = which, len(labels), center, size, yaw, scored, velocity
+    if not allowed(*given):
+        _refuse(*given)
+    spread = position_covariance
+    spread = None if spread is None else _shaped("position_covariance", spread, (m, 3, 3))
+    columns = which, center, size, yaw, score, velocity
+    return frame_of_checked(parameters, int(stamp_ns), tuple(labels), columns, pose, cloud, field_of_view, spread)
 
+
+def frame_of_checked(
+    parameters: Parameters,
+    stamp_ns: int,
+    labels: tuple[str, ...],
+    columns: tuple[Any, ...],
+    pose: Pose | None,
+    cloud: PointCloud | None,
+    field_of_view: FieldOfView | None,
+    position_covariance: NDArray[np.float64] | None,
+) -> tuple[Frame, int]:
+    """Make a frame as `make_frame` does of what its caller has checked: only covariances are checked here.
+
+    Every value is one that `make_frame` allows, and every array has the type, the shape and the order of one in a
+    frame. They are not copied but become read-only, so nobody may change them. `columns` are label, center, size, yaw,
+    score and velocity, the last of which may be None.
+
+    Raises:
+        FrameError: a covariance is none, or an object is too far in the world frame.
+    """
+    label, center, size, yaw, score, velocity = columns
+    m = label.shape[0]
+    velocity = _unknown(m) if velocity is None else velocity
     rotation = None
     if pose is not None and not pose.is_identity:
         rotation = pose.rotation
@@ -254,51 +280,35 @@ def make_frame(
         yaw = np.arctan2(heading[:, 1], heading[:, 0])
         velocity = velocity @ rotation[:2, :2].T
 
-    spread = None
-    if position_covariance is not None:
-        spread = horizontal_covariance(_shaped("position_covariance", position_covariance, (m, 3, 3)), rotation)
+    spread = None if position_covariance is None else horizontal_covariance(position_covariance, rotation)
 
-    known = class_indices(tuple(labels), parameters.labels)[which] if m else which
-    calibrate_scores(parameters, known, score)
+    names = parameters.labels
+    known = class_indices(labels, names)[label]
+    score = calibrate_scores(parameters, known, score)
     source = ((known >= 0) & (score > 0.0)).nonzero()[0]
     if source.shape[0] < m:
         center, size, yaw, velocity = center[source], size[source], yaw[source], velocity[source]
         score, known = score[source], known[source]
         spread = None if spread is None else spread[source]
     columns = center, size, yaw, velocity, score, known, source
-    view = field_of_view
-    if view is not None and view.pose is None and pose is not None:
-        view = replace(view, pose=pose)
-    sensor = pose if pose is not None or view is None else view.pose
-    rest = parameters.labels, cloud, view, spread, sensor
-    if pose is not None and not allowed(known, len(parameters.labels), center, size, yaw, score, velocity):
+    if field_of_view is not None and field_of_view.pose is None and pose is not None:
+        field_of_view = replace(field_of_view, pose=pose)
+    sensor = pose if pose is not None or field_of_view is None else field_of_view.pose
+    rest = names, cloud, field_of_view, spread, sensor
+    for column in columns if spread is None else (*columns, spread):
+        column.flags.writeable = False
+    if rotation is not None and not allowed(known, len(names), center, size, yaw, score, velocity):
         # What is too far only in the world: the constructor names it.
-        return Frame(int(stamp_ns), *columns, *rest), m - source.shape[0]
-    return _checked(int(stamp_ns), columns, *rest), m - source.shape[0]
-
-
-def _checked(
-    stamp_ns: int,
-    columns: tuple[NDArray[Any], ...],
-    labels: tuple[str, ...],
-    cloud: PointCloud | None,
-    view: FieldOfView | None,
-    position_covariance: NDArray[np.float64] | None,
-    pose: Pose | None,
-) -> Frame:
-    """Return the frame of arrays that nobody else has and that were checked, from `center` to `source`."""
+        return Frame(stamp_ns, *columns, *rest), m - source.shape[0]
     frame = object.__new__(Frame)
-    values = frame.__dict__
-    values["stamp_ns"] = stamp_ns
-    for name, column in zip(_ARRAYS, columns, strict=True):
-        values[name] = _sealed(np.ascontiguousarray(column))
-    values["labels"] = labels
-    values["cloud"], values["field_of_view"], values["pose"] = cloud, view, pose
-    values["position_covariance"] = None if position_covariance is None else _sealed(position_covariance)
-    return frame
+    frame.__dict__.update(zip(Frame.__dataclass_fields__, (stamp_ns, *columns, *rest), strict=True))
+    return frame, m - source.shape[0]
 
 
-_ARRAYS: Final = ("center", "size", "yaw", "velocity", "score", "label", "source")
+@lru_cache(64)
+def _unknown(count: int) -> NDArray[np.float64]:
+    """Return the velocities of so many objects whose detector gives none."""
+    return _sealed(np.full((count, 2), np.nan))
 
 
 @kernel
@@ -361,10 +371,11 @@ def _integers(path: str, values: ArrayLike) -> NDArray[np.int64]:
     array = _array(path, values, None)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         raise FrameError(path, "(M,) integers", f"{array.shape} {array.dtype}")
-    return array.astype(np.int64)
+    return _sealed(array.astype(np.int64))
 
 
 def _sealed(array: NDArray[Any]) -> NDArray[Any]:
+    """Make an array read-only: those of a frame are, and there is one type of them for the kernels."""
     array.flags.writeable = False
     return array
 
@@ -375,8 +386,8 @@ def _bounded(path: str, values: NDArray[np.float64], bound: float) -> None:
 
 def _array(path: str, values: ArrayLike, dtype: type[np.float64] | None) -> NDArray[Any]:
     try:
-        # A copy in one piece: a frame is its own, and there is one type for the kernels wherever the arrays come from.
-        return np.array(values, dtype=dtype, order="C")
+        # A copy in one piece: a frame is its own, wherever the arrays come from.
+        return _sealed(np.array(values, dtype=dtype, order="C"))
     except (TypeError, ValueError) as error:
         raise FrameError(path, "an array of numbers", repr(values)[:80]) from error
 

@@ -27,15 +27,17 @@ def calibrated(curve: ScoreCalibration, score: NDArray[np.float64]) -> NDArray[n
     return np.minimum(np.interp(score, given, meant), 1.0)  # rounding may not pass one
 
 
-def calibrate_scores(parameters: Parameters, label: NDArray[np.int64], score: NDArray[np.float64]) -> None:
-    """Overwrite the scores of the classes that have a curve.
+def calibrate_scores(
+    parameters: Parameters, label: NDArray[np.int64], score: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return scores, those of the classes that have a curve gone through it.
 
     Args:
         parameters: the profile.
         label: (M,) index into its classes; -1 for a class that it lacks.
-        score: (M,) in [0, 1].
+        score: (M,) in [0, 1]; the same array comes back where no class has a curve.
     """
     for index, table in enumerate(parameters.classes.values()):
         if table.score_calibration is not None:
-            rows = label == index
-            score[rows] = calibrated(table.score_calibration, score[rows])
+            score = np.where(label == index, calibrated(table.score_calibration, score), score)
+    return score

@@ -6,6 +6,8 @@ kilometres can grow past every bound, and whoever gives tracks away should know 
 
 from __future__ import annotations
 
+from functools import lru_cache
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -36,7 +38,6 @@ MAX_AGE: Final = 1e12
 
 _SHAPES: Final[tuple[tuple[str, tuple[int, ...]], ...]] = (
     ("id", ()),
-    ("label", ()),
     ("center", (3,)),
     ("size", (3,)),
     ("yaw", ()),
@@ -49,9 +50,13 @@ _SHAPES: Final[tuple[tuple[str, tuple[int, ...]], ...]] = (
     ("covariance", (STATE, STATE)),
     ("age", ()),
     ("time_since_detection", ()),
+    ("label", ()),
     ("detection", ()),
     ("confirmed", ()),
 )
+_UNBOUNDED: Final = 3
+"""How many of them, the last ones, may hold any number."""
+_columns: Final = attrgetter(*(name for name, _ in _SHAPES))
 _BOUNDS: Final[tuple[tuple[str, float, float], ...]] = (
     ("center", -MAX_PLACE, MAX_PLACE),
     ("size", 5e-324, MAX_VALUE),
@@ -74,34 +79,24 @@ def sound(tracks: Tracks) -> bool:
     Existence, score and heading confidence lie in [0, 1], sizes are positive, ages are not negative, coordinates are at
     most `MAX_PLACE`, covariances `MAX_COVARIANCE`, ages `MAX_AGE`, all others `MAX_VALUE`.
     """
-    count = tracks.id.shape[0]
-    if any(getattr(tracks, name).shape != (count, *shape) for name, shape in _SHAPES):
+    columns = _columns(tracks)
+    if [column.shape for column in columns] != _shapes(len(tracks.id)):
         return False
-    return bool(
-        all_within(
-            tracks.id,
-            tracks.center,
-            tracks.size,
-            tracks.yaw,
-            tracks.heading_confidence,
-            tracks.velocity,
-            tracks.yaw_rate,
-            tracks.acceleration,
-            tracks.existence,
-            tracks.score,
-            tracks.covariance,
-            tracks.age,
-            tracks.time_since_detection,
-        )
-    )
+    return bool(all_within(*columns[:-_UNBOUNDED]))
+
+
+@lru_cache(256)
+def _shapes(count: int) -> list[tuple[int, ...]]:
+    """Return the shapes of the columns of so many tracks."""
+    return [(count, *shape) for _, shape in _SHAPES]
 
 
 def unsound(tracks: Tracks) -> tuple[str, str, str]:
     """Return what is wrong with tracks that are not `sound`: path of the first value, expected, received."""
     count = tracks.id.shape[0]
-    for name, shape in _SHAPES:
-        if getattr(tracks, name).shape != (count, *shape):
-            return f"tracks.{name}", f"shape {(count, *shape)}", f"shape {getattr(tracks, name).shape}"
+    for (name, _), shape in zip(_SHAPES, _shapes(count), strict=True):
+        if getattr(tracks, name).shape != shape:
+            return f"tracks.{name}", f"shape {shape}", f"shape {getattr(tracks, name).shape}"
     for name, low, high in _BOUNDS:
         values = getattr(tracks, name)
         for place in np.argwhere(~((low <= values) & (values <= high)))[:1]:

@@ -5,7 +5,7 @@ from typing import Annotated, Any, ClassVar, Final, Self, Union, get_args, get_o
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from optipmb_schemas.arrays import ARRAY, Array, numeric
+from optipmb_schemas.arrays import ARRAY, Array
 from optipmb_schemas.errors import MessageError, invalid, path_of, shape_text, show
 
 
@@ -58,11 +58,8 @@ class Message(BaseModel):
         """Return the message of values that are known to be valid, without checking them again.
 
         For what a program has made itself out of values that were checked. Every value has the type that the field
-        holds, arrays their dtype and order; all fields are given that have no default.
+        holds, arrays their dtype and order, and are read-only; all fields are given that have no default.
         """
-        for name, value in fields.items():
-            if type(value) is ARRAY:
-                fields[name] = numeric.read_only(value)
         return cls.of_valid(cls.optional | fields, set(fields))
 
     def with_trusted(self, /, **fields: Any) -> Self:

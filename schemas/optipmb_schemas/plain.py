@@ -142,11 +142,6 @@ def bytes_of(numbers: Numbers, large: int) -> bytes | memoryview:
     return numbers.flat.cast("B") if numbers.flat.nbytes >= large else numbers.tobytes()
 
 
-def read_only(numbers: Numbers) -> Numbers:
-    """Return an array, which is read-only."""
-    return numbers
-
-
 def canonical(numbers: Numbers, description: "Array") -> Numbers:
     """Return an array, whose shape was checked, as a field holds it.
 

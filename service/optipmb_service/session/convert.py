@@ -8,12 +8,14 @@ be viewed.
 from __future__ import annotations
 
 from dataclasses import fields
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
+from optipmb.frame import frame_of_checked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,6 +26,8 @@ IDENTITY = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0.0, 
 """The pose of arrays that are in the world frame already."""
 
 _COLUMNS: Final = tuple(column.name for column in fields(optipmb.Tracks))
+_columns: Final = attrgetter(*_COLUMNS)
+_boxes: Final = attrgetter("label", "center", "size", "yaw", "score", "velocity")
 
 
 def pose_of(message: schemas.Detections | schemas.Points) -> optipmb.Pose | None:
@@ -64,23 +68,15 @@ def cloud_of(message: schemas.Points) -> optipmb.PointCloud:
 def frame_of(parameters: optipmb.Parameters, message: schemas.Detections) -> tuple[optipmb.Frame, int]:
     """Return the frame without its cloud, and how many objects were left out because the profile lacks their class.
 
+    The message was checked when it was made, within bounds that no frame has narrower: arrays are shared, not looked at
+    once more.
+
     Raises:
-        optipmb.FrameError: wrong shapes or values; `path` names the field and the element.
+        optipmb.FrameError: a pose or covariance is none, or an object is too far in the world frame; `path` names it.
     """
-    return optipmb.make_frame(
-        parameters,
-        stamp_ns=message.stamp_ns,
-        labels=message.labels,
-        label=message.label,
-        center=message.center,
-        size=message.size,
-        yaw=message.yaw,
-        score=message.score,
-        velocity=message.velocity,
-        pose=pose_of(message),
-        field_of_view=view_of(message),
-        position_covariance=message.position_covariance,
-    )
+    columns, pose, view = _boxes(message), pose_of(message), view_of(message)
+    spread = message.position_covariance
+    return frame_of_checked(parameters, message.stamp_ns, message.labels, columns, pose, None, view, spread)
 
 
 def unknown_labels(parameters: optipmb.Parameters, message: schemas.Detections) -> dict[str, int]:
@@ -138,10 +134,14 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
         schemas.MessageError: the tracks hold numbers that no message may.
     """
     make = schemas.Tracks.trusted if optipmb.sound(tracks) else schemas.Tracks
-    for name in _COLUMNS:
-        getattr(tracks, name).setflags(write=False)  # they are the message's now, which so needs no views of them
-    class_fields = {} if class_probability is None else schemas.class_fields(class_probability)
-    path_fields = {} if paths is None else schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
+    columns = dict(zip(_COLUMNS, _columns(tracks), strict=True))
+    columns["confirmed"] = columns["confirmed"].astype(np.int64)
+    for column in columns.values():
+        column.flags.writeable = False  # they are the message's now, which so needs no views of them
+    if class_probability is not None:
+        columns |= schemas.class_fields(class_probability)
+    if paths is not None:
+        columns |= schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
     return make(
         stream=stream,
         sensor=frame_id.sensor or None,
@@ -155,23 +155,6 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
         gap=gap,
         ignored=ignored,
         labels=parameters.labels,
-        id=tracks.id,
-        label=tracks.label,
-        center=tracks.center,
-        size=tracks.size,
-        yaw=tracks.yaw,
-        heading_confidence=tracks.heading_confidence,
-        velocity=tracks.velocity,
-        yaw_rate=tracks.yaw_rate,
-        acceleration=tracks.acceleration,
-        existence=tracks.existence,
-        score=tracks.score,
-        covariance=tracks.covariance,
-        age=tracks.age,
-        time_since_detection=tracks.time_since_detection,
-        detection=tracks.detection,
-        confirmed=tracks.confirmed.astype(np.int64),
-        **class_fields,
-        **path_fields,
         delivery=None,
+        **columns,
     )
