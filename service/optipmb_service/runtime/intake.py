@@ -115,8 +115,8 @@ class Inputs(Protocol):
     def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
         """Call `then` soon with what the caches of a stream hold, all frames, and with whether all have answered."""
 
-    def pass_through(self, then: Callable[[], None]) -> None:
-        """Call `then` when all that has come until now is handed over."""
+    def pass_through(self, timeout: float) -> None:
+        """Wait until what has come is handed over, for a moment at most (s)."""
 
 
 class Intake:
@@ -233,9 +233,7 @@ class Intake:
     def _drain(self, sessions: list[str]) -> None:
         """Wait for what is on its way through this process, for a moment at most."""
         ends = time.monotonic() + DRAIN_S
-        passed = threading.Event()
-        self._inputs.pass_through(passed.set)
-        passed.wait(DRAIN_S)
+        self._inputs.pass_through(DRAIN_S)
         while any(self._registry.waits(session) for session in sessions) and time.monotonic() < ends:
             time.sleep(DRAIN_POLL_S)
 

@@ -92,10 +92,6 @@ class Channel(Generic[_T]):
             time.sleep(FULL_S)
         self._waiting.put(item)
 
-    def put_at_once(self, item: _T) -> None:
-        """Put something last, whether there is room or not: the reader itself must not wait for room."""
-        self._waiting.put(item)
-
 
 def directly(take: Callable[[Any], None]) -> tuple[Any, None]:
     """Have what comes handed over on the thread of the network.

@@ -1,7 +1,8 @@
-"""What a member receives: subscriptions that come and go, of single streams or of all, and one thread for each topic.
+"""What a member receives: subscriptions that come and go, of single streams or of all, by topic.
 
-A subscription is told by its topic and its key. However many there are, the samples of a topic pass through one queue
-to one thread, which hands them over in their order. When the subscription of a stream takes over from that of all
+A subscription is told by its topic and its key. However many there are, the samples of a topic are handed over one
+after the other, in their order, on the thread of the network that brings them: a queue and a thread in between would
+cost each message two more changes of the thread. When the subscription of a stream takes over from that of all
 streams, or the other way round, nothing is missing in between, and what comes twice is the newest message at most: that
 is what a new subscription asks Zenoh for. What caches hold from before is asked for once for each publisher
 (`late_join`), and again after the stream was not subscribed to.
@@ -21,7 +22,7 @@ from optipmb_schemas.late_join import LateJoin
 from optipmb_service.runtime.intake import ALL
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import line
-from optipmb_service.zenoh.handles import Channel, directly, undeclare
+from optipmb_service.zenoh.handles import directly, undeclare
 from optipmb_service.zenoh.subscription import ask_cache
 
 if TYPE_CHECKING:
@@ -47,8 +48,7 @@ class Topic:
     Args:
         name: of the topic, for the log.
         session: to subscribe on.
-        receive: called for each sample, one after the other.
-        most: samples that may wait for the thread; Zenoh waits beyond that.
+        receive: called for each sample, one after the other; the thread of the network is not to be kept waiting.
         answered: told the key of a publisher when all has been handed over that its cache held.
     """
 
@@ -57,19 +57,17 @@ class Topic:
         name: str,
         session: zenoh.Session,
         receive: Callable[[zenoh.Sample], None],
-        most: int,
         answered: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._name = name
         self._session = session
         self._receive = receive
-        self._waiting: Channel[zenoh.Sample | Callable[[], object]] = Channel(most)
+        self._turn = threading.Lock()
+        self._closed = False
         self._subscribers: dict[str, tuple[str, Undeclared]] = {}
         self._late_join: LateJoin[zenoh.Sample] = LateJoin(
             self._hand_over, lambda *asked: ask_cache(session, *asked), answered
         )
-        self._thread = threading.Thread(target=self._drain, name=f"reader-{name}", daemon=True)
-        self._thread.start()
 
     def subscribe(
         self, name: str, key: str, passing: Callable[[zenoh.Sample], None] | None = None, *, cached: bool = True
@@ -79,22 +77,21 @@ class Topic:
         Args:
             name: of the subscription; `ALL` for that of all streams.
             key: the key expression.
-            passing: called for each sample, on the thread, instead of the topic's function; nothing is recovered then.
+            passing: called for each sample instead of the topic's function; nothing is recovered then.
             cached: whether what was lost is recovered from caches. To declare that takes Zenoh several times as long,
                 and longer the more is declared already.
 
         Raises:
             TransportError: the session is closed.
         """
-        put = self._waiting.put  # all that is done on the thread of the network
+        handler = directly(partial(self._take, self._late_join.take if passing is None else passing))
         try:
             if passing is None and cached:
                 subscriber: Undeclared = zenoh.ext.declare_advanced_subscriber(
-                    self._session, key, directly(put), history=NEWEST, recovery=RECOVERY
+                    self._session, key, handler, history=NEWEST, recovery=RECOVERY
                 )
             else:
-                passed = directly(put if passing is None else lambda sample: put(partial(passing, sample)))
-                subscriber = self._session.declare_subscriber(key, passed)
+                subscriber = self._session.declare_subscriber(key, handler)
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
         self._subscribers[name] = key, subscriber
@@ -109,34 +106,34 @@ class Topic:
             undeclare(subscriber)
         if left and ALL not in self._subscribers:
             kept = frozenset(key for key, _ in self._subscribers.values())
-            # After what waits, which would be known again.
-            self._waiting.put_at_once(partial(self._late_join.keep, kept))
+            with self._turn:  # what is being handed over would be known again
+                self._late_join.keep(kept)
 
-    def pass_through(self, then: Callable[[], object]) -> None:
-        """Call `then`, on the thread, when all that has come until now is handed over."""
-        self._waiting.put_at_once(then)
+    def pass_through(self, timeout: float) -> None:
+        """Wait until what is being handed over is, at most so long (s)."""
+        if self._turn.acquire(timeout=timeout):
+            self._turn.release()
 
-    def close(self, timeout: float) -> None:
-        """End it; what came before is handed over within `timeout` seconds, and nothing afterwards."""
+    def close(self) -> None:
+        """End it; nothing is handed over afterwards."""
         for _, subscriber in self._subscribers.values():
             undeclare(subscriber)
         self._subscribers.clear()
-        self._waiting.close()
-        self._thread.join(timeout)
+        with self._turn:
+            self._closed = True
         self._late_join.close()
 
-    def _drain(self) -> None:
-        for item in self._waiting:
-            if not isinstance(item, zenoh.Sample):
-                self._guarded(item)
-            elif item.kind == zenoh.SampleKind.PUT:
-                self._guarded(partial(self._late_join.take, item))
+    def _take(self, handle: Callable[[zenoh.Sample], None], sample: zenoh.Sample) -> None:
+        """Take a sample on the thread of the network; of several links there are several threads."""
+        with self._turn:
+            if sample.kind == zenoh.SampleKind.PUT and not self._closed:
+                self._guarded(handle, sample)
 
     def _hand_over(self, sample: zenoh.Sample) -> None:
-        self._guarded(partial(self._receive, sample))
+        self._guarded(self._receive, sample)
 
-    def _guarded(self, work: Callable[[], object]) -> None:
+    def _guarded(self, handle: Callable[[zenoh.Sample], None], sample: zenoh.Sample) -> None:
         try:
-            work()
+            handle(sample)
         except Exception:
-            log.exception("internal_error", reader=self._name)  # one message must not end the reading
+            log.exception("internal_error", topic=self._name)  # one message must not end the subscription

@@ -88,7 +88,7 @@ class Transport:
         passed_by: Callable[[str, int], None],
         answered: Callable[[str], None],
     ) -> None:
-        """Hand over the detections and point clouds that are subscribed to, each on a thread of its own.
+        """Hand over the detections and point clouds that are subscribed to, on threads of the network.
 
         Args:
             on_frame: takes detections.
@@ -113,8 +113,8 @@ class Transport:
 
         self._discover = discover
         self._topics = {
-            "detections": Topic("detections", self._session, detected, CHANNEL, answered),
-            "points": Topic("points", self._session, lambda one: self._receive(one, on_cloud), CHANNEL // 16),
+            "detections": Topic("detections", self._session, detected, answered),
+            "points": Topic("points", self._session, lambda one: self._receive(one, on_cloud)),
         }
 
     def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
@@ -149,10 +149,10 @@ class Transport:
     def _key(self, topic: schemas.Topic, stream: str) -> str:
         return self._keys.matching(stream, topic) if stream else self._keys.all(topic)
 
-    def pass_through(self, then: Callable[[], None]) -> None:
-        """Call `then` when all that has come until now is handed over."""
-        detections, points = self._topics.values()
-        detections.pass_through(lambda: points.pass_through(then))
+    def pass_through(self, timeout: float) -> None:
+        """Wait until what is being handed over is, at most so long (s) for each topic."""
+        for topic in self._topics.values():
+            topic.pass_through(timeout)
 
     def watch_streams(
         self, published: Callable[[str, str, bool], None], discovered: Callable[[str, str, bool], None]
@@ -362,7 +362,7 @@ class Transport:
         """Receive nothing any more; what was received before is handed over within `timeout` seconds."""
         self.leave()
         for topic in self._topics.values():
-            topic.close(timeout)
+            topic.close()
         self._readers.stop(timeout)
 
     def close(self) -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_service.zenoh.inputs
 import pytest
@@ -35,7 +34,7 @@ class Network:
         self.publisher = cached_publisher(session, KEY, Detections, 100)
         self.received = Collected()
         self.answered: list[str] = []
-        self.topic = Topic("detections", session, self._receive, 100, self.answered.append)
+        self.topic = Topic("detections", session, self._receive, self.answered.append)
 
     def _receive(self, sample: zenoh.Sample) -> None:
         self.received.add(str(sample.key_expr), sample.payload.to_bytes(), "")
@@ -58,7 +57,7 @@ def network() -> Iterator[Network]:
         one = Network(session)
         one.publish(b"0", b"1")
         yield one
-        one.topic.close(CLOSE_S)
+        one.topic.close()
 
 
 def test_no_cache_is_asked_again_where_all_streams_take_over_from_one(network: Network) -> None:
@@ -86,17 +85,32 @@ def test_a_stream_that_comes_again_lacks_nothing(network: Network, name: str, ke
     network.counts(b"3", b"4", b"5")
 
 
-def test_messages_that_wait_when_their_stream_is_left_do_not_hide_what_follows(network: Network) -> None:
-    """Messages that are handed over after a stream was left keep nobody from asking its cache when it comes again."""
+def test_messages_on_their_way_when_their_stream_is_left_do_not_hide_what_follows(
+    network: Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A message that is being handed over while its stream is left keeps nobody from asking its cache later."""
     network.topic.subscribe(STREAM, KEY)
     network.publish(b"2")
     network.counts(b"0", b"1", b"2")
-    go_on = threading.Event()
-    network.topic.pass_through(partial(go_on.wait, CLOSE_S))
-    network.publish(b"3", b"4")
-    network.topic.leave([STREAM])
+    arrived, go_on, receive = threading.Event(), threading.Event(), network.received.add
+
+    def slowly(*arguments: Any) -> None:
+        arrived.set()
+        go_on.wait(CLOSE_S)
+        receive(*arguments)
+
+    monkeypatch.setattr(network.received, "add", slowly)
+    publishing = threading.Thread(target=network.publish, args=(b"3",))
+    publishing.start()
+    arrived.wait(CLOSE_S)
+    leaving = threading.Thread(target=network.topic.leave, args=([STREAM],))
+    leaving.start()
+    network.topic.pass_through(0.01)  # as long as it may, for the message waits
     go_on.set()
-    network.counts(b"3", b"4")
+    network.topic.pass_through(CLOSE_S)
+    assert b"3" in {payload for _, payload, _ in network.received.items}
+    publishing.join(CLOSE_S)
+    leaving.join(CLOSE_S)
     network.publish(b"5", b"6")
     network.topic.subscribe(STREAM, KEY)
     network.publish(b"7")
@@ -116,26 +130,30 @@ def test_an_error_while_a_cache_is_asked_ends_nothing(network: Network, monkeypa
     network.counts(b"other")
 
 
-def test_zenoh_waits_while_too_many_messages_wait(network: Network) -> None:
-    """While as many messages wait as may, the thread that brings the next one waits; then all come in their order."""
-    may_go_on, received = threading.Event(), Collected()
+def test_messages_of_several_threads_are_handed_over_one_at_a_time(network: Network) -> None:
+    """Links bring messages on threads of their own; of a topic no two are handed over at the same time."""
+    at_work, together, received = threading.Lock(), [], Collected()
 
     def receive(sample: zenoh.Sample) -> None:
-        may_go_on.wait(CLOSE_S)
+        together.append(not at_work.acquire(blocking=False))
+        threading.Event().wait(0.001)  # others have the processor meanwhile
+        at_work.release()
         received.add(str(sample.key_expr), sample.payload.to_bytes(), "")
 
-    sent = [bytes((number,)) for number in range(20)]
-    topic = Topic("points", network.session, receive, 2)
-    publishing = threading.Thread(target=lambda: [network.session.put(KEYS.points(STREAM), one) for one in sent])
-    try:
-        topic.subscribe(ALL, KEYS.all("points"), cached=False)
-        publishing.start()
-        publishing.join(0.5)
-        assert publishing.is_alive()
-        may_go_on.set()
-        received.wait(lambda items: len(items) == len(sent), "all messages")
-        assert [payload for _, payload, _ in received.items] == sent
-    finally:
-        may_go_on.set()
-        publishing.join(CLOSE_S)  # a session is not closed while another thread is in it
-        topic.close(CLOSE_S)
+    topic = Topic("points", network.session, receive)
+    topic.subscribe(ALL, KEYS.all("points"), cached=False)
+    sent = [[bytes((sender, number)) for number in range(20)] for sender in range(4)]
+    senders = [
+        threading.Thread(target=lambda own=own: [network.session.put(KEYS.points(STREAM), one) for one in own])
+        for own in sent
+    ]
+    for sender in senders:
+        sender.start()
+    for sender in senders:
+        sender.join(CLOSE_S)
+    received.wait(lambda items: len(items) == sum(map(len, sent)), "all messages")
+    topic.close()
+    network.session.put(KEYS.points(STREAM), b"afterwards")
+    assert not any(together)
+    for own in sent:  # each in its order, and nothing after the end
+        assert [payload for _, payload, _ in received.items if payload[0] == own[0][0]] == own
