@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from optipmb.compiled import kernel
+from optipmb.compiled import kernel, long_kernel
 from optipmb.errors import FrameError
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def points_in_boxes(cloud: PointCloud, center: Array, size: Array, yaw: Array) -
     return counts
 
 
-@kernel
+@long_kernel
 def count_points(
     xyz: NDArray[np.float32], center: Array, half: Array, yaw: Array, rotation: Array, counts: NDArray[np.int64]
 ) -> None:
