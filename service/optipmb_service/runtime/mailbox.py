@@ -8,7 +8,8 @@ shed and counted. Where several streams feed the session, none takes the room of
 from __future__ import annotations
 
 import threading
-from collections import Counter, deque
+from collections import deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from optipmb_service.runtime.byte_budget import ByteBudget
@@ -21,6 +22,15 @@ if TYPE_CHECKING:
 
 
 UNLIMITED: Final = 2**62
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """What waits of a stream."""
+
+    frames: int = 0
+    clouds: int = 0
+    bytes: int = 0
 
 
 class Mailbox:
@@ -36,16 +46,14 @@ class Mailbox:
     def __init__(self, frames: int, clouds: int, most_bytes: int = UNLIMITED, budget: ByteBudget | None = None) -> None:
         self._most_bytes = most_bytes
         self._budget = budget or ByteBudget(UNLIMITED)
-        self._bytes: Counter[str] = Counter()
+        self._of: dict[str, _Waiting] = {}
         self._lock = threading.Lock()
         self._urgent: deque[Command] = deque()
         self._clouds: deque[Packet] = deque()
         self._frames: deque[Packet | Command] = deque()
         self._most_frames = frames
         self._most_clouds = clouds
-        self._frames_of: Counter[str] = Counter()
-        self._clouds_of: Counter[str] = Counter()
-        self._shed_of: Counter[str] = Counter()
+        self._shed_of: dict[str, int] = {}
         self._scheduled = False
         self._rung = False
         self._closed = False
@@ -60,18 +68,19 @@ class Mailbox:
     @property
     def waiting(self) -> int:
         """Frames that wait."""
-        return self._frames_of.total()
+        with self._lock:
+            return self._waiting_frames()
 
     def shed_since(self) -> dict[str, int]:
         """Return the frames shed since this was asked last, by `Packet.origin`."""
         with self._lock:
-            shed, self._shed_of = self._shed_of, Counter()
+            shed, self._shed_of = self._shed_of, {}
         return shed
 
     def counts(self) -> tuple[int, int, int]:
         """Return the frames shed so far, those that wait, and the clouds shed so far, of one moment."""
         with self._lock:
-            return self.shed_frames, self.waiting, self.shed_clouds
+            return self.shed_frames, self._waiting_frames(), self.shed_clouds
 
     def offer_frame(self, packet: Packet) -> bool | None:
         """Put a frame last; True: a worker must be sent, None: closed."""
@@ -79,11 +88,12 @@ class Mailbox:
             if self._closed:
                 return None
             origin = packet.origin
-            if self._frames_of[origin] >= self._most_frames:
+            waiting = self._of.get(origin) or _Waiting()
+            if waiting.frames >= self._most_frames:
                 self._shed_frame(origin)
-            if self._fits(packet, origin):
+            if self._fits(packet, origin, waiting):
                 self._frames.append(packet)
-                self._frames_of[origin] += 1
+                waiting.frames += 1
             else:
                 self._count_shed(origin)
             return self._schedule()
@@ -94,11 +104,12 @@ class Mailbox:
             if self._closed:
                 return None
             origin = packet.origin
-            if self._clouds_of[origin] >= self._most_clouds:
+            waiting = self._of.get(origin) or _Waiting()
+            if waiting.clouds >= self._most_clouds:
                 self._shed_cloud(origin)
-            if self._fits(packet, origin):
+            if self._fits(packet, origin, waiting):
                 self._clouds.append(packet)
-                self._clouds_of[origin] += 1
+                waiting.clouds += 1
             else:
                 self.shed_clouds += 1
             return self._schedule()
@@ -131,13 +142,13 @@ class Mailbox:
             if urgent:
                 return None
             if self._clouds:
-                return "cloud", self._taken(self._clouds.popleft(), self._clouds_of)
+                return "cloud", self._taken(self._clouds.popleft(), clouds=1)
             if not self._frames:
                 return None
             item = self._frames.popleft()
             if not isinstance(item, Packet):
                 return "command", item
-            return "frame", self._taken(item, self._frames_of)
+            return "frame", self._taken(item, frames=1)
 
     @property
     def clouds_waiting(self) -> int:
@@ -161,24 +172,29 @@ class Mailbox:
         first, self._scheduled = not self._scheduled, True
         return first
 
-    def _fits(self, packet: Packet, origin: str) -> bool:
+    def _waiting_frames(self) -> int:
+        return sum(one.frames for one in self._of.values())
+
+    def _fits(self, packet: Packet, origin: str, waiting: _Waiting) -> bool:
         """Make room for a message, by what its stream sent before; False when there is none even so."""
-        while self._bytes[origin] + packet.held > self._most_bytes or not self._budget.take(packet.held):
+        held = packet.held
+        while waiting.bytes + held > self._most_bytes or not self._budget.take(held):
             if not (self._shed_cloud(origin) or self._shed_frame(origin)):
                 return False
-        self._bytes[origin] += packet.held
+        waiting.bytes += held
+        self._of[origin] = waiting
         return True
 
-    def _taken(self, packet: Packet, counts: Counter[str]) -> Packet:
+    def _taken(self, packet: Packet, *, frames: int = 0, clouds: int = 0) -> Packet:
         """Count a message that leaves; what counts nothing is forgotten, for names of streams are anybody's choice."""
-        origin = packet.origin
-        self._budget.add(-packet.held)
-        counts[origin] -= 1
-        self._bytes[origin] -= packet.held
-        if not counts[origin]:
-            del counts[origin]
-            if not self._bytes[origin]:
-                del self._bytes[origin]
+        origin, held = packet.origin, packet.held
+        waiting = self._of[origin]
+        self._budget.add(-held)
+        waiting.frames -= frames
+        waiting.clouds -= clouds
+        waiting.bytes -= held
+        if not (waiting.frames or waiting.clouds):
+            del self._of[origin]
         return packet
 
     def _shed_cloud(self, origin: str) -> bool:
@@ -186,7 +202,7 @@ class Mailbox:
         for index, packet in enumerate(self._clouds):
             if packet.origin == origin:
                 del self._clouds[index]
-                self._taken(packet, self._clouds_of)
+                self._taken(packet, clouds=1)
                 self.shed_clouds += 1
                 return True
         return False
@@ -196,11 +212,11 @@ class Mailbox:
         for index, item in enumerate(self._frames):
             if isinstance(item, Packet) and item.origin == origin:
                 del self._frames[index]
-                self._taken(item, self._frames_of)
+                self._taken(item, frames=1)
                 self._count_shed(origin)
                 return True
         return False
 
     def _count_shed(self, origin: str) -> None:
         self.shed_frames += 1
-        self._shed_of[origin] += 1
+        self._shed_of[origin] = self._shed_of.get(origin, 0) + 1

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
+
+from optipmb.records import record
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -15,7 +16,7 @@ PACKET_BYTES: Final = 512
 """What a message takes beside its payload, nearly."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Packet:
     """A message as it arrived, not decoded.
 
