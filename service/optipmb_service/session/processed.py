@@ -7,8 +7,10 @@ has changed.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import optipmb
 from optipmb_service.session.checkpoint import Recorded
 from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.reorder_window import ReorderWindow
@@ -112,10 +114,23 @@ class ProcessedFrames:
         self._history = ReorderWindow(state, self.transition.step)
         self.timeline = self.timeline.settle(state.cursors, state.last, frozenset(self.timeline.frame_ids))
 
+    def begin_anew(self) -> None:
+        """Forget the density: another life of it begins, whose track ids go on."""
+        starts = self.head.starts + 1
+        self.begin(self.head.begun_anew(self._no_objects(), self.transition.name(self.head.last, starts), starts))
+
+    def empty(self) -> None:
+        """Begin the same life with no objects: what was begun with another profile has its classes."""
+        session = self.transition.name(None, self.head.starts)
+        self.begin(replace(self.head, session=session, density=self._no_objects()))
+
     def report_by(self, transition: Transition) -> None:
         """Go on by a transition that tracks as the one before and reports more or less of the tracks."""
         self.transition = transition
         self._history.step = transition.step
+
+    def _no_objects(self) -> optipmb.Density:
+        return optipmb.Density.empty(self.transition.parameters.labels, self.head.density.next_id)
 
     def portable(self) -> tuple[FilterState, tuple[Recorded, ...]]:
         """Return the beginning and the frames of as much of the window as a checkpoint takes along."""

@@ -228,7 +228,7 @@ def test_a_sensor_that_is_silent_makes_room_for_another() -> None:
                 decode_checkpoint(encode_checkpoint(one.snapshot())), 0, Policy(recovery_wait_ns=0), tracker=chained
             )
             one.recovered(0)
-    for kept in (one._pending, one._processed.head.sensors, one._processed.timeline.seen):
+    for kept in (one.sensors, one._processed.head.sensors, one._processed.timeline.seen):
         assert len(kept) == MAX_SENSORS
         assert names[-1] in kept
         assert FRONT.stream in kept

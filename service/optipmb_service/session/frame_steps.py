@@ -1,0 +1,126 @@
+"""What happens when a frame's turn has come: it is put in its place, and the tracker steps.
+
+When a step raises, nothing has changed but that the sensor of the frame is quarantined: the frame and what is held of
+the sensor go, unprocessed, and its frames are refused until a reset or a new start of its publisher. What raised is
+saved, so that it can be seen again.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from optipmb_service.session.dump import dump_of
+from optipmb_service.session.values import MAX_ERROR, Quarantined
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import optipmb_schemas as schemas
+
+    from optipmb_service.session.fused_timeline import FusedTimeline
+    from optipmb_service.session.pending import Ready
+    from optipmb_service.session.processed import ProcessedFrames
+    from optipmb_service.session.recovery import Recovery
+    from optipmb_service.session.reporting import SessionReporting
+    from optipmb_service.session.sensor_queues import SensorQueues
+    from optipmb_service.session.state import Entry
+    from optipmb_service.session.timeline import FrameId, Timeline
+    from optipmb_service.session.values import Output
+
+
+class FrameSteps:
+    """Takes frames through the tracker of a session.
+
+    Args:
+        processed: what the session has gone through.
+        sensors: what is held.
+        recovery: what of it is held for caches.
+        reporting: says what became of frames.
+        run: see `Session.run`.
+        clock: measures how long a step takes, ns.
+    """
+
+    def __init__(
+        self,
+        processed: ProcessedFrames,
+        sensors: SensorQueues,
+        recovery: Recovery,
+        reporting: SessionReporting,
+        run: int,
+        clock: Callable[[], int],
+    ) -> None:
+        self._processed = processed
+        self._sensors = sensors
+        self._recovery = recovery
+        self._reporting = reporting
+        self._clock = clock
+        self.run = run
+        """See `Session.run`."""
+
+    def advance(self, now_ns: int | None) -> list[Output]:
+        """Process the frames that are ready, in order.
+
+        Args:
+            now_ns: monotonic time; None: all of them are.
+        """
+        if now_ns is not None:
+            self._recovery.now_ns = now_ns
+            if (until_ns := self._sensors.recovery_ns) is not None and now_ns >= until_ns:
+                self._recovery.end()
+        outputs: list[Output] = []
+        while ready := self._sensors.take(now_ns, self._recovery.complete_until):
+            outputs += self._process(ready)
+        return outputs
+
+    def amend(self, message: schemas.Points, frame_id: FrameId, ticket: Any) -> list[Output]:
+        """Put a cloud that came after its frame into the window."""
+        began_ns, placed = self._clock(), self._processed.amended(message, frame_id)
+        if placed is None:
+            return []
+        return self._go(placed, self._processed.timeline, frame_id, ticket, began_ns, behind=False)
+
+    def _process(self, ready: Ready) -> list[Output]:
+        """Put a frame in its place."""
+        began_ns, frame_id = self._clock(), ready.held.frame_id
+        judged_by, decision, timeline = ready.held.judged
+        if judged_by is not self._processed.timeline:  # others were held when it came
+            decision, timeline = self._processed.timeline.judge(frame_id)
+        if not decision.verdict.admitted:
+            self._processed.timeline = timeline
+            return self._reporting.refused(frame_id, decision)
+        placed = self._processed.placed(ready, decision, timeline)
+        return self._go(placed, timeline, frame_id, ready.held.ticket, began_ns, behind=decision.last)
+
+    def _go(
+        self,
+        placed: list[Entry],
+        timeline: Timeline | FusedTimeline,
+        frame_id: FrameId,
+        ticket: Any,
+        began_ns: int,
+        *,
+        behind: bool,
+    ) -> list[Output]:
+        """Go through frames with what is new among them; when a step raises, the sensor is quarantined."""
+        processed = self._processed
+        before = processed.head.session
+        try:
+            outcomes = processed.go(placed, behind=behind)
+        except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
+            return self._fail(error, placed, frame_id)
+        gone = processed.settle(timeline)
+        self._sensors.follow(gone)
+        self._reporting.deliveries.inserted += not behind
+        begun = self._reporting.begun(outcomes, before, processed.head.session)
+        took_ns = self._clock() - began_ns
+        parameters = processed.transition.parameters
+        return [*begun, *self._reporting.tracked(outcomes, parameters, ticket, took_ns, self.run)]
+
+    def _fail(self, error: Exception, placed: list[Entry], frame_id: FrameId) -> list[Output]:
+        """Take no more frames of the sensor; the one that failed and what is held go, unprocessed."""
+        reason = self._sensors.quarantine[frame_id.sensor] = f"{type(error).__name__}: {error}"[:MAX_ERROR]
+        self._reporting.deliveries.refused += 1 + self._sensors.pending[frame_id.sensor].clear()
+        self._processed.note(frame_id)
+        self._sensors.follow()
+        dump = dump_of(self._processed.transition, self._processed.base, placed, error)
+        return [self._reporting.complain.failed(frame_id, reason), Quarantined(reason, dump)]
