@@ -15,6 +15,7 @@ import msgpack
 from optipmb_schemas.arrays import Array, Numeric, numeric
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import Limits
+from optipmb_schemas.model import Message
 
 DTYPES: Final = {name: int(name[1]) for name in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")}
 """Number types that a block may have, and their bytes. Numpy's spelling (`<f8`, `|u1`) is understood as well."""
@@ -79,32 +80,28 @@ def _read_block(block: dict[str, Any], description: Array, limits: Limits) -> Nu
 
 def block_of(array: Numeric, dtype: str) -> dict[str, Any]:
     """Return the block of an array of a number type."""
-    return {"dtype": dtype, "shape": array.shape, "data": numeric.bytes_of(array, LARGE)}
+    return {"dtype": dtype, "shape": array.shape, "data": numeric.bytes_of(array)}
 
 
-def head_of(name: str, dtype: str, shape: tuple[int, ...]) -> bytes:
-    """Return all before the data of a small array that is a field of a message, and nothing for others.
-
-    The data are its bytes in memory, so where numbers are stored otherwise than on the wire there is no small array.
-    """
-    size = prod(shape) * DTYPES[dtype]
-    if size >= LARGE or not numeric.LITTLE:
-        return b""
-    field: bytes = _msgpack.packb({name: {"dtype": dtype, "shape": shape, "data": bytes(size)}})
-    return field[1 : len(field) - size]
-
-
-def pack_large(name: str, array: Numeric, dtype: str, offset: int) -> tuple[bytes, bytes | memoryview]:
-    """Return a field with a large array that is to lie at `offset`, in two parts: all before the data, and the data.
-
-    The data are aligned, and a view, not a copy, if they can be.
-    """
-    before, after = _large_head(name, dtype, array.shape)
+def large_head(name: str, dtype: str, shape: tuple[int, ...], offset: int) -> bytes:
+    """Return all before the data of a large array, a field of a message that lies at `offset`: so they are aligned."""
+    before, after = _large_head(name, dtype, shape)
     padding = -(offset + len(before) + 2 + len(after)) % ALIGNMENT
-    return before + b"\xc4" + bytes((padding, *bytes(padding))) + after, numeric.bytes_of(array, LARGE)
+    return before + b"\xc4" + bytes((padding, *bytes(padding))) + after
 
 
 # Messages have the same few shapes over and over.
+
+
+@lru_cache(4096)
+def small_head(kind: type[Message], name: str, shape: tuple[int, ...]) -> tuple[bytes, int]:
+    """Return all before the data of an array, a field of a message, and their bytes; the former only of a small one."""
+    dtype = kind.arrays[name].dtype
+    size = prod(shape) * DTYPES[dtype]
+    if size >= LARGE:
+        return b"", size
+    field: bytes = _msgpack.packb({name: {"dtype": dtype, "shape": shape, "data": bytes(size)}})
+    return field[1 : len(field) - size], size
 
 
 @lru_cache(1024)

@@ -11,8 +11,8 @@ from typing import Any, Final, TypeVar, cast
 
 import msgpack
 
-from optipmb_schemas.arrays import ARRAY
-from optipmb_schemas.blocks import block_of, head_of, pack_large, read_array
+from optipmb_schemas.arrays import ARRAY, numeric
+from optipmb_schemas.blocks import block_of, large_head, read_array, small_head
 from optipmb_schemas.control import (
     DrainRequest,
     MoveRequest,
@@ -79,32 +79,34 @@ def encoding_of(message: Message | type[Message], *, form: str = "msgpack") -> s
     return f"application/{form};optipmb.{kind.__name__}.v{MAJOR}"
 
 
-def encode(message: Message) -> bytes:
-    """Return the message as msgpack, arrays as blocks. Fields that are None are left out."""
-    kind, fields = type(message), message.present()
-    pack = _msgpack.Packer().pack
-    parts: list[bytes | memoryview] = [_msgpack.Packer().pack_map_header(len(fields))]
-    plain: dict[str, Any] = {}
+def encode(message: Message, **others: Any) -> bytes:
+    """Return the message as msgpack, arrays as blocks. Fields that are None are left out.
+
+    Args:
+        message: what is encoded.
+        others: values that are known to be valid, in place of those of the message.
+    """
+    kind, values = type(message), message.__dict__ | others if others else message.__dict__
+    fields = [(name, value) for name in kind.names if (value := values[name]) is not None]
+    packer = _msgpack.Packer()
+    parts: list[Any] = [packer.pack_map_header(len(fields))]
+    offset, plain = len(parts[0]), {}
     for name, value in fields:
         if type(value) is not ARRAY:
             plain[name] = value if type(value) in _SCALARS else _plain(value, blocks=True)
             continue
         if plain:
-            parts.append(_without_head(pack(plain), len(plain)))
+            parts.append(_without_head(packer.pack(plain), len(plain)))
+            offset += len(parts[-1])
             plain = {}
-        if head := _head(kind, name, value.shape):
-            parts += (head, value.tobytes())
-        else:
-            parts += pack_large(name, value, kind.arrays[name].dtype, sum(map(len, parts)))
+        head, size = small_head(kind, name, value.shape)
+        if not head:
+            head = large_head(name, kind.arrays[name].dtype, value.shape, offset)
+        parts += head, value
+        offset += len(head) + size
     if plain:
-        parts.append(_without_head(pack(plain), len(plain)))
-    return b"".join(parts)
-
-
-@lru_cache(4096)
-def _head(kind: type[Message], name: str, shape: tuple[int, ...]) -> bytes:
-    """Return what stands before the data of an array, which has the number type of its field; see `head_of`."""
-    return head_of(name, kind.arrays[name].dtype, shape)
+        parts.append(_without_head(packer.pack(plain), len(plain)))
+    return numeric.joined(parts)
 
 
 def _without_head(packed: bytes, count: int) -> bytes:

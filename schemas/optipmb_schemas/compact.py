@@ -220,7 +220,7 @@ def checked(
     fields["label"] = index = np.frombuffer(data(fields["label"], "i8", [count]), np.int64)
     _need(int(index.view(np.uint64).max()) < len(labels))  # a negative one is larger than any
     _read_columns(fields, count, data)
-    return Detections.trusted(**fields)
+    return Detections.trusted(fields)
 
 
 def checked_part(kind: type[T], data: Callable[[str, int], bytes]) -> T:
@@ -236,7 +236,7 @@ def checked_part(kind: type[T], data: Callable[[str, int], bytes]) -> T:
         arrays[name] = np.frombuffer(numbers, np.float64)
     if kind is Pose:
         unit_quaternion(arrays["quaternion"])
-    part = kind.trusted(**arrays)
+    part = kind.trusted(arrays)
     part.check()
     return part
 

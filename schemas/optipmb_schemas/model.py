@@ -54,7 +54,7 @@ class Message(BaseModel):
         cls.columns = tuple((name, axis, letter) for name, one in cls.arrays.items() for axis, letter in one.letters)
 
     @classmethod
-    def trusted(cls, /, **fields: Any) -> Self:
+    def trusted(cls, fields: dict[str, Any]) -> Self:
         """Return the message of values that are known to be valid, without checking them again.
 
         For what a program has made itself out of values that were checked. Every value has the type that the field
@@ -62,17 +62,13 @@ class Message(BaseModel):
         """
         return cls.of_valid(cls.optional | fields, set(fields))
 
-    def with_trusted(self, /, **fields: Any) -> Self:
-        """Return the message with other values in some fields, which are known to be valid."""
-        return self.of_valid(self.__dict__ | fields, self.model_fields_set | fields.keys())
-
     @classmethod
     def of_valid(cls, values: dict[str, Any], given: set[str]) -> Self:
         """Return the message of the values of all fields, read-only arrays among them, of which `given` were given.
 
         It does what pydantic's `model_construct` does, without looking at every field of the description.
         """
-        message = cls.__new__(cls)
+        message = object.__new__(cls)
         set_attribute = object.__setattr__
         set_attribute(message, "__dict__", values)
         set_attribute(message, "__pydantic_fields_set__", given)

@@ -23,7 +23,7 @@ WHOLE: Final = (int, np.integer)
 REAL: Final = (int, float, np.integer, np.floating)
 """Types of the numbers in lists."""
 
-LITTLE: Final = sys.byteorder == "little"
+_LITTLE: Final = sys.byteorder == "little"
 
 _DTYPES: Final = {name: np.dtype("<" + name) for name in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")}
 
@@ -50,11 +50,14 @@ def of_bytes(data: bytes | memoryview, dtype: str, shape: list[int]) -> NDArray[
     return np.frombuffer(data, _DTYPES[dtype]).reshape(shape) if data else np.empty(shape, _DTYPES[dtype])
 
 
-def bytes_of(array: NDArray[Any], large: int) -> bytes | memoryview:
-    """Return the bytes of an array, little-endian, row by row: a view of those that are `large`."""
-    if not (LITTLE and array.dtype.isnative and array.flags.c_contiguous):
-        array = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-    return array.data.cast("B") if array.nbytes >= large else array.tobytes()
+def bytes_of(array: NDArray[Any]) -> bytes:
+    """Return the bytes of an array as a field holds it, little-endian, row by row."""
+    return (array if _LITTLE else array.byteswap()).tobytes()
+
+
+def joined(parts: list[Any]) -> bytes:
+    """Return bytes and those of arrays, one behind the other."""
+    return b"".join(parts if _LITTLE else [one if type(one) is bytes else bytes_of(one) for one in parts])
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 WHOLE: Final = (int,)
 REAL: Final = (int, float)
 
-LITTLE: Final = True
-
 if sys.byteorder != "little":
     raise ImportError("on a big-endian machine the messages need numpy: pip install 'optipmb-node[arrays]'")
 
@@ -137,9 +135,14 @@ def of_bytes(data: bytes | memoryview, dtype: str, shape: list[int]) -> Numbers:
     return Numbers(_flat(data, _CODES[dtype]), tuple(shape))
 
 
-def bytes_of(numbers: Numbers, large: int) -> bytes | memoryview:
-    """Return the bytes of an array, little-endian, row by row: a view of those that are `large`."""
-    return numbers.flat.cast("B") if numbers.flat.nbytes >= large else numbers.tobytes()
+def bytes_of(numbers: Numbers) -> bytes:
+    """Return the bytes of an array, little-endian, row by row."""
+    return numbers.tobytes()
+
+
+def joined(parts: list[Any]) -> bytes:
+    """Return bytes and those of arrays, one behind the other."""
+    return b"".join([one if type(one) is bytes else one.tobytes() for one in parts])
 
 
 def canonical(numbers: Numbers, description: "Array") -> Numbers:

@@ -186,7 +186,7 @@ def test_tracks_of_any_number_are_transcoded(rows: int, example_of: Any) -> None
         for name, array in tracks.arrays.items()
         if array.rows == "N"
     }
-    many = tracks.with_trusted(**columns)
+    many = tracks.model_copy(update=columns)
     transcoded = transcode(encode(many), encoding=encoding_of(Tracks))
     assert transcoded.message() == convert.to_proto(many)
     known = (many.stream, many.epoch, many.seq, many.stamp_ns, many.revision, many.delivery.run)

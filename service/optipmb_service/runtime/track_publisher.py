@@ -96,23 +96,18 @@ class TrackPublisher:
         passed_ns = time.monotonic_ns() - ticket.now_ns
         waited_ns = max(0, passed_ns - ticket.decode_ns - tracked.step_ns)
         delivery = schemas.Delivery.trusted(
-            instance=self._instance,
-            received_ns=ticket.wall_ns,
-            published_ns=time.time_ns(),
-            queue_ms=waited_ns / MILLISECOND,
-            decode_ms=ticket.decode_ns / MILLISECOND,
-            step_ms=tracked.step_ns / MILLISECOND,
-            run=tracked.run,
+            {
+                "instance": self._instance,
+                "received_ns": ticket.wall_ns,
+                "published_ns": time.time_ns(),
+                "queue_ms": waited_ns / MILLISECOND,
+                "decode_ms": ticket.decode_ns / MILLISECOND,
+                "step_ms": tracked.step_ns / MILLISECOND,
+                "run": tracked.run,
+            }
         )
         self._count_tracks(tracked.tracks.id.tobytes())
-        self._waiting.append(
-            (
-                schemas.encode(tracked.tracks.with_trusted(delivery=delivery)),
-                ticket,
-                waited_ns,
-                tracked.step_ns,
-            )
-        )
+        self._waiting.append((schemas.encode(tracked.tracks, delivery=delivery), ticket, waited_ns, tracked.step_ns))
         self.flush()
 
     def flush(self) -> None:

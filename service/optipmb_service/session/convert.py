@@ -8,8 +8,8 @@ be viewed.
 from __future__ import annotations
 
 from dataclasses import fields
-from operator import attrgetter
-from typing import TYPE_CHECKING, Final
+from operator import attrgetter, methodcaller
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -26,6 +26,7 @@ IDENTITY = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0.0, 
 """The pose of arrays that are in the world frame already."""
 
 _COLUMNS: Final = tuple(column.name for column in fields(optipmb.Tracks))
+_seal: Final = methodcaller("setflags", False)
 _columns: Final = attrgetter(*_COLUMNS)
 _boxes: Final = attrgetter("label", "center", "size", "yaw", "score", "velocity")
 
@@ -133,28 +134,28 @@ def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
     Raises:
         schemas.MessageError: the tracks hold numbers that no message may.
     """
-    make = schemas.Tracks.trusted if optipmb.sound(tracks) else schemas.Tracks
-    columns = dict(zip(_COLUMNS, _columns(tracks), strict=True))
+    sound = optipmb.sound(tracks)
+    columns: dict[str, Any] = dict(zip(_COLUMNS, _columns(tracks), strict=True))
     columns["confirmed"] = columns["confirmed"].astype(np.int64)
     for column in columns.values():
-        column.flags.writeable = False  # they are the message's now, which so needs no views of them
+        _seal(column)  # they are the message's now, which so needs no views of them
     if class_probability is not None:
         columns |= schemas.class_fields(class_probability)
     if paths is not None:
         columns |= schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
-    return make(
-        stream=stream,
-        sensor=frame_id.sensor or None,
-        epoch=frame_id.epoch,
-        seq=frame_id.seq,
-        stamp_ns=frame_id.stamp_ns,
-        session=session,
-        revision=revision,
-        profile=parameters.name,
-        cloud_used=cloud_used,
-        gap=gap,
-        ignored=ignored,
-        labels=parameters.labels,
-        delivery=None,
-        **columns,
-    )
+    columns |= {
+        "stream": stream,
+        "sensor": frame_id.sensor or None,
+        "epoch": frame_id.epoch,
+        "seq": frame_id.seq,
+        "stamp_ns": frame_id.stamp_ns,
+        "session": session,
+        "revision": revision,
+        "profile": parameters.name,
+        "cloud_used": cloud_used,
+        "gap": gap,
+        "ignored": ignored,
+        "labels": parameters.labels,
+        "delivery": None,
+    }
+    return schemas.Tracks.trusted(columns) if sound else schemas.Tracks(**columns)
