@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import optipmb
 from optipmb.effort import UNLIMITED
 from optipmb.geometry import intersection_area
+from optipmb.points import CELLS, NOWHERE, SIDE, boxes_in_sensor, boxes_of_cells, cells_of_points
 from optipmb.preprocess import non_maximum_suppression
 
 Array = NDArray[np.float64]
@@ -190,6 +191,31 @@ def test_points_that_are_not_finite_are_in_no_box() -> None:
     rows = [[np.nan, 0, 0], [0, np.nan, 0], [0, 0, np.nan], [np.inf, 0, 0], [0, -np.inf, 0], [0, 0, np.inf], [0, 0, 0]]
     cloud = optipmb.PointCloud(np.array(rows, np.float32), pose)
     assert optipmb.points_in_boxes(cloud, np.zeros((1, 3)), np.ones((1, 3)), np.zeros(1))[0] == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_points_at_the_faces_of_boxes_fall_into_their_cells(seed: int) -> None:
+    """The cell of each point is that of plain numpy, and one of the box on whose face it lies, to the last bit."""
+    rng = np.random.default_rng(seed)
+    center, half = rng.normal(0, 10.0 ** rng.uniform(-1, 3), (50, 3)), 10.0 ** rng.uniform(-3, 1, (50, 3))
+    _, low, high = boxes_in_sensor(center, half, np.zeros(50), np.eye(3))
+    grid = [(np.float32(low[:, s].min()), np.float32(CELLS / np.ptp(np.r_[low[:, s], high[:, s]]))) for s in range(2)]
+    heights = np.float32(low[:, 2].min()), np.float32(high[:, 2].max())
+    boxes, start, occupied = boxes_of_cells(low, high, *grid)
+    signs = rng.integers(-1, 2, (50, 3))
+    points = np.concatenate([(center + signs * half).astype(np.float32), rng.normal(0, 2e3, (500, 3))])
+    points = np.concatenate([points, np.full((1, 3), np.nan)]).astype(np.float32)
+    found = np.empty(len(points), np.uint32)
+    cells_of_points(points.reshape(-1), *grid, heights, found)
+    with np.errstate(invalid="ignore"):
+        place = [(points[:, s] - origin) * per_metre + np.float32(1.0) for s, (origin, per_metre) in enumerate(grid)]
+    columns = [np.clip(np.nan_to_num(one), 0, CELLS + 1).astype(np.int32) for one in place]
+    outside = ~((points[:, 2] >= heights[0]) & (points[:, 2] <= heights[1]))
+    np.testing.assert_array_equal(found, np.where(outside, NOWHERE, columns[0] * SIDE + columns[1]))
+    for n, cell in enumerate(found[:50]):
+        assert n in boxes[start[cell] : start[cell + 1]]
+        assert occupied[cell]
+    assert not occupied[NOWHERE]
 
 
 def test_no_points_and_no_boxes() -> None:
