@@ -1,21 +1,20 @@
-"""All streams of the service: finds the actor of a message, makes and frees actors, and sees to those that fell silent.
+"""All streams of the service: hands messages to the actors of their streams, and tells these what the others decide.
 
-Called by the readers, the workers, the query thread and the control loop; one lock guards the tables, and nothing slow
-is done under it.
+Called by the readers, the workers, the query thread and the control loop. `actor_table` has the actors, `untracked`
+what came of streams that others track, `admission` says who has room, and `sweep` looks at all of them now and then.
 """
 
 from __future__ import annotations
 
-import threading
 import time
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
-import structlog
 
 import optipmb
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.runtime import dumps
+from optipmb_service.runtime.actor_table import MAX_UNPROVEN, ActorTable
 from optipmb_service.runtime.admission import Admission
 from optipmb_service.runtime.byte_budget import MEGABYTE, ByteBudget
 from optipmb_service.runtime.context import Actor, ActorContext, part_of, policy_of
@@ -23,6 +22,7 @@ from optipmb_service.runtime.fusion import FUSED, Fusion
 from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.rivals import Rivals
 from optipmb_service.runtime.stream_actor import StreamActor
+from optipmb_service.runtime.sweep import Sweep
 from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 from optipmb_service.runtime.untracked import UntrackedMessages
 from optipmb_service.session.problems import problem_of
@@ -42,21 +42,8 @@ if TYPE_CHECKING:
     from optipmb_service.session.values import Lineage
     from optipmb_service.settings import Settings
 
-log = structlog.get_logger("optipmb_service")
-
-MAX_UNPROVEN: Final = 256
-"""Actors at once of streams that have not sent a valid message yet."""
-
-MAX_UNPROVEN_STRAINED: Final = 16
-"""The same while the lease is renewed late: each of them delays that."""
-
 RIVAL_LEASES: Final = 3
 """Leases for which the token of an instance may stay whose stream has been taken over."""
-
-SWEEP_REST: Final = 200
-"""How many times as long as a look at all sessions took of the processor it rests before the next one."""
-
-MOST_REST_NS: Final = 5 * SECOND
 
 MAX_KEYS: Final = 8192
 """Keys whose stream is remembered."""
@@ -104,13 +91,9 @@ class Registry:
         self._settings = settings
         self._reporter = reporter
         self._scheduler = scheduler
-        self._lock = threading.Lock()
-        self._actors: dict[str, StreamActor] = {}
-        self._unproven: set[StreamActor] = set()
+        self._actors = ActorTable(lambda stream: StreamActor(stream, self._context), scheduler, member)
         self._streams: dict[str, tuple[str, str]] = {}
-        self._past = MessageCounters()
         self._metrics = metrics
-        self._sweep_ns = 0
         self._admission = Admission(settings, self._used, self._evict_for_another)
         self._rivals = Rivals(round(RIVAL_LEASES * settings.lease_s * SECOND))
         standby = ByteBudget(settings.standby_mb * MEGABYTE)
@@ -119,6 +102,7 @@ class Registry:
             return TakeoverBuffer(round(settings.standby_s * SECOND), standby)
 
         self.untracked = UntrackedMessages(member.holds, buffer, self._lose)
+        self._sweep = Sweep(settings, self._actors, member, self.untracked, self.command, self._report)
         self.caches: Caches
         """What publishers keep; set before anything is received."""
         self._mailboxes = ByteBudget(settings.memory_mb * MEGABYTE // 2)
@@ -146,7 +130,7 @@ class Registry:
             room=self._admission.room,
             admit=self._admit,
             release=self._admission.release,
-            discard=self._discard,
+            discard=self._actors.discard,
             submit=scheduler.submit,
             arm=arm,
             metrics=metrics,
@@ -187,14 +171,13 @@ class Registry:
             return
         if self.untracked.cache_answered(session, stream):
             return
-        with self._lock:
-            actor = self._actors.get(session)
+        actor = self._actors.of(session)
         if actor is not None and actor.mailbox.offer_command(lambda: actor.on_caches_answered(stream), urgent=False):
             self._scheduler.submit(actor)
 
     def _hand(self, stream: str, packet: Packet, *, frame: bool) -> None:
         offered = Mailbox.offer_frame if frame else Mailbox.offer_cloud
-        if not self._offer(stream, lambda actor: offered(actor.mailbox, packet)):
+        if not self._actors.offer(stream, lambda actor: offered(actor.mailbox, packet)):
             self.untracked.put_off(stream, packet, frame=frame)
 
     def _keep(self, stream: str, packet: Packet, frame: bool) -> None:  # noqa: FBT001 - as a field of the context
@@ -204,7 +187,7 @@ class Registry:
 
     def command(self, stream: str, command: Callable[[StreamActor], None], *, urgent: bool) -> bool:
         """Have a worker run a command for a stream; False when the service takes no more streams."""
-        if self._offer(stream, lambda actor: actor.mailbox.offer_command(lambda: command(actor), urgent=urgent)):
+        if self._actors.offer(stream, lambda actor: actor.mailbox.offer_command(lambda: command(actor), urgent=urgent)):
             return True
         self._refuse(stream)
         return False
@@ -213,29 +196,16 @@ class Registry:
 
     def actors(self) -> list[StreamActor]:
         """Return the actors that have a session, by stream name."""
-        with self._lock:
-            actors = sorted(self._actors.items())
-        return [actor for _, actor in actors if actor.session is not None]
-
-    def _tracking(self) -> list[StreamActor]:
-        """Return the actors that have a session, in any order."""
-        with self._lock:
-            actors = list(self._actors.values())
-        return [actor for actor in actors if actor.session is not None]
+        return self._actors.in_order()
 
     def actor(self, stream: str) -> StreamActor | None:
         """Return the actor of a stream that has a session."""
-        with self._lock:
-            actor = self._actors.get(stream)
+        actor = self._actors.of(stream)
         return actor if actor is not None and actor.session is not None else None
 
     def totals(self) -> MessageCounters:
         """Return what became of all messages since the start."""
-        with self._lock:
-            totals, actors = self._past, list(self._actors.values())
-        for actor in actors:
-            totals += actor.totals()
-        return totals
+        return self._actors.totals()
 
     # Streams that come here, or have left
 
@@ -246,8 +216,7 @@ class Registry:
 
     def waits(self, session: str) -> bool:
         """Whether messages of a session wait for a worker."""
-        with self._lock:
-            actor = self._actors.get(session)
+        actor = self._actors.of(session)
         return actor is not None and (actor.occupied or not actor.mailbox.idle)
 
     def take_up(self, session: str, packets: list[tuple[Packet, bool]]) -> None:
@@ -258,7 +227,7 @@ class Registry:
         def take_up(actor: StreamActor) -> bool | None:
             return actor.mailbox.offer_command(lambda: actor.take_up(packets, answered), urgent=True)
 
-        self._offer(session, take_up, limited=False)
+        self._actors.offer(session, take_up, limited=False)
 
     def tracked(self, session: str) -> bool:
         """Whether a session is there, here or elsewhere: something valid has come of it."""
@@ -275,16 +244,12 @@ class Registry:
 
     def occupied(self) -> set[int]:
         """Return the partitions with a stream whose state is not kept yet."""
-        with self._lock:
-            actors = list(self._actors.values())
-        return {partition_of(actor.stream) for actor in actors if actor.occupied}
+        return {partition_of(actor.stream) for actor in self._actors.every() if actor.occupied}
 
     @property
     def busy(self) -> bool:
         """Whether something waits to be worked on."""
-        with self._lock:
-            actors = list(self._actors.values())
-        return any(not actor.mailbox.idle for actor in actors)
+        return any(not actor.mailbox.idle for actor in self._actors.every())
 
     # What the control loop has done now and then
 
@@ -294,51 +259,14 @@ class Registry:
         Where thousands are silent, that is done less often.
         """
         self._let_in()
-        if now_ns < self._sweep_ns:
-            return
-        began_ns = time.thread_time_ns()
-        self._sweep_all(now_ns)
-        self._sweep_ns = now_ns + min(MOST_REST_NS, SWEEP_REST * (time.thread_time_ns() - began_ns))
-
-    def _sweep_all(self, now_ns: int) -> None:
-        actors = self._tracking()
-        for actor in actors:
-            if self._member.fence(actor.stream) is None:
-                # It began at the very moment in which its partition was left.
-                self.command(actor.stream, StreamActor.on_lost, urgent=True)
-            session = actor.session  # the worker may end it at any moment
-            if actor.fused and session is not None and session.awaits_caches and actor.mailbox.idle:
-                self.command(actor.stream, StreamActor.on_caches_answered, urgent=False)  # or a publisher may be gone
-            actor.sensors.look_for_silent(now_ns, self._settings.stale_s)
-            if now_ns - actor.meter.active_ns > self._settings.idle_s * SECOND and actor.mailbox.idle:
-                self.command(actor.stream, self._close_idle, urgent=False)
-        for stream, owners in self._rivals.contested(now_ns):
-            tracked = f"it is tracked by {' and '.join(owners)}"
-            self._report("contested", stream, "one `store`, or `cluster`, for all instances", tracked)
-        self._evict(actors)
-        self.untracked.trim(now_ns, round(self._settings.idle_s * SECOND))
-
-    def _evict(self, actors: list[StreamActor]) -> None:
-        """Close sessions, the least recently used first, while all together keep more than the process may."""
-        held = [(actor.meter.active_ns, actor.held_bytes, actor) for actor in actors]
-        excess = sum(size for _, size, _ in held) - self._settings.memory_mb * MEGABYTE // 2
-        if excess <= 0:
-            return
-        for _, size, actor in sorted(held, key=lambda one: one[0]):
-            if excess <= 0:
-                return
-            excess -= size
-            self._report("refused", actor.stream, f"messages of at most {self._settings.memory_mb} MB", "more, in all")
-            self.command(actor.stream, lambda one: one.close_session("memory"), urgent=False)
+        self._sweep.run(now_ns, self._rivals)
 
     def changed(self, partition: int, change: Change) -> None:
         """Tell the workers of streams what has become of their partition; those that came here are to be taken up."""
         if change is Change.HELD:
             return
         told = StreamActor.on_recalled if change is Change.RECALLED else StreamActor.on_lost
-        with self._lock:
-            actors = [actor for actor in self._actors.values() if partition_of(actor.stream) == partition]
-        for actor in actors:
+        for actor in [actor for actor in self._actors.every() if partition_of(actor.stream) == partition]:
             if actor.session is not None:  # before it ends: what comes from then on is kept for who asks
                 self.untracked.leave(actor.stream, asked_for=change is Change.RECALLED)
             actor.tell(told)
@@ -350,7 +278,7 @@ class Registry:
 
     def keep(self) -> None:
         """Have every session that changed give its state to the checkpoint writer."""
-        for actor in self._tracking():
+        for actor in self._actors.tracking():
             if actor.changed:  # thousands may be silent
                 actor.tell(StreamActor.keep)
 
@@ -364,20 +292,14 @@ class Registry:
         for actor in self.actors():
             self.command(actor.stream, _flush, urgent=False)
 
-    def _close_idle(self, actor: StreamActor) -> None:
-        # Asked again: a message may have come between the sweep and the worker's turn.
-        if time.monotonic_ns() - actor.meter.active_ns > self._settings.idle_s * SECOND:
-            actor.close_session("idle")
-
-    # Actors
+    # Room
 
     def _over_quota(self, stream: str, packet: Packet, *, frame: bool) -> bool:
         """Refuse a message for which its node, or site, has no more quota."""
         exceeded = self._admission.exceeded(stream, packet.size, packet.now_ns)
         if not exceeded:
             return False
-        with self._lock:
-            self._past += MessageCounters(received=frame, refused=frame, clouds_refused=not frame)
+        self._actors.count(MessageCounters(received=frame, refused=frame, clouds_refused=not frame))
         self._report("quota", stream, exceeded, "more")
         return True
 
@@ -389,49 +311,10 @@ class Registry:
         self._report("refused", stream, f"at most {self._settings.max_sessions} streams at once", "another site's")
         self.command(stream, lambda actor: actor.close_session("evicted"), urgent=True)
 
-    def _offer(self, stream: str, offer: Callable[[StreamActor], bool | None], *, limited: bool = True) -> bool:
-        while True:
-            actor = self._actor(stream, limited=limited)
-            if actor is None:
-                return False
-            sent = offer(actor)
-            if sent is not None:
-                break
-            # The actor has closed since it was found: once more, with a new one.
-            self._discard(actor)
-        if sent:
-            self._scheduler.submit(actor)
-        return True
-
-    def _actor(self, stream: str, *, limited: bool) -> StreamActor | None:
-        with self._lock:
-            actor = self._actors.get(stream)
-            if actor is None and not (self._crowded() and limited):
-                actor = self._actors[stream] = StreamActor(stream, self._context)
-                self._unproven.add(actor)
-            return actor
-
-    def _crowded(self) -> bool:
-        """Whether too many streams have not sent a valid message yet, as far as is known; called with the lock."""
-        most = MAX_UNPROVEN_STRAINED if self._member.strained else MAX_UNPROVEN
-        if len(self._unproven) >= most:
-            known = self._actors.get
-            self._unproven = {one for one in self._unproven if not one.occupied and known(one.stream) is one}
-        return len(self._unproven) >= most
-
     def _let_in(self) -> None:
         """Hand over what was put off, as far as there is room."""
-        while self.untracked.newcomers:
-            with self._lock:
-                if self._crowded():
-                    return
+        while self.untracked.newcomers and self._actors.has_room():
             self.untracked.hand_over_newcomer(self._take_up)
-
-    def _discard(self, actor: Actor) -> None:
-        with self._lock:
-            if self._actors.get(actor.stream) is actor:
-                del self._actors[actor.stream]
-                self._past += actor.totals()
 
     def _admit(self, stream: str) -> Lineage | None:
         lineage = self._admission.admit(stream)
@@ -446,16 +329,14 @@ class Registry:
     def _lose(self, stream: str, lost: list[bool]) -> None:
         """Count messages that were dropped before their stream was tracked, each True: a frame."""
         frames = sum(lost)
-        with self._lock:
-            self._past += MessageCounters(received=frames, refused=frames, clouds_refused=len(lost) - frames)
+        self._actors.count(MessageCounters(received=frames, refused=frames, clouds_refused=len(lost) - frames))
         self._report_shed(stream)
 
     def _report_shed(self, stream: str) -> None:
         self._report("shed", stream, f"fewer than {MAX_UNPROVEN} new streams at once", "more than can wait")
 
     def _count_refused(self) -> None:
-        with self._lock:
-            self._past += MessageCounters(received=1, refused=1)
+        self._actors.count(MessageCounters(received=1, refused=1))
 
     def parsed(self, key: str) -> tuple[str, str]:
         """Return the stream of a key and its session, remembered.

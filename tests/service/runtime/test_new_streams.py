@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import threading
 import time
 from collections import Counter
 from types import SimpleNamespace
@@ -13,14 +12,16 @@ import pytest
 from optipmb_schemas import Keys
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.runtime import directory
+from optipmb_service.runtime.actor_table import ActorTable
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.intake import ALL, NEW_STREAMS, Intake
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.registry import Registry
+from optipmb_service.runtime.sweep import Sweep
 from optipmb_service.runtime.takeover_buffer import UNASKED_NS, TakeoverBuffer
 from optipmb_service.runtime.untracked import UntrackedMessages
-from optipmb_service.session.values import SECOND, MessageCounters
+from optipmb_service.session.values import SECOND
 from router import until
 
 if TYPE_CHECKING:
@@ -292,6 +293,23 @@ def test_the_first_frame_of_a_new_stream_is_kept_until_it_is_asked_for(*, new: b
     assert not untracked.recent([stream])
 
 
+class Streams(ActorTable):
+    """The actors of a member, of which none is made."""
+
+    def __init__(self, kept: Kept) -> None:
+        none: Any = SimpleNamespace()
+        super().__init__(none, none, none)
+        self._kept = kept
+
+    def has_room(self) -> bool:
+        """Whether another stream may be new: as the test says."""
+        return not self._kept.crowded
+
+    def offer(self, *_: object, **__: object) -> bool:
+        """Take it, or not."""
+        return self.has_room()
+
+
 class Kept:
     """The registry of a member, with what it keeps, and the quotas and counters that this concerns."""
 
@@ -302,20 +320,20 @@ class Kept:
         self.metrics: Counter[str] = Counter()
         self.problems: list[str] = []
         self.offered: list[list[Packet]] = []
-        registry._lock, registry._actors, registry._past = threading.Lock(), {}, MessageCounters()
+        registry._actors = Streams(self)
         registry._member = SimpleNamespace(holds=lambda _: self.holds, strained=False)
         registry.untracked = UntrackedMessages(
             lambda _: self.holds, lambda: TakeoverBuffer(keep_ns, budget), registry._lose
         )
-        registry._settings = SimpleNamespace(idle_s=3600.0)
-        registry._crowded = lambda: self.crowded
-        registry._offer = lambda *_: not self.crowded
+        registry._report = lambda code, *_: self.problems.append(code)
+        settings: Any = SimpleNamespace(idle_s=3600.0, stale_s=3600.0, memory_mb=1)
+        registry._sweep = Sweep(
+            settings, registry._actors, registry._member, registry.untracked, registry.command, registry._report
+        )
         registry._take_up = lambda _, packets, __: self.offered.append([packet for packet, _ in packets])
         registry._rivals = SimpleNamespace(contested=lambda *_: [])
-        registry._evict, registry._sweep_ns = lambda _: None, 0
         registry._admission = SimpleNamespace(exceeded=lambda *_: self.exceeded)
         self.exceeded = ""
-        registry._report = lambda code, *_: self.problems.append(code)
         registry._metrics = SimpleNamespace(
             received=lambda topic, _: self.metrics.update([f"received {topic}"]),
             foreign=lambda topic, _: self.metrics.update([f"foreign {topic}"]),
@@ -381,11 +399,11 @@ def test_what_is_put_off_and_dropped_is_refused() -> None:
     registry = kept.registry
     for number in range(50):
         registry.frame(detections(number, 1000))
-    assert (len(registry.untracked._buffers[STREAMS[0]]), registry._past.refused) == (3, 47)
+    assert (len(registry.untracked._buffers[STREAMS[0]]), registry.totals().refused) == (3, 47)
     registry.cloud(detections(50, 1000))
-    assert registry._past.clouds_refused == 1
+    assert registry.totals().clouds_refused == 1
     registry.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
-    assert (registry._past.received, registry._past.refused) == (50, 50)
+    assert (registry.totals().received, registry.totals().refused) == (50, 50)
     assert set(kept.problems) == {"shed"}
 
 
@@ -395,7 +413,7 @@ def test_what_is_put_off_is_within_the_quota() -> None:
     kept.registry.frame(detections(0))
     kept.exceeded = "a message"
     kept.registry.frame(detections(1))
-    assert (len(kept.registry.untracked._buffers[STREAMS[0]]), kept.registry._past.refused) == (1, 1)
+    assert (len(kept.registry.untracked._buffers[STREAMS[0]]), kept.registry.totals().refused) == (1, 1)
     assert kept.problems == ["quota"]
 
 
@@ -413,5 +431,5 @@ def test_what_a_session_passes_on_is_kept_until_it_is_asked_for(*, asked: bool) 
         assert registry.untracked.recent([STREAMS[0]])[:2] == passed
     registry.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
     assert not registry.untracked._buffers[STREAMS[0]]
-    assert registry._past.refused == (0 if asked else 2)
+    assert registry.totals().refused == (0 if asked else 2)
     assert kept.metrics == {"foreign detections": 1}
