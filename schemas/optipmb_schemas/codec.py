@@ -7,7 +7,7 @@ are checked before memory is taken for them. `encode` is deterministic: equal me
 import json
 import re
 from functools import lru_cache
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, TypeVar
 
 import msgpack
 
@@ -138,8 +138,9 @@ def decode(payload: bytes, expected: type[T], *, encoding: str = "", limits: Lim
     most = limits.max_json_bytes if form == "json" else limits.max_bytes
     if len(payload) > most:
         raise MessageError("too_large", "", f"at most {most} bytes of {form}", f"{len(payload)} bytes")
-    if expected is Detections and form == "msgpack" and (message := read_detections(payload, limits)) is not None:
-        return cast("T", message)
+    message = read_detections(payload, limits) if expected is Detections and form == "msgpack" else None
+    if isinstance(message, expected):
+        return message
     fields = _parse_json(payload, limits) if form == "json" else _parse_msgpack(payload, limits)
     if not isinstance(fields, dict):
         raise MessageError("malformed", "", f"one map with the fields of {expected.__name__}", show(fields))

@@ -17,7 +17,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from math import prod
-from operator import le
 from struct import unpack
 from typing import Any, Final, TypeVar
 
@@ -48,12 +47,8 @@ _BLOCK: Final = frozenset({"dtype", "shape", "data"})
 _PADDED: Final = _BLOCK | {"pad"}
 _DTYPES: Final = {"i8": frozenset({"i8", "<i8"}), "f8": frozenset({"f8", "<f8"})}
 _COLUMNS: Final = (("center", 3), ("size", 3), ("yaw", 1), ("score", 1), ("velocity", 2))
-_RANGES: Final = tuple(Detections.arrays[name] for name, _ in _COLUMNS)
-_LOWEST: Final = [float(np.nextafter(one.low, np.inf)) if one.above else one.low for one in _RANGES]
-_HIGHEST: Final = [one.high for one in _RANGES]
 _LITTLE: Final = sys.byteorder == "little"
 _FRAMES: Final = frozenset({"world", "sensor"})
-_VELOCITY: Final = len(_COLUMNS) - 1
 _NUMBERS: Final[dict[type[Message], tuple[tuple[str, int, float, float], ...]]] = {
     kind: tuple((name, int(one.shape[0]), one.low, one.high) for name, one in kind.arrays.items())
     for kind in (Pose, FieldOfView)
@@ -64,6 +59,9 @@ MOST_LENGTHS: Final = 256
 
 MOST_LAYOUTS: Final = 4
 """Layouts of one length."""
+
+MOST_CACHED: Final = 512
+"""Detections up to which the bounds of all their numbers are remembered, by their number; for so many 80 kilobytes."""
 
 T = TypeVar("T", Pose, FieldOfView)
 _msgpack: Any = msgpack  # its type information is partial
@@ -78,20 +76,16 @@ class _Known:
         limits: within which these payloads are.
         fields: all fields, with the values of those that are in the layout itself.
         given: names of the fields that are there.
-        labels: how many there are.
         inner: names of the fields that are maps.
-        shapes: shape of each column of numbers, in the order of `_COLUMNS`, and where it begins in bytes.
-        starts: where it begins in numbers.
+        count: number of detections.
     """
 
     layout: Layout
     limits: Limits
     fields: dict[str, Any]
     given: frozenset[str]
-    labels: int
     inner: tuple[str, ...]
-    shapes: tuple[tuple[str, tuple[int, ...], int], ...]
-    starts: NDArray[np.intp]
+    count: int
 
 
 _known: OrderedDict[int, list[_Known]] = OrderedDict()
@@ -123,17 +117,12 @@ def _read_known(known: _Known, stream: bytes, values: tuple[Any, ...]) -> Detect
         ValueError: they are not valid.
     """
     fields = known.fields | dict(zip(known.layout.names, values, strict=True))
-    _need(len(stream) <= known.limits.max_text and fields["seq"] <= INT64 and fields["stamp_ns"] <= INT64)
+    if len(stream) > known.limits.max_text or fields["seq"] > INT64 or fields["stamp_ns"] > INT64:
+        raise ValueError
     fields["stream"] = _stream_of(stream)
     for name in known.inner:
         fields[name] = checked_part(_INNER[name], partial(_taken, fields, name))
-    label = fields["label"]
-    _need(int(np.maximum.reduce(np.frombuffer(label, np.uint64))) < known.labels)  # a negative one is larger than any
-    fields["label"] = np.frombuffer(label, np.int64)
-    buffer = b"".join([fields[name] for name, _, _ in known.shapes])
-    for name, shape, begin in known.shapes:
-        fields[name] = np.ndarray(shape, np.float64, buffer, begin)
-    _check_ranges(np.frombuffer(buffer, np.float64), known.starts, fields.get("velocity"))
+    _read_columns(fields, known.count)
     return Detections.of_valid(fields, set(known.given))
 
 
@@ -156,19 +145,13 @@ def _remember(payload: bytes, start: int, message: Detections, limits: Limits) -
         return
     names = {name.partition(".")[0] for name in layout.names}
     fields = {name: None if name in names else value for name, value in message.__dict__.items()}
-    count, begin, shapes = len(message.label), 0, []
-    for name, width in _columns(message.velocity):
-        shapes.append((name, (count, width) if width > 1 else (count,), begin))
-        begin += 8 * count * width
     known = _Known(
         layout,
         limits,
         fields,
         frozenset(message.model_fields_set),
-        len(message.labels),
         tuple(name for name in _INNER if name in names),
-        tuple(shapes),
-        _starts(count)[: len(shapes)],
+        len(message.label),
     )
     alike.append(known)
     del alike[:-MOST_LAYOUTS]
@@ -217,9 +200,11 @@ def checked(
     _stream(fields["stream"])
     _need(len(labels) <= limits.max_labels)
     fields["labels"] = _labels(tuple(labels))
-    fields["label"] = index = np.frombuffer(data(fields["label"], "i8", [count]), np.int64)
-    _need(int(index.view(np.uint64).max()) < len(labels))  # a negative one is larger than any
-    _read_columns(fields, count, data)
+    fields["label"] = data(fields["label"], "i8", [count])
+    for name, width in _COLUMNS:
+        if fields.get(name) is not None:
+            fields[name] = data(fields[name], "f8", [count, width] if width > 1 else [count])
+    _read_columns(fields, count)
     return Detections.trusted(fields)
 
 
@@ -241,46 +226,41 @@ def checked_part(kind: type[T], data: Callable[[str, int], bytes]) -> T:
     return part
 
 
-def _read_columns(fields: dict[str, Any], count: int, data: Callable[[Any, str, list[int]], bytes]) -> None:
-    """Replace the columns of numbers by arrays, all of which lie in one buffer, and check their ranges together."""
-    columns = _columns(fields.get("velocity"))
-    parts = [data(fields[name], "f8", [count, width] if width > 1 else [count]) for name, width in columns]
-    numbers = np.frombuffer(b"".join(parts), np.float64)
-    begin = 0
-    for name, width in columns:
-        column = numbers[begin : begin + count * width]
-        fields[name] = column.reshape(count, width) if width > 1 else column
-        begin += count * width
-    _check_ranges(numbers, _starts(count)[: len(columns)], fields.get("velocity"))
+def _read_columns(fields: dict[str, Any], count: int) -> None:
+    """Replace the bytes of columns by arrays, those of numbers in one buffer, and check their ranges together.
 
-
-def _columns(velocity: object) -> tuple[tuple[str, int], ...]:
-    """Return names and widths of the columns of numbers that are there."""
-    return _COLUMNS if velocity is not None else _COLUMNS[:-1]
-
-
-def _check_ranges(numbers: NDArray[np.float64], starts: NDArray[np.intp], velocity: NDArray[np.float64] | None) -> None:
-    """Check the numbers of all columns; ValueError when one is out of its range."""
-    lowest = np.minimum.reduceat(numbers, starts).tolist()
-    highest = np.maximum.reduceat(numbers, starts).tolist()
-    # The extremes of a column with a NaN are NaN, which is in no range.
-    if not (all(map(le, _LOWEST, lowest)) and all(map(le, highest, _HIGHEST))):
-        within = zip(map(le, _LOWEST, lowest), map(le, highest, _HIGHEST), strict=True)
-        good = [above and below for above, below in within]
-        _need(all(good[:_VELOCITY]) and velocity is not None and _unknown_or_good(velocity))
-
-
-def _unknown_or_good(velocity: NDArray[np.float64]) -> bool:
-    """Whether every row is within the range, or all NaN."""
-    good = (velocity >= _RANGES[_VELOCITY].low) & (velocity <= _RANGES[_VELOCITY].high)
-    return bool((good | np.isnan(velocity).all(axis=1, keepdims=True)).all())
+    Raises:
+        ValueError: a number is out of its range.
+    """
+    label = np.frombuffer(fields["label"], np.uint64)
+    _need(int(label[label.argmax()]) < len(fields["labels"]))  # a negative one is larger than any
+    fields["label"] = label.view(np.int64)
+    columns_of = _columns if count <= MOST_CACHED else _columns.__wrapped__
+    columns, low, high = columns_of(count, fields.get("velocity") is not None)
+    numbers = np.frombuffer(b"".join([fields[name] for name, _, _ in columns]))
+    good = (numbers >= low) & (numbers <= high)
+    if np.count_nonzero(good) < len(good):
+        known = 8 * count  # numbers of other columns than the velocity, of which a row may be NaN
+        unknown = np.isnan(numbers[known:].reshape(-1, 2)).all(axis=1, keepdims=True)
+        _need(bool(good[:known].all() and (good[known:].reshape(-1, 2) | unknown).all()))
+    for name, place, shape in columns:
+        fields[name] = numbers[place].reshape(shape)
 
 
 @lru_cache(64)
-def _starts(count: int) -> NDArray[np.intp]:
-    """Return where each column begins in the buffer."""
-    ends = np.cumsum([count * width for _, width in _COLUMNS])
-    return np.concatenate([[0], ends[:-1]]).astype(np.intp)
+def _columns(
+    count: int,
+    velocity: bool,  # noqa: FBT001 - for the cache
+) -> tuple[tuple[tuple[str, slice, tuple[int, ...]], ...], NDArray[np.float64], NDArray[np.float64]]:
+    """Return name, place and shape of the columns of so many detections in one buffer, and what each number may be."""
+    columns, begin, low, high = [], 0, [], []
+    for name, width in _COLUMNS if velocity else _COLUMNS[:-1]:
+        size, one = count * width, Detections.arrays[name]
+        columns.append((name, slice(begin, begin + size), (count, width) if width > 1 else (count,)))
+        begin += size
+        low.append(np.full(size, np.nextafter(one.low, np.inf) if one.above else one.low))
+        high.append(np.full(size, one.high))
+    return tuple(columns), np.concatenate(low), np.concatenate(high)
 
 
 def _part(pairs: Any, kind: type[T]) -> T:
