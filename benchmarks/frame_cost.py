@@ -32,14 +32,13 @@ from optipmb_service.app.kernels import warm_up
 from optipmb_service.observability import logs
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter
-from optipmb_service.runtime import stream_actor
 from optipmb_service.runtime.persistence import NoPersistence
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.registry import Registry
+from optipmb_service.runtime.stream_actor import StreamActor
 from optipmb_service.runtime.track_publisher import TrackPublisher
 from optipmb_service.session import convert
-from optipmb_service.session.checkpoint import encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.settings import Settings
 
@@ -157,15 +156,22 @@ def packets(objects: int, points: int) -> Iterator[list[Packet]]:
         yield made
 
 
+def first_of(*modules: str) -> Any:
+    """Return the first of these modules of the service that the checkout has: an earlier one has it all in another."""
+    for module in modules:
+        with contextlib.suppress(ModuleNotFoundError):
+            return import_module(f"optipmb_service.{module}")
+    raise ModuleNotFoundError(modules[-1])
+
+
 def measured(objects: int, points: int) -> dict[str, float]:
     """Return the median microseconds of each part of a frame."""
     logs.configure("console", "error")
     warm_up()
     parts = Parts()
     network: Any = Network()  # in the place of several parts
-    decoding: Any = stream_actor
-    with contextlib.suppress(ModuleNotFoundError):  # an earlier checkout decodes in the actor
-        decoding = import_module("optipmb_service.runtime.stream_tracking")
+    decoding = first_of("runtime.stream_tracking", "runtime.stream_actor")
+    encode_checkpoint = first_of("session.checkpoint_codec", "session.checkpoint").encode_checkpoint
     for part, owner, name in (
         ("handing over", Registry, "frame"),
         ("handing over", Registry, "cloud"),
@@ -180,7 +186,7 @@ def measured(objects: int, points: int) -> dict[str, float]:
         ("metrics", Metrics, "received"),
         ("metrics", Metrics, "published"),
         ("metrics", Metrics, "tracks"),
-        ("actor", stream_actor.StreamActor, "work"),
+        ("actor", StreamActor, "work"),
     ):
         if hasattr(owner, name):
             setattr(owner, name, parts.time(part, getattr(owner, name)))

@@ -13,12 +13,11 @@ import optipmb_schemas as schemas
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.session.checkpoint import (
+from optipmb_service.session.checkpoint import Checkpoint, CheckpointError
+from optipmb_service.session.checkpoint_codec import (
     HEAD,
     MAGIC,
     VERSION,
-    Checkpoint,
-    CheckpointError,
     decode_checkpoint,
     encode_checkpoint,
     seal,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -11,13 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from optipmb_service.session import convert
-from optipmb_service.session.checkpoint import Checkpoint, decode_checkpoint, encode_checkpoint
+from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.timeline import FrameId
 from router import Sensor
 from sessions import feed, tracks
 
 import optipmb
+
+if TYPE_CHECKING:
+    from optipmb_service.session.checkpoint import Checkpoint
 
 NUSCENES = optipmb.load_profile("nuscenes")
 SENSOR = Sensor()

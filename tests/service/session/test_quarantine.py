@@ -15,7 +15,7 @@ from optipmb_client import dumps as client
 from optipmb_client.cli import run
 from optipmb_client.errors import UsageError
 from optipmb_service.runtime.dumps import FOLDER, MOST, save
-from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from router import Sensor
 from sessions import Failing, Merged, begun, dumps, feed, problems, tracks

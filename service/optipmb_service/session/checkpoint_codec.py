@@ -1,0 +1,186 @@
+"""The state of a session as bytes and back: whole or not at all.
+
+The bytes are a head (magic, version, BLAKE2b digest of version and body) and a body, one msgpack map. Equal checkpoints
+give equal bytes. Reading is total and bounded: it returns a checkpoint or raises `CheckpointError`, and the digest is
+compared before anything else is looked at. A service reads the versions that earlier ones wrote (`checkpoint_reading`),
+and refuses later ones by number.
+
+What depends on how messages were delivered (duplicates, the revisions of corrected tracks, crashes) is kept, but is no
+state: `state_bytes` leaves it out, so that two sessions that took the same frames can be compared.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
+
+import msgpack
+import optipmb_schemas as schemas
+
+import optipmb
+from optipmb_service.session.checkpoint import CheckpointError
+from optipmb_service.session.checkpoint_reading import READERS
+from optipmb_service.session.document import Document
+from optipmb_service.session.values import Deliveries
+
+if TYPE_CHECKING:
+    from optipmb_service.session.checkpoint import Checkpoint, Recorded
+    from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, SensorState
+
+VERSION: Final = 3
+MAGIC: Final = b"OPTIPMB\0"
+DIGEST: Final = 16
+HEAD: Final = len(MAGIC) + 2 + DIGEST
+MAX_BYTES: Final = 2**28
+MAX_PROFILES: Final = 64
+"""Profiles whose form in checkpoints is remembered."""
+
+_msgpack: Any = msgpack  # its type information is partial
+_profiles: dict[int, tuple[optipmb.Parameters, dict[str, Any]]] = {}
+"""The profiles that were written last, by their ids."""
+
+
+def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
+    """Return the bytes of a checkpoint; equal ones give equal bytes."""
+    return seal(_msgpack.packb(_body(checkpoint)))
+
+
+def state_bytes(checkpoint: Checkpoint) -> bytes:
+    """Return the bytes of what does not depend on how messages were delivered."""
+    window = tuple(replace(one, revision=0) for one in checkpoint.window)
+    bare = replace(checkpoint, window=window, deliveries=Deliveries(), newest_cloud_ns={}, run=0, software="")
+    return encode_checkpoint(bare)
+
+
+def digest_of(checkpoint: Checkpoint) -> str:
+    """Return 32 hexadecimal digits over all that later tracks depend on, which counts of messages are no part of."""
+    return hashlib.blake2b(state_bytes(checkpoint), digest_size=DIGEST).hexdigest()
+
+
+def decode_checkpoint(data: bytes) -> Checkpoint:
+    """Return the checkpoint that bytes hold.
+
+    Raises:
+        CheckpointError: torn, changed, of a later version, or not valid.
+    """
+    version_, body = _open(data)
+    try:
+        return READERS[version_](Document.of(body))
+    except (schemas.MessageError, optipmb.OptipmbError) as error:
+        raise CheckpointError(str(error)) from error
+
+
+def seal(body: bytes) -> bytes:
+    """Return a body with the head that names its version and guards it."""
+    return b"".join((MAGIC, VERSION.to_bytes(2, "big"), _digest(VERSION, body), body))
+
+
+def _open(data: bytes) -> tuple[int, bytes]:
+    if len(data) < HEAD or data[: len(MAGIC)] != MAGIC:
+        raise CheckpointError("no checkpoint: its first bytes are others")
+    if len(data) > MAX_BYTES:
+        raise CheckpointError(f"{len(data)} bytes: more than a checkpoint has")
+    version_ = int.from_bytes(data[len(MAGIC) : len(MAGIC) + 2], "big")
+    if version_ > VERSION:
+        raise CheckpointError(f"version {version_}: from a newer service; this one reads versions up to {VERSION}")
+    if version_ not in READERS:
+        raise CheckpointError(f"version {version_}: there is none such")
+    body = data[HEAD:]
+    if data[len(MAGIC) + 2 : HEAD] != _digest(version_, body):
+        raise CheckpointError("torn or changed: the digest is that of other bytes")
+    return version_, body
+
+
+def _digest(version_: int, body: bytes) -> bytes:
+    digest = hashlib.blake2b(version_.to_bytes(2, "big"), digest_size=DIGEST, person=b"optipmb-check")
+    digest.update(body)
+    return digest.digest()
+
+
+# Writing
+
+
+def _body(checkpoint: Checkpoint) -> dict[str, Any]:
+    parameters = _dumped(checkpoint.parameters)
+    # Most sessions of a store have one of a few profiles; the order of the classes is that of their indices.
+    return {
+        "software": checkpoint.software,
+        "stream": checkpoint.stream,
+        "parameters": parameters,
+        "fused": checkpoint.fused,
+        "cloud_wait_ns": checkpoint.cloud_wait_ns,
+        "quarantine": [list(one) for one in sorted(checkpoint.quarantine.items())],
+        "epochs": [
+            [name, seen.epoch, seen.highest, _mask(seen.mask)]
+            for name, epochs in sorted(checkpoint.seen.items())
+            for seen in epochs
+        ],
+        "base": _state(checkpoint.base),
+        "window": [
+            {
+                "detections": _packed(one, "detections", one.message),
+                "points": None if one.points is None else _packed(one, "points", one.points),
+                "missed": one.missed,
+                "revision": one.revision,
+            }
+            for one in checkpoint.window
+        ],
+        # Without a window the present is its beginning.
+        "head": _state(checkpoint.head) if checkpoint.window else None,
+        "deliveries": _table(checkpoint.deliveries),
+        "newest_cloud_ns": [list(one) for one in sorted(checkpoint.newest_cloud_ns.items())],
+        "run": checkpoint.run,
+    }
+
+
+def _dumped(parameters: optipmb.Parameters) -> dict[str, Any]:
+    """Return a profile as maps and numbers; sessions write the same one every second."""
+    known = _profiles.get(id(parameters))
+    if known is None or known[0] is not parameters:
+        if len(_profiles) >= MAX_PROFILES:
+            _profiles.clear()
+        known = _profiles[id(parameters)] = parameters, parameters.model_dump(mode="json")
+    return known[1]
+
+
+def _table(values: FrameCounts | PoseHistory | Deliveries) -> dict[str, Any]:
+    return {name: getattr(values, name) for name in values.__slots__}
+
+
+def _packed(one: Recorded, name: str, message: schemas.Message) -> bytes:
+    packed = one.packed.get(name)
+    if packed is None:
+        packed = one.packed[name] = schemas.encode(message)
+    return packed
+
+
+def _mask(mask: int) -> bytes:
+    return mask.to_bytes((mask.bit_length() + 7) // 8, "big")
+
+
+def _state(state: FilterState) -> dict[str, Any]:
+    density, last = state.density, state.last
+    return {
+        "stamp_ns": density.stamp_ns,
+        "next_id": density.next_id,
+        "density": schemas.pack_columns(optipmb.columns_of(density)),
+        "session": state.session,
+        "starts": state.starts,
+        "generation": state.generation,
+        "last": None if last is None else [last.epoch, last.seq, last.stamp_ns, last.sensor],
+        "tracks": state.tracks,
+        "counts": _table(state.counts),
+        "sensors": [{"sensor": name, **_sensor(one)} for name, one in sorted(state.sensors.items())],
+    }
+
+
+def _sensor(one: SensorState) -> dict[str, Any]:
+    cursor = one.cursor
+    return {
+        "course": [cursor.epoch, cursor.seq, cursor.era, cursor.generation, cursor.newest_ns, cursor.floor_ns],
+        "jumped": [cursor.jumped, cursor.jumped_ns],
+        "tracked": None if one.tracked is None else list(one.tracked),
+        "reported": sorted(one.reported),
+        "whereabouts": _table(one.pose_history),
+    }
