@@ -9,7 +9,8 @@ import structlog
 from optipmb_schemas import Keys
 
 from optipmb_service.cluster.copying import copy_sessions
-from optipmb_service.cluster.sqlite import SqliteStore, in_use
+from optipmb_service.cluster.member_locks import in_use
+from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.kept_tracks import LoggedTracks

@@ -10,27 +10,25 @@ power cut too, which may only cost the last transactions; the publishers' caches
 transaction would cost several milliseconds of disk time each second for nothing else. Much is written in transactions
 of a bounded size, so that other processes have their turn.
 
-Beside them is a folder with a file that each member holds a lock on. The kernel gives up the lock of a member whose
-process has ended, however it ended: then it can be said for certain that it publishes nothing more.
+`sqlite_file` opens such a file. Beside the two is the folder of the locks of members (`member_locks`).
 """
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import os
-import sqlite3
-import threading
 import time
-from hashlib import blake2b
 from itertools import islice
-from typing import IO, TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from optipmb_service.cluster.member_locks import MEMBERS, MemberLocks, in_use
+from optipmb_service.cluster.sqlite_file import Database, is_damaged
 from optipmb_service.cluster.store import ENDED, KEPT, Fenced, Record, StoreError, Write
 
 if TYPE_CHECKING:
+    import sqlite3
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
@@ -42,16 +40,8 @@ ASIDE: Final = 64
 LEASES: Final = "leases.db"
 """File of the records."""
 
-MEMBERS: Final = "members"
-"""Folder of the files whose locks say that members live."""
-
 ENDED_KEPT: Final = 64
 """Records of ended members that are kept; who has followed none of the later ones was ended itself."""
-
-BUSY_S: Final = 5.0
-"""How long a transaction waits for those of other processes; each takes milliseconds."""
-
-BUSY_PAUSE_S: Final = 0.01
 
 SLICE: Final = 64
 """Streams of one transaction."""
@@ -82,90 +72,6 @@ _NEWEST: Final = "SELECT data FROM checkpoints WHERE stream = ? ORDER BY number 
 _SILENT: Final = "SELECT stream FROM written WHERE at < ? LIMIT ?"
 
 
-class Database:
-    """One file and a connection to it; any thread may use it, one at a time.
-
-    Args:
-        path: the file; made when it is not there. None: in memory.
-        schema: of its tables.
-        synchronous: SQLite's setting.
-
-    Raises:
-        StoreError: it cannot be opened or written, or is no such file.
-    """
-
-    def __init__(self, path: Path | None, schema: str, synchronous: str) -> None:
-        self._path = path
-        self._lock = threading.Lock()
-        self.connection: sqlite3.Connection | None = None
-        try:
-            self.connection = sqlite3.connect(
-                path or ":memory:", timeout=BUSY_S, isolation_level=None, check_same_thread=False
-            )
-            self._begin_log(self.connection)
-            self.connection.execute(f"PRAGMA synchronous = {synchronous}")
-            self.connection.execute(f"PRAGMA journal_size_limit = {64 * 2**20}")
-            self.connection.executescript(schema)
-            self.connection.execute("PRAGMA user_version = 3")  # fails here already where nothing can be written
-        except (sqlite3.Error, OSError) as error:
-            self.close()
-            raise StoreError(f"{path}: {error}") from error
-
-    @staticmethod
-    def _begin_log(connection: sqlite3.Connection) -> None:
-        """Have the journal be a write-ahead log; SQLite itself does not wait there for a process that does the same."""
-        until_s = time.monotonic() + BUSY_S
-        while True:
-            try:
-                connection.execute("PRAGMA journal_mode = WAL")
-            except sqlite3.OperationalError as error:
-                if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > until_s:
-                    raise
-                time.sleep(BUSY_PAUSE_S)
-            else:
-                return
-
-    def close(self, timeout: float = 1.0) -> None:
-        """Close the file, unless it is in use for so long (s); may be called twice."""
-        if not self._lock.acquire(timeout=timeout):
-            return  # it hangs, and the process ends
-        try:
-            if self.connection is not None:
-                self.connection.close()
-                self.connection = None
-        finally:
-            self._lock.release()
-
-    @contextlib.contextmanager
-    def use(self) -> Iterator[sqlite3.Connection]:
-        """Have the connection for one's own.
-
-        Raises:
-            StoreError: whatever is wrong with it.
-        """
-        with self._lock:
-            if self.connection is None:
-                raise StoreError(f"{self._path}: closed")
-            try:
-                yield self.connection
-            except sqlite3.Error as error:
-                raise StoreError(f"{self._path}: {error}") from error
-
-    @contextlib.contextmanager
-    def transaction(self) -> Iterator[sqlite3.Connection]:
-        """Do all of it or nothing; the write lock is taken first, so that no reader has to become a writer halfway."""
-        with self.use() as connection:
-            connection.execute("BEGIN IMMEDIATE")
-            try:
-                yield connection
-                connection.execute("COMMIT")
-            except BaseException:
-                # A full disk may have rolled it back already.
-                if connection.in_transaction:
-                    connection.execute("ROLLBACK")
-                raise
-
-
 class SqliteStore:
     """The leases and checkpoints of the processes of one machine.
 
@@ -182,9 +88,7 @@ class SqliteStore:
     remote: Final = False
 
     def __init__(self, path: Path | None, clock: Callable[[], float] = time.time) -> None:
-        self._members = None if path is None else path.with_name(MEMBERS)
-        self._member = ""
-        self._lock_file: IO[bytes] | None = None
+        self._locks = MemberLocks(None if path is None else path.with_name(MEMBERS))
         self._clock = clock
         self._checkpoints = Database(path, _CHECKPOINTS, "NORMAL")
         try:
@@ -213,7 +117,7 @@ class SqliteStore:
         kind, _, name = write.key.partition("/")
         begins = kind == "member" and write.over == 0 and write.value != ENDED
         if begins:
-            self._take_lock(name)
+            self._locks.take(name)
         with self._leases.transaction() as connection:
             row = connection.execute("SELECT revision FROM records WHERE key = ?", (write.key,)).fetchone()
             if (row[0] if row else 0) != write.over:
@@ -223,17 +127,12 @@ class SqliteStore:
             if begins:
                 connection.execute(_OLD_MEMBERS, (ENDED_KEPT,))
         if kind == "member" and write.value == ENDED:
-            self._leave_lock(name)
+            self._locks.leave(name)
         return int(last) + 1
 
     def gone(self, member: str) -> bool:
         """Whether nobody holds the lock of a member. A file that is missing says nothing about its process."""
-        if member == self._member or self._members is None:
-            return False
-        try:
-            return not _locked(self._lock_of(member))
-        except OSError:
-            return False
+        return self._locks.is_free(member)
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
         """Write the newest checkpoints of streams, some in a transaction; return those that were refused.
@@ -310,39 +209,7 @@ class SqliteStore:
         """Close the files; may be called twice."""
         self._checkpoints.close(timeout / 2)
         self._leases.close(timeout / 2)
-        if self._lock_file is not None:
-            self._lock_file.close()
-
-    def _lock_of(self, member: str) -> Path:
-        assert self._members is not None  # noqa: S101 - said for the type checker
-        return self._members / blake2b(member.encode(), digest_size=8).hexdigest()
-
-    def _take_lock(self, member: str) -> None:
-        """Take the lock of a member that begins; the one before it in this process has ended."""
-        if self._members is None or member == self._member:
-            return
-        try:
-            file = self._lock_of(member).open("xb")
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise StoreError(f"{self._members}: {error}") from error
-        if self._lock_file is not None:
-            self._lock_file.close()
-        self._member, self._lock_file = member, file
-
-    def _leave_lock(self, member: str) -> None:
-        if self._members is not None:
-            with contextlib.suppress(OSError):
-                self._lock_of(member).unlink(missing_ok=True)
-
-
-def in_use(path: Path) -> bool:
-    """Whether a member lives that keeps its leases beside a file of checkpoints."""
-    for lock in path.with_name(MEMBERS).glob("*"):
-        with contextlib.suppress(OSError):  # it has gone meanwhile
-            if _locked(lock):
-                return True
-    return False
+        self._locks.close()
 
 
 def _some(left: Iterator[tuple[str, Fenced]]) -> list[tuple[str, Fenced]]:
@@ -371,7 +238,7 @@ def _leases_beside(path: Path) -> Database:
         raise StoreError(f"{members}: {error}") from error
     try:
         fcntl.flock(folder, fcntl.LOCK_EX)  # of two that begin, one looks and replaces
-        if _damaged(file) and not in_use(path):
+        if is_damaged(file) and not in_use(path):
             log.warning("leases_damaged", file=str(file))
             for one in (file, *(file.with_name(f"{LEASES}{end}") for end in ("-wal", "-shm"))):
                 one.unlink(missing_ok=True)
@@ -380,25 +247,3 @@ def _leases_beside(path: Path) -> Database:
         raise StoreError(f"{file}: {error}") from error
     finally:
         os.close(folder)
-
-
-def _damaged(file: Path) -> bool:
-    """Whether a file is no database, or not whole."""
-    if not file.exists():
-        return False
-    with contextlib.closing(sqlite3.connect(file, timeout=BUSY_S)) as connection:
-        try:
-            return bool(connection.execute("PRAGMA quick_check(1)").fetchone() != ("ok",))
-        except sqlite3.OperationalError:  # busy, or not readable: it is not known
-            return False
-        except sqlite3.DatabaseError:
-            return True
-
-
-def _locked(path: Path) -> bool:
-    with path.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False

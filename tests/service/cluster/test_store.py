@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 from lease_log import Alone
-from optipmb_service.cluster.sqlite import ASIDE, ENDED_KEPT, LEASES, MEMBERS, SLICE, SLICE_BYTES, SqliteStore
+from optipmb_service.cluster.member_locks import MEMBERS
+from optipmb_service.cluster.sqlite import ASIDE, ENDED_KEPT, LEASES, SLICE, SLICE_BYTES, SqliteStore
 from optipmb_service.cluster.store import ENDED, StoreError, Write, load_newest
 
 if TYPE_CHECKING:
