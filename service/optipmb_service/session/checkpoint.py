@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     import optipmb
+    from optipmb_service.session.seen_numbers import SeenNumbers
     from optipmb_service.session.state import FilterState
-    from optipmb_service.session.timeline import SeenNumbers
 
 _SOFTWARE: Final = version("optipmb")
 

@@ -13,8 +13,9 @@ import optipmb_schemas as schemas
 import optipmb
 from optipmb_service.session import convert
 from optipmb_service.session.checkpoint import Checkpoint, Recorded
+from optipmb_service.session.seen_numbers import EPOCHS, WINDOW, SeenNumbers
 from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, SensorState
-from optipmb_service.session.timeline import EPOCHS, WINDOW, Cursor, FrameId, SeenNumbers
+from optipmb_service.session.timeline import Cursor, FrameId
 from optipmb_service.session.values import MAX_CLOUD_WAIT_NS, MAX_COUNT, MAX_ERROR, MAX_LABELS, MAX_SENSORS, Deliveries
 
 if TYPE_CHECKING:

@@ -17,19 +17,8 @@ from bisect import bisect
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from optipmb_service.session.timeline import (
-    JUMP_FRAMES,
-    WINDOW,
-    Cursor,
-    Decision,
-    FrameId,
-    Placement,
-    SeenNumbers,
-    Verdict,
-    complete_until,
-    number_of,
-    remembered,
-)
+from optipmb_service.session.seen_numbers import WINDOW, SeenNumbers, complete_until, number_of, remembered
+from optipmb_service.session.timeline import JUMP_FRAMES, Cursor, Decision, FrameId, Placement, Verdict
 from optipmb_service.session.values import MAX_SENSORS
 
 if TYPE_CHECKING:

@@ -6,7 +6,8 @@ import itertools
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.session.timeline import WINDOW, Cursor, Decision, FrameId, Timeline, Verdict, hold_until
+from optipmb_service.session.seen_numbers import WINDOW
+from optipmb_service.session.timeline import Cursor, Decision, FrameId, Timeline, Verdict, hold_until
 
 SECOND = 1_000_000_000
 LIMIT = 5 * SECOND
