@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Final, Protocol, Self
 
 import numpy as np
@@ -116,13 +117,19 @@ class FieldOfView:
         azimuth, elevation, distance = ((one[0], one[1]) for one in (view.azimuth, view.elevation, view.range))
         return cls(azimuth, elevation, distance, pose)
 
+    def at(self, pose: Pose) -> Self:
+        """Return the same intervals with a pose of the sensor."""
+        placed = object.__new__(type(self))
+        placed.__dict__.update(self.__dict__, pose=pose)
+        return placed
+
     @property
     def width(self) -> float:
         """Width of the sector of azimuth, rad."""
         begin, end = self.azimuth
         return end - begin if end >= begin else end - begin + 2.0 * math.pi
 
-    @property
+    @cached_property
     def limits(self) -> Array:
         """The intervals as `shares_in_view` compares them, (7,).
 

@@ -8,7 +8,7 @@ coordinates to the world.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
@@ -65,8 +65,8 @@ class Pose:
         norm = math.sqrt(w * w + x * x + y * y + z * z)
         if abs(norm - 1.0) > UNIT_TOLERANCE:
             raise FrameError("pose.quaternion", "a unit quaternion (w, x, y, z)", f"norm {norm:.6g}")
-        object.__setattr__(self, "translation", translation)
-        object.__setattr__(self, "quaternion", quaternion / norm)
+        # Copies can be written to, as where there is no pose: so they are one type for the kernels.
+        self.__dict__.update(translation=translation.copy(), quaternion=quaternion / norm)
 
     @property
     def is_identity(self) -> bool:
@@ -292,7 +292,7 @@ def frame_of_checked(
         spread = None if spread is None else spread[source]
     columns = center, size, yaw, velocity, score, known, source
     if field_of_view is not None and field_of_view.pose is None and pose is not None:
-        field_of_view = replace(field_of_view, pose=pose)
+        field_of_view = field_of_view.at(pose)
     sensor = pose if pose is not None or field_of_view is None else field_of_view.pose
     rest = names, cloud, field_of_view, spread, sensor
     for column in columns if spread is None else (*columns, spread):

@@ -95,13 +95,13 @@ def large_head(name: str, dtype: str, shape: tuple[int, ...], offset: int) -> by
 
 @lru_cache(4096)
 def small_head(kind: type[Message], name: str, shape: tuple[int, ...]) -> tuple[bytes, int]:
-    """Return all before the data of an array, a field of a message, and their bytes; the former only of a small one."""
+    """Return all before the data of an array of a message, nothing if it is large; and how many bytes both have."""
     dtype = kind.arrays[name].dtype
     size = prod(shape) * DTYPES[dtype]
     if size >= LARGE:
         return b"", size
     field: bytes = _msgpack.packb({name: {"dtype": dtype, "shape": shape, "data": bytes(size)}})
-    return field[1 : len(field) - size], size
+    return field[1 : len(field) - size], len(field) - 1
 
 
 @lru_cache(1024)

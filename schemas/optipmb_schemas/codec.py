@@ -99,11 +99,12 @@ def encode(message: Message, **others: Any) -> bytes:
             parts.append(_without_head(packer.pack(plain), len(plain)))
             offset += len(parts[-1])
             plain = {}
-        head, size = small_head(kind, name, value.shape)
+        head, length = small_head(kind, name, value.shape)
         if not head:
             head = large_head(name, kind.arrays[name].dtype, value.shape, offset)
+            length += len(head)
         parts += head, value
-        offset += len(head) + size
+        offset += length
     if plain:
         parts.append(_without_head(packer.pack(plain), len(plain)))
     return numeric.joined(parts)

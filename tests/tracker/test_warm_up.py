@@ -51,7 +51,8 @@ for seed, modules in enumerate([optipmb.Modules(), optipmb.Modules(), *baselines
         if given.cloud is not None:
             pose = optipmb.Pose(given.cloud.pose.translation, given.cloud.pose.quaternion)
             cloud = optipmb.PointCloud(read_only(given.cloud.xyz), pose)
-        frame, _ = optipmb.make_frame(parameters, pose=here if seed else None, **columns)
+        view = optipmb.FieldOfView(pose=here if seed > 4 else None) if seed > 3 else None
+        frame, _ = optipmb.make_frame(parameters, pose=here if seed else None, field_of_view=view, **columns)
         frame = replace(frame, cloud=cloud)  # as where a cloud comes after its frame
         density = tracker.step(density, frame).density
     stored = {name: read_only(column) for name, column in optipmb.columns_of(density).items()}

@@ -8,7 +8,9 @@ be viewed.
 from __future__ import annotations
 
 from dataclasses import fields
+from functools import lru_cache
 from operator import attrgetter, methodcaller
+from struct import unpack
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -28,6 +30,7 @@ IDENTITY = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0.0, 
 _COLUMNS: Final = tuple(column.name for column in fields(optipmb.Tracks))
 _seal: Final = methodcaller("setflags", False)
 _columns: Final = attrgetter(*_COLUMNS)
+_intervals: Final = attrgetter("azimuth", "elevation", "range")
 _boxes: Final = attrgetter("label", "center", "size", "yaw", "score", "velocity")
 
 
@@ -44,17 +47,29 @@ def pose_of(message: schemas.Detections | schemas.Points) -> optipmb.Pose | None
     return optipmb.Pose(translation=message.pose.translation, quaternion=message.pose.quaternion)
 
 
-def view_of(message: schemas.Detections) -> optipmb.FieldOfView | None:
+def view_of(message: schemas.Detections, pose: optipmb.Pose | None) -> optipmb.FieldOfView | None:
     """Return the field of view of a frame in the axes of its sensor, None when the sensor sees everything.
+
+    Args:
+        message: whose it is.
+        pose: `pose_of` the message.
 
     Raises:
         optipmb.FrameError: an interval is none.
     """
     if message.field_of_view is None:
         return None
-    pose = message.pose
-    place = None if pose is None else optipmb.Pose(translation=pose.translation, quaternion=pose.quaternion)
-    return optipmb.FieldOfView.of(message.field_of_view, place)
+    view = _view(*(interval.tobytes() for interval in _intervals(message.field_of_view)))
+    if pose is None and message.pose is not None:
+        pose = optipmb.Pose(translation=message.pose.translation, quaternion=message.pose.quaternion)
+    return view if pose is None else view.at(pose)
+
+
+@lru_cache(1024)
+def _view(*intervals: bytes) -> optipmb.FieldOfView:
+    """Return a field of view without its pose; a sensor has the same in every message."""
+    azimuth, elevation, distance = (unpack("2d", interval) for interval in intervals)
+    return optipmb.FieldOfView(azimuth, elevation, distance)
 
 
 def cloud_of(message: schemas.Points) -> optipmb.PointCloud:
@@ -75,8 +90,8 @@ def frame_of(parameters: optipmb.Parameters, message: schemas.Detections) -> tup
     Raises:
         optipmb.FrameError: a pose or covariance is none, or an object is too far in the world frame; `path` names it.
     """
-    columns, pose, view = _boxes(message), pose_of(message), view_of(message)
-    spread = message.position_covariance
+    columns, pose, spread = _boxes(message), pose_of(message), message.position_covariance
+    view = view_of(message, pose)
     return frame_of_checked(parameters, message.stamp_ns, message.labels, columns, pose, None, view, spread)
 
 

@@ -82,7 +82,7 @@ def test_a_checked_message_is_the_frame_that_make_frame_makes_of_it(message: sch
     if sent:
         message = schemas.decode(schemas.encode(message), schemas.Detections)
     columns = {name: getattr(message, name) for name in (*message.arrays, "stamp_ns", "labels")}
-    wanted = made(
-        optipmb.make_frame, PROFILE, pose=convert.pose_of(message), field_of_view=convert.view_of(message), **columns
-    )
+    pose = message.pose and optipmb.Pose(message.pose.translation, message.pose.quaternion)
+    columns["field_of_view"] = optipmb.FieldOfView.of(message.field_of_view, pose)
+    wanted = made(optipmb.make_frame, PROFILE, pose=pose if message.frame == "sensor" else None, **columns)
     assert made(convert.frame_of, PROFILE, message) == wanted
