@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 import optipmb
+from optipmb_service.app.control_loop import run
 from optipmb_service.app.kernels import warm_up
 from optipmb_service.app.loops import HANDOVER_S, leave
-from optipmb_service.app.service import run
 from optipmb_service.observability import logs
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.settings import Settings
