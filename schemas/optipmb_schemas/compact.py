@@ -214,9 +214,15 @@ def checked_part(kind: type[T], data: Callable[[str, int], bytes]) -> T:
     Raises:
         ValueError, TypeError, LookupError: it is for the models.
     """
+    part: T = _part_of(kind, *[data(name, length) for name, length, _, _ in _NUMBERS[kind]])
+    return part
+
+
+@lru_cache(1024)
+def _part_of(kind: type[Pose | FieldOfView], *parts: bytes) -> Any:
+    """Return the message inside of the bytes of its arrays; most sensors have the same in every message."""
     arrays = {}
-    for name, length, low, high in _NUMBERS[kind]:
-        numbers = data(name, length)
+    for (name, length, low, high), numbers in zip(_NUMBERS[kind], parts, strict=True):
         _need(all(low <= value <= high for value in unpack(f"<{length}d", numbers)))
         arrays[name] = np.frombuffer(numbers, np.float64)
     if kind is Pose:

@@ -44,7 +44,13 @@ def pose_of(message: schemas.Detections | schemas.Points) -> optipmb.Pose | None
         return None
     if message.pose is None:
         raise optipmb.FrameError("pose", "the pose of the sensor", "nothing")
-    return optipmb.Pose(translation=message.pose.translation, quaternion=message.pose.quaternion)
+    return _pose(message.pose.translation.tobytes(), message.pose.quaternion.tobytes())
+
+
+@lru_cache(1024)
+def _pose(translation: bytes, quaternion: bytes) -> optipmb.Pose:
+    """Return a pose, of which many sensors have the same in every message."""
+    return optipmb.Pose(np.frombuffer(translation), np.frombuffer(quaternion))
 
 
 def view_of(message: schemas.Detections, pose: optipmb.Pose | None) -> optipmb.FieldOfView | None:
@@ -61,7 +67,7 @@ def view_of(message: schemas.Detections, pose: optipmb.Pose | None) -> optipmb.F
         return None
     view = _view(*(interval.tobytes() for interval in _intervals(message.field_of_view)))
     if pose is None and message.pose is not None:
-        pose = optipmb.Pose(translation=message.pose.translation, quaternion=message.pose.quaternion)
+        pose = _pose(message.pose.translation.tobytes(), message.pose.quaternion.tobytes())
     return view if pose is None else view.at(pose)
 
 
