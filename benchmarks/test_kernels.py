@@ -11,7 +11,7 @@ from settled import PARAMETERS, settled
 import optipmb
 from optipmb.association import associate
 from optipmb.class_posterior import UNGROUPED
-from optipmb.density import BernoulliArrays, PoissonArrays, columns_of_rows
+from optipmb.density import BernoulliArrays, PoissonArrays, columns_of_components, columns_of_objects
 from optipmb.hypotheses import local_hypotheses
 from optipmb.points import points_in_boxes
 from optipmb.predict import predict
@@ -60,7 +60,7 @@ def before_association(objects: int) -> tuple[Any, ...]:
     measurements, _, _ = preprocess(frame, TABLE)
     old, new = density.bernoulli, density.poisson
     p_d = TABLE["detection"][old.label], TABLE["detection"][new.label]
-    known, undetected = BernoulliArrays(*columns_of_rows(old)), PoissonArrays(*columns_of_rows(new))
+    known, undetected = BernoulliArrays(*columns_of_objects(old)), PoissonArrays(*columns_of_components(new))
     given = known, UNGROUPED, p_d[0], undetected, p_d[1], measurements, TABLE.period, TABLE.period
     return *given, TABLE.confusion, TABLE.classes
 

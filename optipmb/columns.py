@@ -20,7 +20,8 @@ from optipmb.density import (
     Misses,
     PoissonArrays,
     Poissons,
-    columns_of_rows,
+    columns_of_components,
+    columns_of_objects,
 )
 from optipmb.errors import DensityError
 
@@ -48,7 +49,7 @@ def fitting(density: Density, classes: int) -> bool:
     misses, objects, pi = density.misses, density.bernoulli, density.class_probability
     if pi is not None and not (isinstance(pi, np.ndarray) and pi.shape == (len(objects.label), classes)):
         return False
-    columns = columns_of_rows(objects), columns_of_rows(density.poisson)
+    columns = columns_of_objects(objects), columns_of_components(density.poisson)
     try:
         return (
             only_arrays(*columns)

@@ -22,7 +22,7 @@ from optipmb.compiled import kernel
 from optipmb.records import INDEX, Columns, record
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
@@ -183,13 +183,9 @@ BernoulliArrays: Final[Any] = _arrays(Bernoullis, "BernoulliArrays")
 PoissonArrays: Final[Any] = _arrays(Poissons, "PoissonArrays")
 """The columns of the records by the same names, as kernels know them: they take no dataclass."""
 
-_objects: Final = attrgetter(*BernoulliArrays._fields)
-_components: Final = attrgetter(*PoissonArrays._fields)
-
-
-def columns_of_rows(rows: Bernoullis | Poissons) -> Columns:
-    """Return the columns as kernels take them."""
-    return _objects(rows) if isinstance(rows, Bernoullis) else _components(rows)
+columns_of_objects: Final[Callable[[Bernoullis], Columns]] = attrgetter(*BernoulliArrays._fields)
+columns_of_components: Final[Callable[[Poissons], Columns]] = attrgetter(*PoissonArrays._fields)
+"""Return the columns as kernels take them."""
 
 
 @record

@@ -9,7 +9,19 @@ import numpy as np
 
 from optipmb.calibration import calibrate_rows
 from optipmb.compiled import kernel
-from optipmb.density import OMEGA, PHI, STATE, A, BernoulliArrays, V, X, Y, columns_of_rows, copy_state, whole_periods
+from optipmb.density import (
+    OMEGA,
+    PHI,
+    STATE,
+    A,
+    BernoulliArrays,
+    V,
+    X,
+    Y,
+    columns_of_objects,
+    copy_state,
+    whole_periods,
+)
 from optipmb.heading import doubt, sign_probability
 from optipmb.position_noise import PLAIN
 from optipmb.preprocess import Measurements
@@ -100,7 +112,7 @@ def extract(
     """
     return Tracks(
         *extract_tracks(
-            columns_of_rows(bernoulli),
+            columns_of_objects(bernoulli),
             missed_from_ns,
             measurement,
             tuple(measurements),

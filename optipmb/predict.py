@@ -18,7 +18,8 @@ from optipmb.density import (
     Density,
     PoissonArrays,
     Poissons,
-    columns_of_rows,
+    columns_of_components,
+    columns_of_objects,
     whole_periods,
 )
 from optipmb.motion import predict_state
@@ -64,7 +65,7 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     bernoulli, poisson, misses = density.bernoulli, density.poisson, density.misses
     before_ns = density.stamp_ns
     dt = 0.0 if before_ns == NO_FRAME else (stamp_ns - before_ns) * 1e-9
-    given, undetected = columns_of_rows(bernoulli), columns_of_rows(poisson)
+    given, undetected = columns_of_objects(bernoulli), columns_of_components(poisson)
     if dt == 0.0 or misses is not None or len(table.confusion) or not only_arrays(given, undetected):
         check_fitting(density, density.labels)
     if dt == 0.0:
@@ -86,7 +87,7 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
         raise
     kept, mean, covariance, existence, repaired = objects
     pi = predict_classes(density, kept, dt, table)
-    if kept.shape[0] < len(bernoulli):
+    if kept.shape[0] < bernoulli.existence.shape[0]:
         bernoulli = bernoulli.take(kept)
         misses = None if misses is None else misses.take(kept)
     bernoulli = Bernoullis(
@@ -105,7 +106,7 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
         bernoulli.confirmed,
     )
     kept, mean, covariance, weight, repaired_poisson = components
-    if kept.shape[0] < len(poisson):
+    if kept.shape[0] < poisson.weight.shape[0]:
         poisson = poisson.take(kept)
     poisson = Poissons(mean, covariance, weight, poisson.label, poisson.auxiliary, poisson.born_ns)
     posterior = Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses, pi)

@@ -20,7 +20,8 @@ from optipmb.density import (
     Density,
     PoissonArrays,
     Poissons,
-    columns_of_rows,
+    columns_of_components,
+    columns_of_objects,
 )
 from optipmb.detection_probability import detection_probability, over_time
 from optipmb.effort import UNLIMITED, check_effort
@@ -230,12 +231,13 @@ class Tracker:
         self._max_pairs = max_pairs
         self.parameters = parameters
         self.modules = modules if modules is not None else Modules()
+        self._labels = parameters.labels
         self._table = ClassTable.of(parameters)
         self._horizons = np.array(parameters.horizons, np.float64)
 
     def initial(self, next_id: int = 1) -> Density:
         """Return the density before the first frame."""
-        return Density.empty(self.parameters.labels, next_id)
+        return Density.empty(self._labels, next_id)
 
     def step(self, density: Density, frame: Frame) -> StepResult:
         """Run one recursion of Algorithm 1.
@@ -274,11 +276,11 @@ class Tracker:
         missed_from_ns = predicted.missed_from_ns if looks is None else looks.misses.missed_from_ns
         pi = predicted.class_probability
         columns, class_probability, undetected, row, hits, known, detected, repaired_now = update(
-            columns_of_rows(bernoulli),
+            columns_of_objects(bernoulli),
             UNGROUPED if pi is None else pi,
             p_d,
             missed_from_ns,
-            columns_of_rows(poisson),
+            columns_of_components(poisson),
             p_d_poisson,
             len(predicted.poisson),
             tuple(measurements),
@@ -319,9 +321,9 @@ class Tracker:
 
     def _check(self, density: Density, frame: Frame) -> None:
         """Refuse other classes, which kernels would read out of bounds for, and frames of the past."""
-        labels = self.parameters.labels
+        labels = self._labels
         for path, given in (("labels", frame.labels), ("density.labels", density.labels)):
-            if given != labels:
+            if given is not labels and given != labels:
                 raise FrameError(path, f"the classes of profile {self.parameters.name}, {labels}", str(given)[:200])
         if density.stamp_ns != NO_FRAME and frame.stamp_ns < density.stamp_ns:
             raise FrameError("stamp_ns", f"a stamp from {density.stamp_ns} on", str(frame.stamp_ns))

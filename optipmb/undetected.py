@@ -12,7 +12,7 @@ import numpy as np
 
 from optipmb.birth import birth_states
 from optipmb.compiled import kernel
-from optipmb.density import STATE, PoissonArrays, Poissons, columns_of_rows, copy_state, whole_periods
+from optipmb.density import STATE, PoissonArrays, Poissons, columns_of_components, copy_state, whole_periods
 from optipmb.hypotheses import CLUTTER
 
 if TYPE_CHECKING:
@@ -132,6 +132,6 @@ def with_measurement_births(
     kept, born = np.arange(len(poisson)), np.arange(measurements.score.shape[0])
     return Poissons(
         *with_births(
-            PoissonArrays(*columns_of_rows(poisson)), kept, born, weight, measurements, stamp_ns, table.classes
+            PoissonArrays(*columns_of_components(poisson)), kept, born, weight, measurements, stamp_ns, table.classes
         )
     )

@@ -18,7 +18,7 @@ from optipmb.association import UNASSIGNED
 from optipmb.birth import birth_states, first_detected_states, moment_match
 from optipmb.births_beside import forbid_births
 from optipmb.calibration import SURE, calibrate_rows
-from optipmb.density import BernoulliArrays, Bernoullis, PoissonArrays, Poissons, columns_of_rows, whole_periods
+from optipmb.density import BernoulliArrays, Bernoullis, PoissonArrays, Poissons, columns_of_objects, whole_periods
 from optipmb.extract import extract_tracks, select_tracks
 from optipmb.geometry import bev_iou, box_iou, iou_exceeds
 from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN, Hypotheses
@@ -367,7 +367,7 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
         mean, covariance, r, label, auxiliary, identity, born, seen, score, evidence, odds, extracted, after
     )
     (ids, labels, center, size, heading_, facing_, velocity, rate, acceleration, *told, age, since, detection, now) = (
-        extract_tracks(columns_of_rows(objects), seen, measurement, tuple(measured), NOW, True, PERIOD, classes)
+        extract_tracks(columns_of_objects(objects), seen, measurement, tuple(measured), NOW, True, PERIOD, classes)
     )
     out = center, size, heading_, facing_, velocity, rate, acceleration, age, since
     wanted_now = told[0] >= np.where(before[rows], low[label[rows]], high[label[rows]])

@@ -15,7 +15,7 @@ from scenes import boxes
 
 import optipmb
 from optipmb.columns import columns_fit, fitting
-from optipmb.density import columns_of_rows
+from optipmb.density import columns_of_components, columns_of_objects
 from optipmb.warm import compilations
 
 KITTI, NUSCENES = optipmb.load_profile("kitti"), optipmb.load_profile("nuscenes")
@@ -68,7 +68,7 @@ def test_columns_fit_as_numpy_says(seed: int) -> None:
     """Shapes of one length in every column, and classes that exist."""
     rng = np.random.default_rng(seed)
     density = settled()
-    objects, components = (columns_of_rows(one) for one in (density.bernoulli, density.poisson))
+    objects, components = columns_of_objects(density.bernoulli), columns_of_components(density.poisson)
     assert columns_fit(objects, components, 3)
     for columns in (objects, components):
         place = int(rng.integers(0, len(columns)))

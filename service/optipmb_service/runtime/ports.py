@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol
-
-from optipmb.records import record
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -16,7 +15,7 @@ PACKET_BYTES: Final = 512
 """What a message takes beside its payload, nearly."""
 
 
-@record
+@dataclass(slots=True)
 class Packet:
     """A message as it arrived, not decoded.
 
@@ -27,6 +26,8 @@ class Packet:
         encoding: the Zenoh encoding, as a text.
         wall_ns: arrival by the wall clock, ns since 1970; only reported, never decided by.
         now_ns: arrival by the monotonic clock, ns.
+        origin: what tells the stream: the key without its topic.
+        held: bytes that it takes while it waits.
     """
 
     key: str
@@ -35,16 +36,12 @@ class Packet:
     encoding: str
     wall_ns: int
     now_ns: int
+    origin: str = field(init=False)
+    held: int = field(init=False)
 
-    @property
-    def origin(self) -> str:
-        """What tells the stream: the key without its topic."""
-        return self.key.rpartition("/")[0]
-
-    @property
-    def held(self) -> int:
-        """Bytes that it takes while it waits."""
-        return PACKET_BYTES + (0 if self.payload is None else self.size)
+    def __post_init__(self) -> None:
+        self.origin = self.key.rpartition("/")[0]
+        self.held = PACKET_BYTES + (0 if self.payload is None else self.size)
 
 
 class Caches(Protocol):

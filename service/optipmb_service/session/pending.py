@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from bisect import insort
 from dataclasses import replace
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
 
 from optipmb.records import record
@@ -48,6 +49,7 @@ class Held:
         ignored: objects left out of it.
         deadline_ns: until when it waits for its cloud (monotonic); None: it does not.
         ticket: what the caller gave with it.
+        weight: bytes that it takes, nearly.
         judged: the timeline that it was judged by, and the decision and the timeline that came of it.
     """
 
@@ -58,6 +60,7 @@ class Held:
     ignored: int
     deadline_ns: int | None
     ticket: Any
+    weight: int
     judged: Judged
 
 
@@ -68,6 +71,9 @@ class Ready:
     held: Held
     points: schemas.Points | None
     missed: bool
+
+
+_order: Final = attrgetter("order")
 
 
 class PendingFrames:
@@ -125,10 +131,10 @@ class PendingFrames:
             cloud_wait_ns=self.policy.cloud_wait_ns,
             cloud_memory_ns=self.policy.cloud_memory_ns,
         )
-        self.held_bytes += size_of(message, None)
-        order = judged[1].place.order(frame_id)
-        held = Held(message, frame_id, order, frame, ignored, deadline_ns, ticket, judged)
-        insort(self._held, held, key=lambda one: one.order)
+        weight, order = size_of(message), judged[1].place.order(frame_id)
+        self.held_bytes += weight
+        held = Held(message, frame_id, order, frame, ignored, deadline_ns, ticket, weight, judged)
+        insort(self._held, held, key=_order)
 
     def follow(self, past: Timeline | FusedTimeline, base: FilterState, gone: frozenset[FrameId]) -> None:
         """Take over where the past is now.
@@ -202,7 +208,7 @@ class PendingFrames:
         if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not (many or self._crowded(head)):
             return None
         del self._held[0]
-        self.held_bytes -= size_of(head.message, None)
+        self.held_bytes -= head.weight
         return Ready(head, points, missed)
 
     def _cloud(self, held: Held) -> schemas.Points | None:

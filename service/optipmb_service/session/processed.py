@@ -15,7 +15,7 @@ from optipmb_service.session.checkpoint import Recorded
 from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.reorder_window import ReorderWindow
 from optipmb_service.session.restored_window import window_of
-from optipmb_service.session.state import Entry, size_of
+from optipmb_service.session.state import Entry
 from optipmb_service.session.timeline import Timeline
 from optipmb_service.session.transition import Transition, empty
 
@@ -76,9 +76,11 @@ class ProcessedFrames:
             decision: that it is admitted.
             timeline: with it.
         """
-        frame_id, message, points = ready.held.frame_id, ready.held.message, ready.points
-        frame, ignored, weight = ready.held.frame, ready.held.ignored, size_of(message, points)
-        entry = Entry(frame_id, decision.place, message, points, ready.missed, 0, frame, ignored, weight)
+        held, points = ready.held, ready.points
+        weight = held.weight if points is None else held.weight + points.xyz.nbytes
+        entry = Entry(
+            held.frame_id, decision.place, held.message, points, ready.missed, 0, held.frame, held.ignored, weight
+        )
         return [*self.entries, entry] if decision.last else self._history.inserted(entry, timeline.places())
 
     def amended(self, points: schemas.Points, frame_id: FrameId) -> list[Entry] | None:

@@ -48,11 +48,8 @@ class ReorderWindow:
         self._after: list[FilterState | None] = [None] * len(self._entries)
         if self._entries:
             self._after[-1] = head
-
-    @property
-    def head(self) -> FilterState:
+        self.head = self.state(len(self._entries))
         """The present state."""
-        return self.state(len(self._entries))
 
     @property
     def entries(self) -> tuple[Entry, ...]:
@@ -76,6 +73,7 @@ class ReorderWindow:
         state, outcome = self.step(self.head, entry)
         self._entries.append(entry)
         self._after.append(state)
+        self.head = state
         return [outcome]
 
     def inserted(self, entry: Entry, places: Mapping[FrameId, Placement]) -> list[Entry]:
@@ -125,6 +123,7 @@ class ReorderWindow:
             outcomes.append(outcome)
         self._entries = entries
         self._after = [*self._after[:first], *after]
+        self.head = state
         return outcomes
 
     def trim(self, policy: Policy) -> frozenset[FrameId]:
@@ -135,7 +134,7 @@ class ReorderWindow:
         if not cut:
             return frozenset()
         self.base = self.state(cut)
-        gone = frozenset(entry.frame_id for entry in self._entries[:cut])
+        gone = frozenset([entry.frame_id for entry in self._entries[:cut]])
         del self._entries[:cut], self._after[:cut]
         return gone
 
@@ -151,7 +150,8 @@ class ReorderWindow:
             # Mostly all but the oldest few fit, and they are of one generation: their span is that of the two ends.
             last, first = entries[-1], 0
             if span_ns is not None and entries[0].place.generation == last.place.generation:
-                while last.time_ns - entries[first].time_ns > span_ns:
+                since_ns = last.time_ns - span_ns
+                while entries[first].time_ns < since_ns:
                     first += 1
                 return len(entries) - first
         elapsed, weight, number = 0, 0, 0

@@ -59,8 +59,7 @@ class SensorQueues:
             now_ns: monotonic time; None: nothing waits any longer.
             complete: whether no frame is missing before one.
         """
-        waiting = [one for one in self.pending.values() if len(one)]
-        for one in waiting if len(waiting) < 2 else sorted(waiting, key=_earliest):  # noqa: PLR2004 - one is in order
+        for one in self.pending.values() if len(self.pending) == 1 else sorted(self.pending.values(), key=_earliest):
             if ready := one.take(now_ns, complete):
                 return ready
         return None

@@ -163,10 +163,11 @@ class Entry:
     @property
     def time_ns(self) -> int:
         """The stamp by which it is ordered."""
-        return self.place.time_ns(self.frame_id)
+        place = self.place
+        return self.frame_id.stamp_ns if place.at_ns is None else place.at_ns
 
 
-def size_of(message: schemas.Detections, points: schemas.Points | None) -> int:
+def size_of(message: schemas.Detections, points: schemas.Points | None = None) -> int:
     """Return the bytes that the inputs of a frame take, nearly."""
     row = _ROW if message.velocity is None else _ROW + _VELOCITY
     return 256 + row * len(message.label) + (points.xyz.nbytes if points is not None else 0)

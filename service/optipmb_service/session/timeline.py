@@ -114,7 +114,8 @@ class Placement:
 
     def order(self, frame_id: FrameId) -> Order:
         """Return the key by which frames are processed."""
-        return self.generation, self.time_ns(frame_id), frame_id.sensor, self.era, frame_id.seq
+        time_ns = frame_id.stamp_ns if self.at_ns is None else self.at_ns
+        return self.generation, time_ns, frame_id.sensor, self.era, frame_id.seq
 
 
 @record
@@ -161,8 +162,11 @@ class Cursor:
         if place.opens is Verdict.UNCONFIRMED:
             jumped = self._agreeing(frame_id)
             return replace(self, seq=max(self.seq, frame_id.seq), jumped=jumped, jumped_ns=frame_id.stamp_ns)
-        newest_ns = max(self.newest_ns, frame_id.stamp_ns) if place.era == self.era else frame_id.stamp_ns
-        seq = max(self.seq, frame_id.seq) if frame_id.epoch == self.epoch else frame_id.seq
+        newest_ns, seq = frame_id.stamp_ns, frame_id.seq
+        if place.era == self.era and self.newest_ns > newest_ns:
+            newest_ns = self.newest_ns
+        if frame_id.epoch == self.epoch and self.seq > seq:
+            seq = self.seq
         return Cursor(frame_id.epoch, seq, place.era, place.generation, newest_ns, place.floor_ns)
 
     def _agreeing(self, frame_id: FrameId) -> int:
