@@ -26,11 +26,12 @@ import structlog
 
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.runtime.directory import StreamDirectory, node_of
+from optipmb_service.runtime.handover import Handover, Others
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.values import SECOND
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable
 
     from optipmb_service.cluster.member import Member
     from optipmb_service.runtime.ports import Packet
@@ -45,11 +46,6 @@ ALL: Final = ""
 """Instead of a stream: all of them."""
 
 EXPIRY_S: Final = 1.0
-DRAIN_S: Final = 0.5
-"""How long who is asked for what came lately waits for what is still on its way through this process."""
-
-DRAIN_POLL_S: Final = 0.005
-
 NEW_STREAMS: Final = 128
 """New streams that are taken in at once, and announced at once, and none while the lease is renewed late.
 
@@ -79,7 +75,7 @@ def _inputs(streams: Iterable[str]) -> set[Input]:
     return of_all | {Input(kind, stream, cached) for stream in streams for kind in kinds for cached in (False, True)}
 
 
-class Inputs(Protocol):
+class Inputs(Others, Protocol):
     """What is needed of the network."""
 
     def receive(
@@ -109,14 +105,8 @@ class Inputs(Protocol):
     def discover(self, streams: set[str]) -> None:
         """Announce these streams, and no others."""
 
-    def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
-        """Return what other instances have received lately of sessions, each packet with whether it is a frame."""
-
     def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
         """Call `then` soon with what the caches of a stream hold, all frames, and with whether all have answered."""
-
-    def pass_through(self, timeout: float) -> None:
-        """Wait until what has come is handed over, for a moment at most (s)."""
 
 
 class Intake:
@@ -156,8 +146,7 @@ class Intake:
         self._came: set[int] = set()
         self._left: dict[int, int] = {}
         self._received: set[int] = set()
-        self._owed: set[str] = set()
-        self._handed = threading.Condition()
+        self._handover = Handover(registry, member, inputs)
         self._wake = threading.Event()
         self._hurry = threading.Event()
         self._expires_ns = 0
@@ -193,9 +182,7 @@ class Intake:
             elif change is Change.LOST:
                 self._came.discard(partition)
                 self._left[partition] = time.monotonic_ns() + self._linger_ns
-        with self._handed:
-            owed = self._registry.untracked.of_partitions({partition})
-            (self._owed.update if change is Change.LOST else self._owed.difference_update)(owed)
+        (self._handover.lost if change is Change.LOST else self._handover.kept)(partition)
         self._hurry.set()
         self._wake.set()
 
@@ -207,35 +194,13 @@ class Intake:
 
     def hand_over(self, sessions: Iterable[str], give: Callable[[Packet], None]) -> None:
         """Give what was received lately of sessions that are tracked elsewhere now, the oldest first."""
-        sessions = list(sessions)
-        asked = [session for session in sessions if self._may_have(session)]
-        if asked:
-            self._drain(asked)
-            for packet in self._registry.untracked.recent(asked):
-                give(packet)
-            with self._handed:
-                self._owed.difference_update(asked)
-                self._handed.notify_all()
-        # Who asks has subscribed already.
-        still = {partition_of(session) for session in self._owed.copy()}
+        given = self._handover.give(
+            list(sessions), lambda one: DISCOVERY in self._received or one in self._received, give
+        )
         with self._lock:
-            for partition in {partition_of(session) for session in sessions} - still:
+            for partition in given:
                 self._left.pop(partition, None)
         self._wake.set()
-
-    def _may_have(self, session: str) -> bool:
-        """Whether something of a session that is tracked elsewhere may have come, or be on its way through here."""
-        if self._member.holds(session):
-            return False
-        subscribed = DISCOVERY in self._received or partition_of(session) in self._received
-        return subscribed or session in self._registry.untracked
-
-    def _drain(self, sessions: list[str]) -> None:
-        """Wait for what is on its way through this process, for a moment at most."""
-        ends = time.monotonic() + DRAIN_S
-        self._inputs.pass_through(DRAIN_S)
-        while any(self._registry.waits(session) for session in sessions) and time.monotonic() < ends:
-            time.sleep(DRAIN_POLL_S)
 
     def awaited(self, session: str, sensors: Iterable[str]) -> dict[str, bool]:
         """Return the streams of a session whose caches may hold something, each with whether its publisher is there.
@@ -257,8 +222,7 @@ class Intake:
 
     def handed_over(self, timeout: float) -> bool:
         """Wait until who has the partitions that were left has asked, at most so long (s); False when that was it."""
-        with self._handed:
-            return self._handed.wait_for(lambda: not self._owed, timeout)
+        return self._handover.wait(timeout)
 
     # From the network
 
@@ -373,7 +337,7 @@ class Intake:
             del streams[stream]
         self._known = streams
         if coming:
-            self._take_up(coming)
+            self._handover.take(coming)
 
     def _watch_owners(self, *, discovering: bool) -> None:
         if discovering is not self._watching:
@@ -432,14 +396,3 @@ class Intake:
             and self._registry.actor(session) is None
         }  # fmt: skip
         return sorted(coming | self._registry.untracked.of_partitions(came) if came else coming)
-
-    def _take_up(self, sessions: list[str]) -> None:
-        packets: dict[str, list[tuple[Packet, bool]]] = {session: [] for session in sessions}
-        try:
-            for packet, frame in self._inputs.ask_recent(sessions):
-                _, session = self._registry.parsed(packet.key)
-                if session in packets:
-                    packets[session].append((packet, frame))
-        finally:
-            for session, found in packets.items():
-                self._registry.take_up(session, found)
