@@ -1,7 +1,6 @@
 """A session's turns on the worker: it takes up, leaves and keeps the session of its stream, and hands it what waits.
 
-All is on one worker at a time, so nothing is locked here. Most sessions are those of one stream. Where several streams
-share one (`fusion`), the actor has its name.
+All is on one worker at a time, so nothing is locked. Where several streams share a session, the actor has its name.
 
 An actor is made for whatever arrives on the key of a stream whose partition this instance holds, its session only for a
 valid message: garbage costs an actor that is gone when its mailbox is empty. Clocks: `now_ns` monotonic for all
