@@ -89,6 +89,7 @@ class ActorTable:
         with self._lock:
             if self._actors.get(actor.stream) is actor:
                 del self._actors[actor.stream]
+                self._unproven.discard(actor)
                 self._past += actor.totals()
 
     def count(self, messages: MessageCounters) -> None:
