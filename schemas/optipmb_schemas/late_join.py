@@ -97,7 +97,7 @@ class LateJoin(Generic[_S]):
         self._closed = False
 
     def take(self, sample: _S) -> None:
-        """Take a sample that the subscriber has received; to be called by one thread."""
+        """Take a sample that the subscriber has received; to be called by one thread at a time."""
         info = sample.source_info
         if info is None:  # of a publisher without a cache
             with self._lock:

@@ -58,7 +58,7 @@ class Message(BaseModel):
         """Return the message of values that are known to be valid, without checking them again.
 
         For what a program has made itself out of values that were checked. Every value has the type that the field
-        holds, arrays their dtype and order, and are read-only; all fields are given that have no default.
+        holds, arrays their dtype, C order, and are read-only; all fields are given that have no default.
         """
         return cls.of_valid(cls.optional | fields, set(fields))
 

@@ -1,6 +1,6 @@
 """A service on the network: every part of it, put together, started and ended in order.
 
-Messages go from a reader thread to a stream's mailbox to the tracking thread.
+Messages go from a thread of the network to a stream's mailbox to the tracking thread.
 
 Start: open Zenoh, subscribe, answer queries, say alive. End: withdraw the alive token, let other members take the
 streams over, stop receiving, track what was received as long as the grace lasts, close.
@@ -51,7 +51,7 @@ log = structlog.get_logger("optipmb_service")
 DRAIN_POLL_S: Final = 0.01
 JOIN_S: Final = 0.3
 SAVE_S: Final = 0.5
-"""The last checkpoints have so long even where the readers took all the time."""
+"""The last checkpoints have so long even where messages took all the time."""
 
 LEASES_S: Final = 1.0
 """What is left at the end to say that the leases are free, however long the checkpoints take."""

@@ -145,7 +145,7 @@ class Durations:
 class Metrics:
     """The figures of one process, read by any thread.
 
-    Messages of a topic are counted by the reader of the topic, all else by the thread that tracks.
+    Messages of a topic are counted one after the other, all else by the thread that tracks.
     """
 
     def __init__(self) -> None:

@@ -31,8 +31,8 @@ class Others(Protocol):
     def ask_recent(self, sessions: Sequence[str]) -> list[tuple[Packet, bool]]:
         """Return what other instances have received lately of sessions, each packet with whether it is a frame."""
 
-    def pass_through(self, timeout: float) -> None:
-        """Wait until what has come is handed over, for a moment at most (s)."""
+    def pass_through(self, then: Callable[[], None]) -> None:
+        """Call `then` when all that has come until now is handed over."""
 
 
 class Handover:
@@ -112,6 +112,8 @@ class Handover:
     def _drain(self, sessions: list[str]) -> None:
         """Wait for what is on its way through this process, for a moment at most."""
         ends = time.monotonic() + DRAIN_S
-        self._others.pass_through(DRAIN_S)
+        passed = threading.Event()
+        self._others.pass_through(passed.set)
+        passed.wait(DRAIN_S)
         while any(self._registry.waits(session) for session in sessions) and time.monotonic() < ends:
             time.sleep(DRAIN_POLL_S)

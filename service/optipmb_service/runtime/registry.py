@@ -1,7 +1,8 @@
 """All streams of the service: hands messages to the actors of their streams, and tells these what the others decide.
 
-Called by the readers, the workers, the query thread and the control loop. `actor_table` has the actors, `untracked`
-what came of streams that others track, `admission` says who has room, and `sweep` looks at all of them now and then.
+Called by threads of the network, the workers, the query thread and the control loop. `actor_table` has the actors,
+`untracked` what came of streams that others track, `admission` says who has room, and `sweep` looks at all of them now
+and then.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ class Registry:
             tracker=tracker,
         )
 
-    # Messages, from the readers
+    # Messages, from the network
 
     def frame(self, packet: Packet) -> None:
         """Hand detections to their stream; never waits."""

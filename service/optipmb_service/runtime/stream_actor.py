@@ -94,15 +94,14 @@ class StreamActor:
     def work(self) -> bool:
         """Take some of what waits; True: come again."""
         ends_ns = time.monotonic_ns() + TURN_NS
-        paused = self._paused
         for _ in range(BATCH):
-            taken = self.mailbox.take(urgent=paused)
+            taken = self.mailbox.take(urgent=self._paused)
             if taken is None:
                 break
             self._guard(self._handle, *taken)
-            paused = self._paused
             if time.monotonic_ns() >= ends_ns:
                 break
+        paused = self._paused  # behind `take`, which answers the ring: who rings says that a pause has ended
         if not paused:
             self._out.tracks.flush()
             self._guard(self._settle)

@@ -2,7 +2,7 @@
 
 A session may be another member's, may be on its way to or from one, or may be new and wait for room. Once it is to be
 tracked here, what was kept goes first, so all that comes is kept until that has been handed over. Called by the
-readers, the workers, the intake and the control loop; one lock guards it all.
+network, the workers, the intake and the control loop; one lock guards it all.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ class UntrackedMessages:
         known = {(packet.key, packet.payload) for packet, _ in packets}
         packets = packets + [one for one in buffer.take() if (one[0].key, one[0].payload) not in known]
         take_up(session, packets, buffer.answered.copy())
-        self._forget(session)  # from now on readers hand over newer ones
+        self._forget(session)  # from now on newer ones are handed over
 
     def _buffer_of(self, session: str, now_ns: int | None = None) -> TakeoverBuffer:
         buffer = self._buffers.get(session)

@@ -11,6 +11,7 @@ is what a new subscription asks Zenoh for. What caches hold from before is asked
 from __future__ import annotations
 
 import threading
+from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -39,6 +40,9 @@ Late publishers are not detected: after a link was lost, the newest message woul
 and Zenoh would take these for lost. Heartbeats tell of what was missed.
 """
 
+MOST: Final = 256
+"""Messages of a topic that may wait while another thread hands over those before them."""
+
 RECOVERY: Final = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
 
 
@@ -62,8 +66,9 @@ class Topic:
         self._name = name
         self._session = session
         self._receive = receive
+        self._waiting: deque[Callable[[], object]] = deque()
         self._turn = threading.Lock()
-        self._closed = False
+        self._closed = threading.Event()
         self._subscribers: dict[str, tuple[str, Undeclared]] = {}
         self._late_join: LateJoin[zenoh.Sample] = LateJoin(
             self._hand_over, lambda *asked: ask_cache(session, *asked), answered
@@ -106,34 +111,47 @@ class Topic:
             undeclare(subscriber)
         if left and ALL not in self._subscribers:
             kept = frozenset(key for key, _ in self._subscribers.values())
-            with self._turn:  # what is being handed over would be known again
-                self._late_join.keep(kept)
+            # After what has come, which would be known again.
+            self._in_turn(partial(self._late_join.keep, kept))
 
-    def pass_through(self, timeout: float) -> None:
-        """Wait until what is being handed over is, at most so long (s)."""
-        if self._turn.acquire(timeout=timeout):
-            self._turn.release()
+    def pass_through(self, then: Callable[[], object]) -> None:
+        """Call `then`, on some thread, when all that has come until now is handed over."""
+        self._in_turn(then)
 
-    def close(self) -> None:
-        """End it; nothing is handed over afterwards."""
+    def close(self, timeout: float) -> None:
+        """End it; what came before is handed over within `timeout` seconds, and nothing afterwards."""
         for _, subscriber in self._subscribers.values():
             undeclare(subscriber)
         self._subscribers.clear()
-        with self._turn:
-            self._closed = True
+        self._in_turn(self._closed.set)
+        self._closed.wait(timeout)
+        self._closed.set()
         self._late_join.close()
 
     def _take(self, handle: Callable[[zenoh.Sample], None], sample: zenoh.Sample) -> None:
-        """Take a sample on the thread of the network; of several links there are several threads."""
-        with self._turn:
-            if sample.kind == zenoh.SampleKind.PUT and not self._closed:
-                self._guarded(handle, sample)
+        """Take a sample on the thread of the network that brings it; of several links there are several threads."""
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._in_turn(partial(handle, sample))
+
+    def _in_turn(self, work: Callable[[], object]) -> None:
+        """Have work done behind all that came before it: here, or by the thread that is at it already."""
+        self._waiting.append(work)
+        # Who is at it looks once more after it has let go, so nothing that came meanwhile is left. Only where much
+        # waits does this thread wait, too.
+        while self._waiting and self._turn.acquire(blocking=len(self._waiting) > MOST):
+            try:
+                while self._waiting and not self._closed.is_set():
+                    self._guarded(self._waiting.popleft())
+                if self._closed.is_set():
+                    self._waiting.clear()
+            finally:
+                self._turn.release()
 
     def _hand_over(self, sample: zenoh.Sample) -> None:
-        self._guarded(self._receive, sample)
+        self._guarded(partial(self._receive, sample))
 
-    def _guarded(self, handle: Callable[[zenoh.Sample], None], sample: zenoh.Sample) -> None:
+    def _guarded(self, work: Callable[[], object]) -> None:
         try:
-            handle(sample)
+            work()
         except Exception:
             log.exception("internal_error", topic=self._name)  # one message must not end the subscription

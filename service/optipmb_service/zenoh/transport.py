@@ -149,10 +149,10 @@ class Transport:
     def _key(self, topic: schemas.Topic, stream: str) -> str:
         return self._keys.matching(stream, topic) if stream else self._keys.all(topic)
 
-    def pass_through(self, timeout: float) -> None:
-        """Wait until what is being handed over is, at most so long (s) for each topic."""
-        for topic in self._topics.values():
-            topic.pass_through(timeout)
+    def pass_through(self, then: Callable[[], None]) -> None:
+        """Call `then` when all that has come until now is handed over."""
+        detections, points = self._topics.values()
+        detections.pass_through(lambda: points.pass_through(then))
 
     def watch_streams(
         self, published: Callable[[str, str, bool], None], discovered: Callable[[str, str, bool], None]
@@ -362,7 +362,7 @@ class Transport:
         """Receive nothing any more; what was received before is handed over within `timeout` seconds."""
         self.leave()
         for topic in self._topics.values():
-            topic.close()
+            topic.close(timeout)
         self._readers.stop(timeout)
 
     def close(self) -> None:

@@ -26,6 +26,7 @@ from optipmb_schemas import (
 )
 from optipmb_service.app.clustering import STORE_FILE
 from optipmb_service.cluster.leases import PARTITIONS
+from optipmb_service.cluster.member import Member
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime import persistence, stream_queries
@@ -273,6 +274,32 @@ def test_a_checkpoint_waits_for_a_write_lease_that_lapsed() -> None:
     until(done.is_set, "it is written")
     assert store.streams() == (CAREFUL.stream,)
     writer.close(5)
+
+
+def test_a_stream_goes_on_when_its_lease_holds_again_in_the_middle_of_a_turn(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that has found the lease lapsed, and is rung before it looks for messages, leaves none behind."""
+    lapsed, may_write, take = threading.Event(), Member.may_write, Mailbox.take
+
+    def lapses(self: Member, stream: str, fence: int | None) -> bool:
+        return not lapsed.is_set() and may_write(self, stream, fence)
+
+    def renewed_meanwhile(self: Mailbox, *, urgent: bool = False) -> Any:
+        if urgent:
+            lapsed.clear()
+            assert not self.ring()
+        return take(self, urgent=urgent)
+
+    monkeypatch.setattr(Member, "may_write", lapses)
+    monkeypatch.setattr(Mailbox, "take", renewed_meanwhile)
+    _, endpoint = start()
+    with Node(endpoint) as node:
+        node.send(CAREFUL.detections(0))
+        node.tracks(CAREFUL.stream, 1)
+        lapsed.set()
+        node.send(CAREFUL.detections(1))
+        node.tracks(CAREFUL.stream, 2)
 
 
 def test_a_question_about_the_state_keeps_no_frame_waiting(

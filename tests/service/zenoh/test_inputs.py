@@ -57,7 +57,7 @@ def network() -> Iterator[Network]:
         one = Network(session)
         one.publish(b"0", b"1")
         yield one
-        one.topic.close()
+        one.topic.close(CLOSE_S)
 
 
 def test_no_cache_is_asked_again_where_all_streams_take_over_from_one(network: Network) -> None:
@@ -103,14 +103,14 @@ def test_messages_on_their_way_when_their_stream_is_left_do_not_hide_what_follow
     publishing = threading.Thread(target=network.publish, args=(b"3",))
     publishing.start()
     arrived.wait(CLOSE_S)
-    leaving = threading.Thread(target=network.topic.leave, args=([STREAM],))
-    leaving.start()
-    network.topic.pass_through(0.01)  # as long as it may, for the message waits
+    passed = threading.Event()
+    network.topic.leave([STREAM])
+    network.topic.pass_through(passed.set)
+    assert not passed.is_set()
     go_on.set()
-    network.topic.pass_through(CLOSE_S)
+    passed.wait(CLOSE_S)
     assert b"3" in {payload for _, payload, _ in network.received.items}
     publishing.join(CLOSE_S)
-    leaving.join(CLOSE_S)
     network.publish(b"5", b"6")
     network.topic.subscribe(STREAM, KEY)
     network.publish(b"7")
@@ -152,7 +152,7 @@ def test_messages_of_several_threads_are_handed_over_one_at_a_time(network: Netw
     for sender in senders:
         sender.join(CLOSE_S)
     received.wait(lambda items: len(items) == sum(map(len, sent)), "all messages")
-    topic.close()
+    topic.close(CLOSE_S)
     network.session.put(KEYS.points(STREAM), b"afterwards")
     assert not any(together)
     for own in sent:  # each in its order, and nothing after the end
