@@ -23,7 +23,7 @@ from optipmb.compiled import kernel
 from optipmb.density import PHI, Misses, Poissons, X, Y
 from optipmb.detection_probability import over_time
 from optipmb.errors import FrameError
-from optipmb.records import INDEX, record
+from optipmb.records import INDEX, read_only, record
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -48,6 +48,9 @@ ROUNDING: Final = 1e-9
 
 _NO_LIMIT: Final = 2.0
 """No sine and no cosine is larger."""
+
+_AXES_OF_WORLD: Final = read_only(np.eye(3)), read_only(np.zeros(3))
+"""Rotation and translation where there is no pose."""
 
 
 class Intervals(Protocol):
@@ -217,7 +220,7 @@ def look(
     view = view or FieldOfView()
     if misses is None:
         misses = Misses(bernoulli.seen_ns, np.full(len(bernoulli), before_ns, np.int64))
-    axes = (np.eye(3), np.zeros(3)) if view.pose is None else (view.pose.rotation, view.pose.translation)
+    axes: tuple[Array, Array] = _AXES_OF_WORLD if view.pose is None else (view.pose.rotation, view.pose.translation)
     where = *axes, view.limits
     in_view, poisson_in_view = np.empty(len(bernoulli)), np.empty(len(poisson))
     shares_in_view(bernoulli.mean, bernoulli.covariance, bernoulli.auxiliary, *where, in_view)

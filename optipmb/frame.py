@@ -19,6 +19,7 @@ from optipmb.compiled import kernel
 from optipmb.errors import FrameError
 from optipmb.field_of_view import FieldOfView, check_view
 from optipmb.position_noise import horizontal_covariance, semidefinite
+from optipmb.records import read_only
 from optipmb.score_calibration import calibrate_scores
 
 if TYPE_CHECKING:
@@ -46,6 +47,8 @@ class Pose:
         translation: (3,) float64, m.
         quaternion: (4,) float64, unit, w x y z.
 
+    Its arrays cannot be written to: many frames may share a pose.
+
     Raises:
         FrameError: wrong shape, not finite, or no unit quaternion.
     """
@@ -65,8 +68,7 @@ class Pose:
         norm = math.sqrt(w * w + x * x + y * y + z * z)
         if abs(norm - 1.0) > UNIT_TOLERANCE:
             raise FrameError("pose.quaternion", "a unit quaternion (w, x, y, z)", f"norm {norm:.6g}")
-        # Copies can be written to, as where there is no pose: so they are one type for the kernels.
-        self.__dict__.update(translation=translation.copy(), quaternion=quaternion / norm)
+        self.__dict__.update(translation=translation, quaternion=read_only(quaternion / norm))
 
     @property
     def is_identity(self) -> bool:
@@ -77,13 +79,12 @@ class Pose:
     def rotation(self) -> NDArray[np.float64]:
         """Rotation matrix (3, 3) of the quaternion."""
         w, x, y, z = self.quaternion.tolist()
-        return np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        return read_only(np.array(rows))
 
 
 _UNTURNED: Final = ([1.0, 0.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0])
@@ -238,7 +239,7 @@ def make_frame(
     center, size = _shaped("center", center, (m, 3)), _shaped("size", size, (m, 3))
     yaw, score = _shaped("yaw", yaw, (m,)), _shaped("score", score, (m,))
     velocity = _unknown(m) if velocity is None else _shaped("velocity", velocity, (m, 2))
-    scored = _sealed(np.where(score == 0.0, 1.0, score))  # those are left out, whatever they are
+    scored = read_only(np.where(score == 0.0, 1.0, score))  # those are left out, whatever they are
     given = which, len(labels), center, size, yaw, scored, velocity
     if not allowed(*given):
         _refuse(*given)
@@ -308,7 +309,7 @@ def frame_of_checked(
 @lru_cache(64)
 def _unknown(count: int) -> NDArray[np.float64]:
     """Return the velocities of so many objects whose detector gives none."""
-    return _sealed(np.full((count, 2), np.nan))
+    return read_only(np.full((count, 2), np.nan))
 
 
 @kernel
@@ -371,13 +372,7 @@ def _integers(path: str, values: ArrayLike) -> NDArray[np.int64]:
     array = _array(path, values, None)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         raise FrameError(path, "(M,) integers", f"{array.shape} {array.dtype}")
-    return _sealed(array.astype(np.int64))
-
-
-def _sealed(array: NDArray[Any]) -> NDArray[Any]:
-    """Make an array read-only: those of a frame are, and there is one type of them for the kernels."""
-    array.flags.writeable = False
-    return array
+    return read_only(array.astype(np.int64))
 
 
 def _bounded(path: str, values: NDArray[np.float64], bound: float) -> None:
@@ -387,7 +382,7 @@ def _bounded(path: str, values: NDArray[np.float64], bound: float) -> None:
 def _array(path: str, values: ArrayLike, dtype: type[np.float64] | None) -> NDArray[Any]:
     try:
         # A copy in one piece: a frame is its own, wherever the arrays come from.
-        return _sealed(np.array(values, dtype=dtype, order="C"))
+        return read_only(np.array(values, dtype=dtype, order="C"))
     except (TypeError, ValueError) as error:
         raise FrameError(path, "an array of numbers", repr(values)[:80]) from error
 

@@ -91,7 +91,7 @@ def count_points(
     boxes, start, occupied = boxes_of_cells(low, high, x_cells, y_cells)
 
     flat = xyz.reshape(xyz.size)
-    near, cell_of = np.empty(BLOCK, np.uint32), np.empty(BLOCK, np.uint32)  # signs of indices would be looked at
+    near, cell_of = np.empty(BLOCK, np.uint32), np.empty(BLOCK, np.uint32)  # numba tests the sign of signed ones
     for first in range(0, xyz.shape[0], BLOCK):
         block = flat[3 * first : 3 * min(first + BLOCK, xyz.shape[0])]
         cells_of_points(block, x_cells, y_cells, heights, cell_of)
@@ -117,7 +117,7 @@ def count_points(
 def cells_of_points(block: Coordinates, x_cells: Cells, y_cells: Cells, heights: Cells, cell_of: Small) -> None:
     """Write the cell of each point to `cell_of`; NOWHERE where it is above or below all boxes, or NaN.
 
-    One simple loop over plain numbers, which the compiler turns into vector instructions.
+    A loop without branches, which the compiler vectorizes.
 
     Args:
         block: (3 P,) x, y, z of one point after the other, in the sensor frame.
@@ -137,7 +137,7 @@ def cells_of_points(block: Coordinates, x_cells: Cells, y_cells: Cells, heights:
 def column(coordinate: np.float32, cells: Cells) -> np.int32:
     """Return the column of the grid along one axis, in 0 to CELLS + 1; a border column for NaN.
 
-    It never falls with the coordinate, however it is rounded: what lies between the ends of a box falls between theirs.
+    It is monotonic, however it is rounded: what lies between the ends of a box has a column between theirs.
     """
     origin, per_metre = cells
     place = (coordinate - origin) * per_metre + np.float32(1.0)

@@ -8,9 +8,12 @@ For the same reason a step gives the fields of the long records by position.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final, TypeAlias, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar, dataclass_transform
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 T = TypeVar("T")
 
@@ -30,3 +33,9 @@ FLAG: Final = np.dtype(np.bool_)
 def record(cls: type[T]) -> type[T]:
     """Make a class a dataclass with slots whose fields are assigned by its constructor alone."""
     return dataclass(slots=True)(cls)
+
+
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """Make an array read-only: what a frame or a pose has can be shared, and is one type for the kernels."""
+    array.flags.writeable = False
+    return array

@@ -323,7 +323,7 @@ class Tracker:
         """Refuse other classes, which kernels would read out of bounds for, and frames of the past."""
         labels = self._labels
         for path, given in (("labels", frame.labels), ("density.labels", density.labels)):
-            if given is not labels and given != labels:
+            if given != labels:
                 raise FrameError(path, f"the classes of profile {self.parameters.name}, {labels}", str(given)[:200])
         if density.stamp_ns != NO_FRAME and frame.stamp_ns < density.stamp_ns:
             raise FrameError("stamp_ns", f"a stamp from {density.stamp_ns} on", str(frame.stamp_ns))

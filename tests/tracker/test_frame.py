@@ -180,6 +180,17 @@ def test_a_frame_does_not_share_the_callers_arrays() -> None:
     assert frame.size.max() == 1
 
 
+def test_a_pose_cannot_be_changed() -> None:
+    """Frames share poses: nobody can write to one, and it keeps no array of its caller's."""
+    translation, quaternion = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    pose = optipmb.Pose(translation, quaternion)
+    translation[0], quaternion[:] = 1.0, [0.0, 1.0, 0.0, 0.0]
+    for array in (pose.translation, pose.quaternion, pose.rotation):
+        assert not array.flags.writeable
+    np.testing.assert_array_equal(pose.translation, np.zeros(3))
+    np.testing.assert_array_equal(pose.rotation, np.eye(3))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_order_of_detections_does_not_matter_in_sensor_coordinates(seed: int) -> None:
     """Also where a pose is applied, shuffled detections give the same bytes."""
