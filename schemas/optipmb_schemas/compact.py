@@ -242,7 +242,7 @@ def _read_columns(fields: dict[str, Any], count: int) -> None:
     _need(int(label[label.argmax()]) < len(fields["labels"]))  # a negative one is larger than any
     fields["label"] = label.view(np.int64)
     columns_of = _columns if count <= MOST_CACHED else _columns.__wrapped__
-    columns, low, high = columns_of(count, fields.get("velocity") is not None)
+    columns, low, high = columns_of(count, velocity=fields.get("velocity") is not None)
     numbers = np.frombuffer(b"".join([fields[name] for name, _, _ in columns]))
     good = (numbers >= low) & (numbers <= high)
     if not good[good.argmin()]:
@@ -255,8 +255,7 @@ def _read_columns(fields: dict[str, Any], count: int) -> None:
 
 @lru_cache(64)
 def _columns(
-    count: int,
-    velocity: bool,  # noqa: FBT001 - for the cache
+    count: int, *, velocity: bool
 ) -> tuple[tuple[tuple[str, slice, tuple[int, ...]], ...], NDArray[np.float64], NDArray[np.float64]]:
     """Return name, place and shape of the columns of so many detections in one buffer, and what each number may be."""
     columns, begin, low, high = [], 0, [], []
