@@ -7,7 +7,7 @@ valid message: garbage costs an actor that is gone when its mailbox is empty. Cl
 decisions, the wall clock only for what delivery reports.
 
 The parts: `stream_tracking` takes a message through the session, under `step_limit`; `stream_outputs` has what comes
-of it; `stream_sensors` knows who feeds the session. `session_opening` restores a session or makes one, `missed_packets`
+of it; `stream_sensors` knows who feeds the session. `session_opening` restores a session or makes one, `missed_queue`
 has what it missed, `awaited_caches` which caches it waits for.
 """
 
@@ -22,7 +22,7 @@ import structlog
 from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.awaited_caches import AwaitedCaches
 from optipmb_service.runtime.mailbox import Mailbox
-from optipmb_service.runtime.missed_packets import MissedPackets
+from optipmb_service.runtime.missed_queue import MissedQueue
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.session_opening import SessionOpening
 from optipmb_service.runtime.stream_counters import StreamCounters
@@ -71,7 +71,7 @@ class StreamActor:
         self._out = StreamOutputs(stream, context, self.meter)
         self._tracking = StreamTracking(context, self._accounts, self.sensors, self._out)
         self._opening = SessionOpening(stream, context, fused=self.fused)
-        self._missed = MissedPackets(stream, context.buffer)
+        self._missed = MissedQueue(stream, context.buffer)
         self._caches = AwaitedCaches(stream, context.caches)
         self._waiting = context.buffer()
         self._asking: list[tuple[Callable[[StreamActor], None], bool]] = []
@@ -101,7 +101,7 @@ class StreamActor:
             self._guard(self._handle, *taken)
             if time.monotonic_ns() >= ends_ns:
                 break
-        paused = self._paused  # behind `take`, which answers the ring: who rings says that a pause has ended
+        paused = self._paused  # asked after `take`: a call of `ring` before that may have told that the pause has ended
         if not paused:
             self._out.tracks.flush()
             self._guard(self._settle)

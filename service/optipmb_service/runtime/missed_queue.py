@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 
-class MissedPackets:
+class MissedQueue:
     """The packets that one session has missed and not taken yet; for its worker alone.
 
     Args:
