@@ -134,10 +134,10 @@ class Topic:
             self._in_turn(partial(handle, sample))
 
     def _in_turn(self, work: Callable[[], object]) -> None:
-        """Have work done behind all that came before it: here, or by the thread that is at it already."""
+        """Have work done after all that came before it: here, or on the thread that is doing so already."""
         self._waiting.append(work)
-        # Who is at it looks once more after it has let go, so nothing that came meanwhile is left. Only where much
-        # waits does this thread wait, too.
+        # The thread that holds the lock looks at the queue again after it has released it, so nothing stays behind.
+        # This thread waits for it only where too much is in the queue.
         while self._waiting and self._turn.acquire(blocking=len(self._waiting) > MOST):
             try:
                 while self._waiting and not self._closed.is_set():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_service.zenoh.inputs
@@ -155,5 +156,41 @@ def test_messages_of_several_threads_are_handed_over_one_at_a_time(network: Netw
     topic.close(CLOSE_S)
     network.session.put(KEYS.points(STREAM), b"afterwards")
     assert not any(together)
-    for own in sent:  # each in its order, and nothing after the end
+    assert b"afterwards" not in {payload for _, payload, _ in received.items}
+    for own in sent:  # each in its order
         assert [payload for _, payload, _ in received.items if payload[0] == own[0][0]] == own
+
+
+def test_a_thread_waits_while_too_many_messages_wait(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While more messages wait than may, the thread that brings the next one waits; then all come in their order."""
+    monkeypatch.setattr(optipmb_service.zenoh.inputs, "MOST", 2)
+    arrived, may_go_on, received = threading.Event(), threading.Event(), Collected()
+
+    def receive(sample: zenoh.Sample) -> None:
+        arrived.set()
+        may_go_on.wait(CLOSE_S)
+        received.add(str(sample.key_expr), sample.payload.to_bytes(), "")
+
+    def send(*payloads: bytes) -> threading.Thread:
+        put = partial(network.session.put, KEYS.points(STREAM))
+        sender = threading.Thread(target=lambda: [put(payload) for payload in payloads])
+        sender.start()
+        return sender
+
+    sent = [bytes((number,)) for number in range(20)]
+    topic = Topic("points", network.session, receive)
+    topic.subscribe(ALL, KEYS.all("points"), cached=False)
+    senders = [send(sent[0])]
+    try:
+        arrived.wait(CLOSE_S)
+        senders.append(send(*sent[1:]))
+        senders[1].join(0.5)
+        assert senders[1].is_alive()
+        may_go_on.set()
+        received.wait(lambda items: len(items) == len(sent), "all messages")
+        assert [payload for _, payload, _ in received.items] == sent
+    finally:
+        may_go_on.set()
+        for sender in senders:
+            sender.join(CLOSE_S)  # a session is not closed while another thread is in it
+        topic.close(CLOSE_S)
