@@ -40,7 +40,6 @@ from optipmb_service.runtime.stream_actor import StreamActor
 from optipmb_service.runtime.track_publisher import TrackPublisher
 from optipmb_service.session import convert
 from optipmb_service.session.session import Session
-from optipmb_service.settings import Settings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
@@ -195,7 +194,7 @@ def measured(objects: int, points: int) -> dict[str, float]:
     with contextlib.suppress(ModuleNotFoundError):
         newer["missed"] = import_module("optipmb_service.runtime.missed_frames").NoLog()
     registry = Registry(
-        Settings(instance="cost", store="none"),
+        first_of("settings.model", "settings").Settings(instance="cost", store="none"),
         Profiles.read("nuscenes", {}),
         sink=network,
         reporter=ProblemReporter(network.publish_problem, lambda *_: None),

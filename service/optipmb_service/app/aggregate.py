@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.observability.metrics import Value
     from optipmb_service.runtime.ports import Request
-    from optipmb_service.settings import Settings
+    from optipmb_service.settings.model import Settings
 
 log = structlog.get_logger("optipmb_service")
 

@@ -23,17 +23,9 @@ from optipmb_service.app.collector import collector_paused
 from optipmb_service.app.loops import leave
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import logs
-from optipmb_service.settings import (
-    DEFAULT_GRPC,
-    DEFAULT_LISTEN,
-    DEFAULT_NATS,
-    Loaded,
-    Settings,
-    SettingsInvalidError,
-    address,
-    load,
-    state_home,
-)
+from optipmb_service.settings.forms import DEFAULT_GRPC, DEFAULT_LISTEN, DEFAULT_NATS, address
+from optipmb_service.settings.loading import Loaded, SettingsInvalidError, load
+from optipmb_service.settings.model import Settings, state_home
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

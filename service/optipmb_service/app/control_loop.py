@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.runtime.context import Actor
     from optipmb_service.runtime.profiles import Profiles
-    from optipmb_service.settings import Settings
+    from optipmb_service.settings.model import Settings
 
 log = structlog.get_logger("optipmb_service")
 

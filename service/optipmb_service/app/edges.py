@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.grpc.beside import AddFigures
     from optipmb_service.http import Source, Watched
-    from optipmb_service.settings import Settings
+    from optipmb_service.settings.model import Settings
     from optipmb_service.zenoh.client import Client
 
     class Monitored(Source, Watched, Protocol):

@@ -13,7 +13,7 @@ from optipmb_service.grpc.server import Server
 if TYPE_CHECKING:
     from optipmb_service.app.loops import StopRequest
     from optipmb_service.observability.health import ProcessHealth
-    from optipmb_service.settings import Settings
+    from optipmb_service.settings.model import Settings
     from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")

@@ -19,7 +19,7 @@ from optipmb_service.zenoh.client import Client
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from optipmb_service.settings import Settings
+    from optipmb_service.settings.model import Settings
 
 log = structlog.get_logger("optipmb_service")
 

@@ -31,7 +31,7 @@ from optipmb_service.zenoh import Transport
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from optipmb_service.settings import Settings
+    from optipmb_service.settings.model import Settings
 
 log = structlog.get_logger("optipmb_service")
 

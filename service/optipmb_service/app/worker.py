@@ -26,7 +26,7 @@ from optipmb_service.app.kernels import warm_up
 from optipmb_service.app.loops import HANDOVER_S, leave
 from optipmb_service.observability import logs
 from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.settings import Settings
+from optipmb_service.settings.model import Settings
 
 if TYPE_CHECKING:
     from optipmb_service.app.loops import StopRequest

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from optipmb_service.settings import Settings
+    from optipmb_service.settings.model import Settings
 
 log = structlog.get_logger("optipmb_service")
 

@@ -23,7 +23,7 @@ from optipmb_service.runtime.ports import TransportError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from optipmb_service.settings import Settings
+    from optipmb_service.settings.model import Settings
 
 WAIT_BEFORE_DROP_US: Final = 50_000
 WAIT_BEFORE_DROP_FRAGMENTS_US: Final = 500_000

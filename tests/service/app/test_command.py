@@ -13,7 +13,7 @@ import pytest
 from optipmb_schemas import Keys, ServiceStatus, SessionParameters
 from optipmb_service.app import cli, nats
 from optipmb_service.app.worker import run_alone
-from optipmb_service.settings import load
+from optipmb_service.settings.loading import load
 from router import Node, Sensor
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess

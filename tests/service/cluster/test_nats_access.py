@@ -19,7 +19,7 @@ from optipmb_service.app.nats import program
 from optipmb_service.cluster.jetstream import JetStream
 from optipmb_service.cluster.nats_access import NatsAccess
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.settings import SettingsInvalidError, load
+from optipmb_service.settings.loading import SettingsInvalidError, load
 from protected import MAKE, make
 from router import Node, Sensor, until
 from routers import free_endpoint, open_router

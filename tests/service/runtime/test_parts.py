@@ -18,7 +18,9 @@ from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session.cloud_buffer import CloudBuffer
 from optipmb_service.session.problems import problem_of
-from optipmb_service.settings import LimitSettings, Settings, SettingsInvalidError, load
+from optipmb_service.settings.loading import SettingsInvalidError, load
+from optipmb_service.settings.model import Settings
+from optipmb_service.settings.tables import LimitSettings
 from router import SECOND, Sensor
 
 import optipmb
