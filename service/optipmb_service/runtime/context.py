@@ -64,7 +64,7 @@ class ActorContext:
         member: says which streams are tracked here.
         checkpoint writer: where checkpoints go and come from.
         missed: what is known of the frames that a session has missed.
-        buffer: makes buffers for packets of streams that are not tracked here now.
+        buffer: makes buffers for packets that wait for their session.
         keep: takes a packet of a stream that another instance is to track.
         dump: saves what is needed to see an error of a session again; returns the file.
         caches: returns what is known of the publishers' caches.
@@ -127,4 +127,5 @@ def policy_of(settings: Settings) -> Policy:
         late_clouds=settings.late_clouds,
         recovery_wait_ns=round(settings.recovery_wait_s * SECOND),
         max_speed=settings.max_speed,
+        at_once=1,  # other streams have their turn between two frames
     )

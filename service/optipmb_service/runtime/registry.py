@@ -8,6 +8,7 @@ and then.
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
@@ -24,7 +25,7 @@ from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.rivals import Rivals
 from optipmb_service.runtime.stream_actor import StreamActor
 from optipmb_service.runtime.sweep import Sweep
-from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
+from optipmb_service.runtime.takeover_buffer import ANY_AGE_NS, TakeoverBuffer
 from optipmb_service.runtime.untracked import UntrackedMessages
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import SECOND, MessageCounters
@@ -99,10 +100,11 @@ class Registry:
         self._rivals = Rivals(round(RIVAL_LEASES * settings.lease_s * SECOND))
         standby = ByteBudget(settings.standby_mb * MEGABYTE)
 
-        def buffer() -> TakeoverBuffer:
-            return TakeoverBuffer(round(settings.standby_s * SECOND), standby)
+        def buffer(keep_ns: int = ANY_AGE_NS) -> TakeoverBuffer:
+            return TakeoverBuffer(keep_ns, standby)
 
-        self.untracked = UntrackedMessages(member.holds, buffer, self._lose)
+        standby_ns = round(settings.standby_s * SECOND)
+        self.untracked = UntrackedMessages(member.holds, partial(buffer, standby_ns), self._lose)
         self._sweep = Sweep(settings, self._actors, member, self.untracked, self.command, self._report)
         self.caches: Caches
         """What publishers keep; set before anything is received."""

@@ -164,7 +164,9 @@ class StreamActor:
         if deadline_ns <= now_ns and not self.mailbox.clouds_waiting:
             self._out.deliver(session.on_tick(now_ns), session)
             deadline_ns = session.deadline_ns
-        if deadline_ns is not None and deadline_ns != self._armed_ns:
+        if deadline_ns == 0:
+            self.mailbox.ring()  # more is ready: after the other streams
+        elif deadline_ns is not None and deadline_ns != self._armed_ns:
             self._armed_ns = deadline_ns
             self._context.arm(self, deadline_ns)
 
@@ -231,7 +233,8 @@ class StreamActor:
             if not self._open():
                 self._accounts.refuse(None, frame=frame)
                 return
-        self._waiting.add(packet, frame=frame)
+        if dropped := self._accounts.lose(self._waiting.add(packet, frame=frame, own=True)):
+            self._out.report("shed", "", "room for what waits", f"{dropped} more; dropped", count=dropped)
 
     def ask(self, command: Callable[[StreamActor], None], *, seek: bool) -> None:
         """Call `command`, as soon as no session is about to begin or end, or has to be told what it missed.
@@ -269,8 +272,7 @@ class StreamActor:
 
     def _open(self, *, seeking: bool = False) -> bool:
         """Begin to open a session, while packets wait; False when there is no room."""
-        has_room = self._opening.start(seeking=seeking)
-        if has_room:
+        if has_room := self._opening.start(seeking=seeking):
             self._load()
         return has_room
 

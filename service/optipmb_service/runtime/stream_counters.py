@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from optipmb_service.session.values import Counters, MessageCounters
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import optipmb_schemas as schemas
 
     from optipmb_service.runtime.mailbox import Mailbox
@@ -44,6 +46,14 @@ class StreamCounters:
         else:
             self._traffic.received += 1
             self._traffic.refused += 1
+
+    def lose(self, dropped: Sequence[bool]) -> int:
+        """Count messages that were dropped while they waited, each with whether it was a frame; returns the frames."""
+        frames = sum(dropped)
+        self._traffic.shed += frames
+        self._traffic.received += frames
+        self._traffic.clouds_shed += len(dropped) - frames
+        return frames
 
     def pass_on(self, frames: int) -> None:
         """Do not count frames that waited here and will be tracked, and counted, by another instance."""

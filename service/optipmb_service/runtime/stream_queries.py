@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Final, Literal, TypeVar
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
+MOST_OF_MANY: Final = 4
+"""Questions about many streams that may be open at once: each has a checkpoint of every stream that it matches."""
+
 NO_SESSION = "0" * 32
 """Session id in the state of a stream that has none."""
 
@@ -52,6 +55,7 @@ class StreamQueries:
         self._tracks = tracks
         self._keys = registry.keys
         self._digests = ThreadPoolExecutor(1, "digest")
+        self._room_of_many = threading.Semaphore(MOST_OF_MANY)
 
     def answer(self, request: Request) -> None:
         """Answer what concerns sessions, here or on the worker of the stream."""
@@ -128,7 +132,18 @@ class StreamQueries:
         if not actors:
             request.finish()
             return
-        left = _Countdown(len(actors), request.finish)
+        if not self._room_of_many.acquire(blocking=False):
+            full = schemas.MessageError(
+                "too_large", "key", f"at most {MOST_OF_MANY} queries about many streams open at once", "another one"
+            )
+            guarded(request, lambda: request.refuse(self._problem("", full, code="refused")))
+            return
+
+        def finish() -> None:
+            self._room_of_many.release()
+            request.finish()
+
+        left = _Countdown(len(actors), finish)
         for actor in actors:
             if not self._registry.command(actor.stream, self._one_of_many(request, left), urgent=True):
                 left.one()

@@ -56,12 +56,11 @@ class StreamTracking:
             self._counters.refuse(session, frame=frame)
             self.limit.refuse(stream)
             return
-        began_ns, held = time.thread_time_ns(), session.held
+        began_ns = time.thread_time_ns()
         try:
             self._track(session, packet, frame=frame)
         finally:
-            # After a restore a message may let go many that were held for it.
-            self.limit.charge(stream, (time.thread_time_ns() - began_ns) // max(1, held + frame - session.held))
+            self.limit.charge(stream, time.thread_time_ns() - began_ns)
 
     def read(
         self, packet: Packet, session: Session | None, *, frame: bool

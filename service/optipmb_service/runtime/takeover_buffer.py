@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 UNASKED_NS: Final = 120 * SECOND
 """Age at which packets are dropped that nobody has asked for yet, where the stream is new or has left a member."""
 
+ANY_AGE_NS: Final = 2**62
+"""No age is too high: the packets wait for a session that is about to take them."""
+
 
 class TakeoverBuffer:
     """The waiting packets of one stream; not for several threads at once.

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from optipmb_service.session.sensor_queues import SensorQueues
     from optipmb_service.session.state import Entry
     from optipmb_service.session.timeline import FrameId, Timeline
-    from optipmb_service.session.values import Output
+    from optipmb_service.session.values import Output, Policy
 
 
 class FrameSteps:
@@ -36,6 +36,7 @@ class FrameSteps:
         sensors: what is held.
         recovery: what of it is held for caches.
         reporting: says what became of frames.
+        policy: how many frames go through the tracker at once.
         run: see `Session.run`.
         clock: measures how long a step takes, ns.
     """
@@ -46,6 +47,7 @@ class FrameSteps:
         sensors: SensorQueues,
         recovery: Recovery,
         reporting: SessionReporting,
+        policy: Policy,
         run: int,
         clock: Callable[[], int],
     ) -> None:
@@ -53,23 +55,31 @@ class FrameSteps:
         self._sensors = sensors
         self._recovery = recovery
         self._reporting = reporting
+        self._at_once = policy.at_once
         self._clock = clock
+        self.has_ready = False
+        """Whether `advance` has left frames that may be ready."""
         self.run = run
         """See `Session.run`."""
 
     def advance(self, now_ns: int | None) -> list[Output]:
-        """Process the frames that are ready, in order.
+        """Process the frames that are ready, in order, `Policy.at_once` of them at most.
 
         Args:
-            now_ns: monotonic time; None: all of them are.
+            now_ns: monotonic time; None: all that are held are ready, and all are processed.
         """
         if now_ns is not None:
             self._recovery.now_ns = now_ns
             if (until_ns := self._sensors.recovery_ns) is not None and now_ns >= until_ns:
                 self._recovery.end()
         outputs: list[Output] = []
+        self.has_ready, taken = False, 0
         while ready := self._sensors.take(now_ns, self._recovery.complete_until):
             outputs += self._process(ready)
+            taken += 1
+            if now_ns is not None and taken >= self._at_once and self._sensors.may_wait:
+                self.has_ready = self._sensors.held > 0
+                break
         return outputs
 
     def amend(self, message: schemas.Points, frame_id: FrameId, ticket: Any) -> list[Output]:

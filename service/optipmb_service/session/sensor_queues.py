@@ -64,6 +64,16 @@ class SensorQueues:
                 return ready
         return None
 
+    @property
+    def held(self) -> int:
+        """Frames that are held; may be asked by any thread."""
+        return sum(len(one) for one in tuple(self.pending.values()))
+
+    @property
+    def may_wait(self) -> bool:
+        """Whether no sensor has more bytes held than it may."""
+        return all(one.held_bytes <= self._policy.held_bytes for one in self.pending.values())
+
     def follow(self, gone: frozenset[FrameId] = frozenset()) -> None:
         """Take over where the past is now; `gone` are the frames that have left its window."""
         for one in self.pending.values():

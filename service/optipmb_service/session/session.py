@@ -73,7 +73,9 @@ class Session:
         self._processed = ProcessedFrames(self._settings.transition(parameters), policy, life, fused=fused)
         self._sensors = SensorQueues(policy, self._processed)
         self._recovery = Recovery(policy, self._processed, self._sensors)
-        self._steps = FrameSteps(self._processed, self._sensors, self._recovery, self._reporting, life.run, clock)
+        self._steps = FrameSteps(
+            self._processed, self._sensors, self._recovery, self._reporting, policy, life.run, clock
+        )
         self._restored = False
         if not fused:
             self._sensors.of("")
@@ -152,7 +154,7 @@ class Session:
     def deadline_ns(self) -> int | None:
         """When `on_tick` is due (monotonic, ns); None while nothing is held."""
         due = [one.deadline_ns(self._recovery.complete_until) for one in self._sensors.pending.values()]
-        return min((one for one in due if one is not None), default=None)
+        return 0 if self._steps.has_ready else min((one for one in due if one is not None), default=None)
 
     def refuse(self) -> None:
         """Count a message of the stream that was none."""
@@ -335,15 +337,15 @@ class Session:
     def run(self) -> int:
         """Number that grows whenever a session of the stream begins or is taken up again, by whichever process.
 
-        A frame that was tracked before a crash, with others missing, may be tracked again after it with these there,
-        and nobody knows any more under which revision it was published. What a later run publishes of a frame holds.
+        A frame that was tracked before a crash may be tracked again after it, with others that were missing then, and
+        nobody knows any more under which revision it was published. What a later run publishes holds.
         """
         return self._steps.run
 
     @property
     def held(self) -> int:
         """Frames that wait."""
-        return sum(map(len, self._sensors.pending.values()))
+        return self._sensors.held
 
     @property
     def held_bytes(self) -> int:

@@ -64,6 +64,8 @@ class Policy:
         max_speed: fastest that a sensor moves; 0: any pose is taken.
         pose_margin: how far a pose may lie from where that speed allows.
         astray_frames: frames in a row that agree on another place until the session begins anew there.
+        at_once: frames that are ready which one call takes through the tracker; the next calls take the others. More
+            are taken only while more than `held_bytes` are held.
     """
 
     gap_limit_ns: int = 5 * SECOND
@@ -81,6 +83,7 @@ class Policy:
     max_speed: float = 100.0
     pose_margin: float = 10.0
     astray_frames: int = 5
+    at_once: int = 2**62
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ import contextlib
 import queue
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 
 import optipmb_schemas as schemas
 import structlog
@@ -40,10 +40,6 @@ class Undeclared(Protocol):
 
     def undeclare(self) -> object:
         """Withdraw it."""
-
-
-class _Dropped(Protocol):
-    def drop(self) -> object: ...
 
 
 class Putting(Protocol):
@@ -237,58 +233,6 @@ class Publisher:
             undeclare(self._token)
         self._publisher = None
         self._forget(self)
-
-
-class Question:
-    """A query; not finished, it keeps its asker waiting until the timeout."""
-
-    def __init__(self, query: zenoh.Query) -> None:
-        self._query = query
-        self.key = str(query.key_expr)
-        payload = query.payload
-        self.payload = None if payload is None else payload.to_bytes()
-        self.encoding = "" if query.encoding is None else str(query.encoding)
-
-    def matches(self, key: str) -> bool:
-        """Tell whether the key expression that was asked includes a key."""
-        return bool(self._query.key_expr.intersects(zenoh.KeyExpr(key)))
-
-    def answer(self, key: str, message: schemas.Message) -> None:
-        """Reply.
-
-        Raises:
-            TransportError: the asker or the session is gone.
-        """
-        try:
-            self._query.reply(key, schemas.encode(message), encoding=schemas.encoding_of(message))
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
-
-    def answer_text(self, key: str, text: bytes, encoding: str, *, about: str = "") -> None:
-        """Reply with bytes as they are, and with the key that they are about.
-
-        Raises:
-            TransportError: the asker or the session is gone.
-        """
-        try:
-            self._query.reply(key, text, encoding=encoding, attachment=about or None)
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
-
-    def refuse(self, problem: schemas.Problem) -> None:
-        """Reply with an error.
-
-        Raises:
-            TransportError: the asker or the session is gone.
-        """
-        try:
-            self._query.reply_err(schemas.encode(problem), encoding=schemas.encoding_of(problem))
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error
-
-    def finish(self) -> None:
-        """Tell the asker that nothing follows."""
-        cast("_Dropped", self._query).drop()
 
 
 def undeclare(declared: Undeclared) -> None:

@@ -20,13 +20,13 @@ from optipmb_service.zenoh.connection import close, line, opened
 from optipmb_service.zenoh.handles import (
     Channel,
     Publisher,
-    Question,
     Readers,
     cached_publisher,
     publish_problem,
     undeclare,
 )
 from optipmb_service.zenoh.inputs import Topic
+from optipmb_service.zenoh.queries import OpenQueries
 from optipmb_service.zenoh.subscription import ask_cache
 
 if TYPE_CHECKING:
@@ -234,9 +234,9 @@ class Transport:
         return None
 
     def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
-        channel: Channel[zenoh.Query] = Channel(CHANNEL // 16)
-        queryable = self._session.declare_queryable(key, channel.handler)
-        self._readers.add("queries", queryable, channel, _answering(answer))
+        queries = OpenQueries(self._instance)
+        queryable = self._session.declare_queryable(key, queries.handler)
+        self._readers.add("queries", queryable, queries, answer)
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:
         """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
@@ -382,10 +382,6 @@ class Transport:
 def _name(stream: str, *, cached: bool) -> str:
     """Return the name of a subscription; for a moment there may be one with recovery and one without."""
     return stream if cached else f"{stream} plain"
-
-
-def _answering(answer: Callable[[Request], None]) -> Callable[[zenoh.Query], None]:
-    return lambda query: answer(Question(query))
 
 
 def _log_link(event: zenoh.TransportEvent) -> None:

@@ -203,6 +203,34 @@ def test_frames_keep_their_order_while_one_waits() -> None:
     assert [message.seq for message in tracks(one.on_points(SENSOR.points(0), 1))] == [0, 1]
 
 
+def test_frames_that_are_ready_together_go_one_at_a_time() -> None:
+    """Each call has the tracks of one frame, and the next one is due at once; they are the same bytes."""
+    one, other = session(policy=Policy(at_once=1)), session()
+    feed(one, range(20), has_points=True)
+    feed(other, range(20), has_points=True)
+    assert one.deadline_ns == WAIT_NS
+    got = []
+    while one.deadline_ns is not None:
+        found = tracks(one.on_tick(WAIT_NS))
+        assert len(found) == 1
+        assert one.deadline_ns == (0 if one.held else None)
+        got += found
+    assert [plain(a) for a in got] == [plain(b) for b in tracks(other.on_tick(WAIT_NS))]
+
+
+def test_more_than_one_at_a_time_goes_for_the_bytes_that_are_held() -> None:
+    """A large frame that comes behind small ones has so many of them go that no more bytes are held than may be."""
+    most = 100_000
+    one = session(policy=Policy(at_once=1, held_bytes=most, rewind_ns=0))
+    feed(one, range(20), has_points=True)
+    before = one.held
+    assert before == 20
+    for seq in range(20, 23):
+        one.on_detections(SENSOR.detections(seq, objects=400, has_points=True), 0)
+        assert one.held_bytes <= most
+    assert one.held < before
+
+
 def test_frames_that_overtook_each_other_while_held_are_put_in_order() -> None:
     """While nothing is processed yet, order of arrival does not matter."""
     one, other = session(), session()

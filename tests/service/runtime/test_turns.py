@@ -1,0 +1,94 @@
+"""What waits in a stream: other streams have their turn while it is worked off, and what is dropped of it counts."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+from optipmb_schemas import Keys, SessionState
+from optipmb_service.cluster.sqlite import SqliteStore
+from router import Node, Sensor, until
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    import pytest
+
+KEYS = Keys()
+CAREFUL = Sensor("site/careful/lidar")
+CARELESS = Sensor("site/careless/lidar")
+
+
+def test_frames_that_are_ready_together_keep_no_other_waiting(start: Callable[..., Any]) -> None:
+    """Sixty frames have waited for clouds that never came: another stream is tracked between them."""
+    held, wait_s = 60, 2.0
+    reached, gate, steps = threading.Event(), threading.Event(), []
+
+    class Noted:
+        def __init__(self, parameters: optipmb.Parameters) -> None:
+            self._tracker = optipmb.Tracker(parameters)
+
+        def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+            steps.append(self)
+            if len(steps) == 2:
+                reached.set()
+                assert gate.wait(60)
+            return self._tracker.step(density, frame)
+
+    service, endpoint = start(tracker=Noted, cloud_wait_s=wait_s, queue_frames=2 * held)
+
+    def queues(careful: int, careless: int) -> None:
+        expected = {CAREFUL.stream: careful, CARELESS.stream: careless}
+        until(lambda: {one.stream: one.queue for one in service.status().sessions} == expected, str(expected))
+
+    with Node(endpoint) as node:
+        node.send(CAREFUL.detections(0))
+        node.tracks(CAREFUL.stream, 1)
+        node.send(*(CARELESS.detections(seq, has_points=True) for seq in range(held)))
+        queues(0, held)
+        due = time.monotonic() + wait_s
+        node.send(CAREFUL.detections(1))
+        assert reached.wait(60)
+        node.send(CAREFUL.detections(2))
+        queues(1, held)
+        until(lambda: time.monotonic() > due, "all are due")
+        gate.set()
+        assert [one.seq for one in node.tracks(CARELESS.stream, held)] == list(range(held))
+        node.tracks(CAREFUL.stream, 3)
+    third = [index for index, one in enumerate(steps) if one is steps[0]][2]
+    assert third < held // 2
+
+
+def test_what_is_dropped_before_a_session_begins_is_counted(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """While the store is slow more comes than may wait: the oldest go, counted and reported, and the newest stay."""
+    sent, objects = 40, 1000
+    gate, load = threading.Event(), SqliteStore.load
+
+    def slow(store: SqliteStore, stream: str) -> bytes | None:
+        assert stream != CARELESS.stream or gate.wait(60)
+        return load(store, stream)
+
+    monkeypatch.setattr(SqliteStore, "load", slow)
+    service, endpoint = start(store=str(tmp_path), standby_mb=1)
+    with Node(endpoint) as node:
+        node.send(CAREFUL.detections(0))
+        node.tracks(CAREFUL.stream, 1)
+        node.send(*(CARELESS.detections(seq, objects=objects) for seq in range(sent)))
+        problem = node.problem(CARELESS.stream, "shed")
+        node.send(CAREFUL.detections(1))
+        node.tracks(CAREFUL.stream, 2)  # on the same link: what was sent before has come
+        gate.set()
+        node.tracks(CARELESS.stream, 1)
+        until(lambda: node.ask(KEYS.query(CARELESS.stream, "state"), SessionState).queue == 0, "all are tracked")
+        state, status = node.ask(KEYS.query(CARELESS.stream, "state"), SessionState), service.status()
+        tracked = [one.seq for one in node.tracks(CARELESS.stream, state.frames)]
+    assert "room" in problem.expected
+    assert tracked == list(range(sent - state.frames, sent))
+    assert 0 < state.frames < sent
+    assert (status.received, status.shed) == (sent + 2, sent - state.frames)

@@ -1,0 +1,61 @@
+"""Queries that come faster than they are answered."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import TYPE_CHECKING, Any, Final
+
+import optipmb_service.zenoh.queries
+import pytest
+from optipmb_schemas import Keys, Problem, SessionState, decode
+from optipmb_service.runtime import stream_queries
+from router import Node, Sensor
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+KEYS: Final = Keys()
+SENSOR: Final = Sensor()
+ASK_S: Final = 60.0
+MOST: Final = 4
+ASKED: Final = 10
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "key"),
+    [
+        (optipmb_service.zenoh.queries, "MOST_OPEN", KEYS.query(SENSOR.stream, "state")),
+        (stream_queries, "MOST_OF_MANY", f"{KEYS.prefix}/*/*/*/q/state"),
+    ],
+    ids=["of one stream", "of many"],
+)
+def test_queries_beyond_those_that_may_be_open_are_refused(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, module: Any, name: str, key: str
+) -> None:
+    """Answers take a while: as many queries as may be open wait, others are refused at once, frames are tracked."""
+    gate, digest = threading.Event(), stream_queries.digest_of
+
+    def slow(checkpoint: Any) -> str:
+        assert gate.wait(ASK_S)
+        return digest(checkpoint)
+
+    monkeypatch.setattr(stream_queries, "digest_of", slow)
+    monkeypatch.setattr(module, name, MOST)
+    _, endpoint = start()
+    with Node(endpoint) as node, ThreadPoolExecutor(ASKED) as asking:
+        node.send(SENSOR.detections(0))
+        node.tracks(SENSOR.stream, 1)
+        asked = [asking.submit(node.query, key, None, ASK_S) for _ in range(ASKED)]
+        while len(done := [one for one in asked if one.done()]) < ASKED - MOST:
+            wait({*asked} - {*done}, ASK_S, "FIRST_COMPLETED")
+        node.send(SENSOR.detections(1))
+        node.tracks(SENSOR.stream, 2)
+        gate.set()
+        answers = [answer for one in asked for answer in one.result()]
+        refused = [decode(payload, Problem) for ok, _, payload in answers if not ok]
+        answered = [decode(payload, SessionState) for ok, _, payload in answers if ok]
+        assert (len(refused), len(answered)) == (ASKED - MOST, MOST)
+        assert {(one.code, str(MOST) in one.expected) for one in refused} == {("refused", True)}
+        for _ in range(2 * MOST):  # each gives its room back
+            assert [ok for ok, _, _ in node.query(key, None, ASK_S)] == [True]
