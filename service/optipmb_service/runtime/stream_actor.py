@@ -233,7 +233,7 @@ class StreamActor:
             if not self._open():
                 self._accounts.refuse(None, frame=frame)
                 return
-        if dropped := self._accounts.lose(self._waiting.add(packet, frame=frame, own=True)):
+        if dropped := self._accounts.drop(self._waiting.add(packet, frame=frame, own=True)):
             self._out.report("shed", "", "room for what waits", f"{dropped} more; dropped", count=dropped)
 
     def ask(self, command: Callable[[StreamActor], None], *, seek: bool) -> None:
@@ -367,8 +367,7 @@ class StreamActor:
             self._context.persistence.put(self.session.snapshot(), self._fence)
 
     def _drop_session(self, reason: str) -> None:
-        session = self.session
-        if session is None:
+        if (session := self.session) is None:
             return
         self.session, self._armed_ns = None, None
         self._caches.forget()

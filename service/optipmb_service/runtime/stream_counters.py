@@ -47,7 +47,7 @@ class StreamCounters:
             self._traffic.received += 1
             self._traffic.refused += 1
 
-    def lose(self, dropped: Sequence[bool]) -> int:
+    def drop(self, dropped: Sequence[bool]) -> int:
         """Count messages that were dropped while they waited, each with whether it was a frame; returns the frames."""
         frames = sum(dropped)
         self._traffic.shed += frames

@@ -7,10 +7,10 @@ saved, so that it can be seen again.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from optipmb_service.session.dump import dump_of
-from optipmb_service.session.values import MAX_ERROR, Quarantined
+from optipmb_service.session.values import MAX_ERROR, SECOND, Quarantined
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     from optipmb_service.session.sensor_queues import SensorQueues
     from optipmb_service.session.state import Entry
     from optipmb_service.session.timeline import FrameId, Timeline
-    from optipmb_service.session.values import Output, Policy
+    from optipmb_service.session.values import Output
+
+FLUSH_NS: Final = SECOND
+"""Longest time for all frames that are held at a reset, a change of parameters or the end: others wait for them."""
 
 
 class FrameSteps:
@@ -36,7 +39,6 @@ class FrameSteps:
         sensors: what is held.
         recovery: what of it is held for caches.
         reporting: says what became of frames.
-        policy: how many frames go through the tracker at once.
         run: see `Session.run`.
         clock: measures how long a step takes, ns.
     """
@@ -47,7 +49,6 @@ class FrameSteps:
         sensors: SensorQueues,
         recovery: Recovery,
         reporting: SessionReporting,
-        policy: Policy,
         run: int,
         clock: Callable[[], int],
     ) -> None:
@@ -55,7 +56,6 @@ class FrameSteps:
         self._sensors = sensors
         self._recovery = recovery
         self._reporting = reporting
-        self._at_once = policy.at_once
         self._clock = clock
         self.has_ready = False
         """Whether `advance` has left frames that may be ready."""
@@ -66,18 +66,21 @@ class FrameSteps:
         """Process the frames that are ready, in order, `Policy.at_once` of them at most.
 
         Args:
-            now_ns: monotonic time; None: all that are held are ready, and all are processed.
+            now_ns: monotonic time; None: all that are held are ready. All are processed then, within `FLUSH_NS`;
+                those left are refused.
         """
         if now_ns is not None:
             self._recovery.now_ns = now_ns
             if (until_ns := self._sensors.recovery_ns) is not None and now_ns >= until_ns:
                 self._recovery.end()
         outputs: list[Output] = []
-        self.has_ready, taken = False, 0
+        self.has_ready, taken, ends_ns = False, 0, self._clock() + FLUSH_NS
         while ready := self._sensors.take(now_ns, self._recovery.complete_until):
             outputs += self._process(ready)
             taken += 1
-            if now_ns is not None and taken >= self._at_once and self._sensors.may_wait:
+            if now_ns is None and self._clock() >= ends_ns:
+                return [*outputs, *self._refuse_held()]
+            if now_ns is not None and self._sensors.enough(taken):
                 self.has_ready = self._sensors.held > 0
                 break
         return outputs
@@ -125,6 +128,17 @@ class FrameSteps:
         took_ns = self._clock() - began_ns
         parameters = processed.transition.parameters
         return [*begun, *self._reporting.tracked(outcomes, parameters, ticket, took_ns, self.run)]
+
+    def _refuse_held(self) -> list[Output]:
+        """Refuse all frames that are held, with a problem for each sensor."""
+        problems: list[Output] = []
+        for one in self._sensors.pending.values():
+            if (first := one.first) is not None:
+                count = one.clear()
+                self._reporting.deliveries.refused += count
+                problems.append(self._reporting.complain.too_slow(first, count, FLUSH_NS))
+        self._sensors.follow()
+        return problems
 
     def _fail(self, error: Exception, placed: list[Entry], frame_id: FrameId) -> list[Output]:
         """Take no more frames of the sensor; the one that failed and what is held go, unprocessed."""

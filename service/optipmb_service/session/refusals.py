@@ -69,6 +69,11 @@ class Refusals:
         """A frame that needs too much computing."""
         return self._problem("overload", frame_id, error.path, error.expected, error.received)
 
+    def too_slow(self, first: FrameId, count: int, most_ns: int) -> schemas.Problem:
+        """Frames from one on for which there was no time when all had to be processed at once."""
+        expected = f"at most {most_ns / SECOND:g} s for all frames that waited"
+        return self._problem("overload", first, "", expected, "more").model_copy(update={"count": count})
+
     def too_many(self, frame_id: FrameId) -> schemas.Problem:
         """A sensor too many for the session."""
         return self._problem("refused", frame_id, "stream", f"at most {MAX_SENSORS} sensors in a session", "another")

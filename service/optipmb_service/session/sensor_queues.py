@@ -69,10 +69,10 @@ class SensorQueues:
         """Frames that are held; may be asked by any thread."""
         return sum(len(one) for one in tuple(self.pending.values()))
 
-    @property
-    def may_wait(self) -> bool:
-        """Whether no sensor has more bytes held than it may."""
-        return all(one.held_bytes <= self._policy.held_bytes for one in self.pending.values())
+    def enough(self, taken: int) -> bool:
+        """Whether the others wait when so many were taken at once: no sensor has more bytes held than it may."""
+        most = self._policy.held_bytes
+        return taken >= self._policy.at_once and all(one.held_bytes <= most for one in self.pending.values())
 
     def follow(self, gone: frozenset[FrameId] = frozenset()) -> None:
         """Take over where the past is now; `gone` are the frames that have left its window."""

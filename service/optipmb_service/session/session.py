@@ -73,9 +73,7 @@ class Session:
         self._processed = ProcessedFrames(self._settings.transition(parameters), policy, life, fused=fused)
         self._sensors = SensorQueues(policy, self._processed)
         self._recovery = Recovery(policy, self._processed, self._sensors)
-        self._steps = FrameSteps(
-            self._processed, self._sensors, self._recovery, self._reporting, policy, life.run, clock
-        )
+        self._steps = FrameSteps(self._processed, self._sensors, self._recovery, self._reporting, life.run, clock)
         self._restored = False
         if not fused:
             self._sensors.of("")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -229,6 +230,20 @@ def test_more_than_one_at_a_time_goes_for_the_bytes_that_are_held() -> None:
         one.on_detections(SENSOR.detections(seq, objects=400, has_points=True), 0)
         assert one.held_bytes <= most
     assert one.held < before
+
+
+def test_a_reset_takes_no_longer_than_it_may() -> None:
+    """Frames that are held go before it for a second; those left are refused, and taken when they come again."""
+    ticks = count(0, SECOND // 5)
+    one = session(clock=lambda: next(ticks))
+    feed(one, range(20), has_points=True)
+    outputs = one.reset()
+    processed = len(tracks(outputs))
+    assert 0 < processed < 10
+    found = problems(outputs)
+    assert [(one.code, one.seq, one.count) for one in found] == [("overload", processed, 20 - processed)]
+    assert (one.held, one.counters.refused) == (0, 20 - processed)
+    assert len(tracks(feed(one, range(processed, 20), has_points=False))) == 20 - processed
 
 
 def test_frames_that_overtook_each_other_while_held_are_put_in_order() -> None:
