@@ -10,9 +10,9 @@ import os
 import re
 import tomllib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_settings import EnvSettingsSource, SettingsError
 
 from optipmb_service.settings.model import PREFIX, Settings
@@ -22,6 +22,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 Source = Literal["option", "environment", "file", "default"]
+
+TABLES: Final = frozenset(
+    name
+    for name, field in Settings.model_fields.items()
+    if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+)
+"""The settings that are tables of settings and merged name by name; `profiles` is one value, whose order matters."""
 
 
 class SettingsInvalidError(ValueError):
@@ -57,8 +64,7 @@ def load(
     for source, layer in layers:
         for name, value in layer.items():
             old = values.get(name)
-            # A nested table is merged name by name; the table of profiles is one value, its order has a meaning.
-            if name == "limits" and isinstance(old, dict) and isinstance(value, dict):
+            if name in TABLES and isinstance(old, dict) and isinstance(value, dict):
                 values[name] = {**old, **value}
             else:
                 values[name] = value

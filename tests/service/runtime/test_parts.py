@@ -305,6 +305,22 @@ def test_a_misspelt_variable_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None
     assert load().unknown == ("OPTIPMB_CLOUD_WAIT",)
 
 
+def test_a_variable_in_a_table_leaves_the_rest_of_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A variable inside a table replaces its one setting of the file; the table of profiles is replaced as a whole."""
+    file = tmp_path / "service.toml"
+    file.write_text(
+        '[limits]\nmax_points = 5\n[profiles]\n"a/*/*" = "kitti"\n[ros2]\ndomain = 3\nnode = "of_file"\n'
+        '[ros2.streams."a/b/c"]\ndetections = "/of/file"\n'
+    )
+    monkeypatch.setenv("OPTIPMB_ROS2__DOMAIN", "7")
+    monkeypatch.setenv("OPTIPMB_LIMITS__MAX_BYTES", "2048")
+    monkeypatch.setenv("OPTIPMB_PROFILES", '{"b/*/*": "nuscenes"}')
+    settings = load(file).settings
+    assert (settings.ros2.domain, settings.ros2.node, list(settings.ros2.streams)) == (7, "of_file", ["a/b/c"])
+    assert (settings.limits.max_bytes, settings.limits.max_points) == (2048, 5)
+    assert settings.profiles == {"b/*/*": "nuscenes"}
+
+
 @pytest.mark.parametrize("value", ["tcp/1.2.3.4:1,tcp/[::]:2", '["tcp/1.2.3.4:1", "tcp/[::]:2"]'])
 def test_lists_in_the_environment(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     """Several endpoints in one variable, with commas or as JSON."""
