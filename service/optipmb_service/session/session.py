@@ -342,7 +342,7 @@ class Session:
 
     @property
     def held(self) -> int:
-        """Frames that wait."""
+        """Frames that wait; may be called by any thread."""
         return self._sensors.held
 
     @property

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from optipmb_schemas import Pose
 from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.fused_timeline import FusedTimeline
+from optipmb_service.session.pending import PendingFrames
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import MAX_SENSORS, Policy
 from router import SECOND, Sensor
@@ -210,6 +211,21 @@ def test_a_session_takes_so_many_sensors() -> None:
     outputs = feed(one, [0], replace(FRONT, stream="site/node/more"))
     assert [(p.code, p.stream) for p in problems(outputs)] == [("refused", "site/node/more")]
     assert len(one.density.bernoulli) == 1
+
+
+def test_the_state_can_be_told_while_a_sensor_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The state of a session may be asked for by any thread, also when a sensor comes while they are counted."""
+    one, length = fused(), PendingFrames.__len__
+    given_to(one, [FRONT.detections(0), REAR.detections(0)])
+
+    def interrupted(pending: PendingFrames) -> int:
+        one.on_detections(replace(SIDE, stream=f"site/car/lidar-{len(one.sensors)}").detections(0), 0)
+        return length(pending)
+
+    monkeypatch.setattr(PendingFrames, "__len__", interrupted)
+    before = len(one.sensors)
+    assert one.state().queue == 0
+    assert len(one.sensors) == before + 2
 
 
 def test_a_sensor_that_is_silent_makes_room_for_another() -> None:
