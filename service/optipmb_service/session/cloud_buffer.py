@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Container, Iterator
 
     import optipmb_schemas as schemas
 
@@ -36,6 +36,10 @@ class CloudBuffer:
 
     def __iter__(self) -> Iterator[schemas.Points]:
         return iter(self._kept.values())
+
+    def bytes_beside(self, used: Container[int]) -> int:
+        """Return the bytes of points kept of all clouds but some, given by `id`; may be called by any thread."""
+        return sum(cloud.xyz.nbytes for cloud in tuple(self._kept.values()) if id(cloud) not in used)
 
     def add(self, cloud: schemas.Points) -> None:
         """Keep a cloud."""

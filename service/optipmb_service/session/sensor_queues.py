@@ -118,6 +118,16 @@ class SensorQueues:
         used = frozenset(id(entry.points) for entry in self._processed.entries)
         return [one for pending in self.pending.values() for one in pending.unprocessed(used)]
 
+    def kept_bytes(self) -> int:
+        """Return the bytes of what waits, of clouds and of the window, nearly; may be called by any thread.
+
+        A cloud of the window is found by its stamp as well until its frame leaves the window: it counts once.
+        """
+        entries = self._processed.entries
+        used = frozenset(id(entry.points) for entry in entries)
+        waiting = [one.held_bytes + one.clouds.bytes_beside(used) for one in tuple(self.pending.values())]
+        return sum(entry.weight for entry in entries) + sum(waiting)
+
     def newest_cloud_ns(self) -> dict[str, int]:
         """Return the stamp of the newest cloud of each sensor that has sent one."""
         newest = ((name, one.clouds.newest_ns) for name, one in self.pending.items())

@@ -348,8 +348,7 @@ class Session:
     @property
     def held_bytes(self) -> int:
         """Bytes of the messages that are kept: frames that wait, clouds, and the window; nearly, for any thread."""
-        window = sum(entry.weight for entry in self._processed.entries)
-        return window + sum(one.held_bytes + one.clouds.bytes for one in tuple(self._sensors.pending.values()))
+        return self._sensors.kept_bytes()
 
     @property
     def quarantine(self) -> str:

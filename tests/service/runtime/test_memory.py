@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from optipmb_service.session.session import Session
+from optipmb_service.session.state import size_of
 from optipmb_service.zenoh.transport import TRACKS_CACHE
 from router import Node, Sensor
 from service_process import ServiceProcess
@@ -61,6 +62,19 @@ def test_a_worker_loads_no_solvers(busy: ServiceProcess) -> None:
     mapped = Path(f"/proc/{busy.process.pid}/maps").read_text(encoding="utf-8")
     assert "numpy/_core" in mapped
     assert [name for name in NEEDLESS if name in mapped] == []
+
+
+def test_a_cloud_counts_once() -> None:
+    """What a session keeps grows by a cloud when that comes, and by the detections alone when its frame is tracked."""
+    session = Session(SENSOR.stream, optipmb.load_profile("nuscenes"))
+    kept = []
+    for seq in range(3):
+        session.on_points(SENSOR.points(seq), 0)
+        kept.append(session.held_bytes)
+        assert session.on_detections(SENSOR.detections(seq, has_points=True), 0)
+        kept.append(session.held_bytes)
+    cloud, detections = SENSOR.points(0).xyz.nbytes, size_of(SENSOR.detections(0))
+    assert kept == [seq * (cloud + detections) + one for seq in range(3) for one in (cloud, cloud + detections)]
 
 
 def test_a_session_is_freed_at_its_end() -> None:
