@@ -26,6 +26,13 @@ SWEEP_REST: Final = 200
 MOST_REST_NS: Final = 5 * SECOND
 
 
+LITTLE: Final = 0.1
+"""Part of an equal share of the memory: a session that keeps less is not closed for it.
+
+It would free next to nothing. All such sessions keep less than a tenth of the memory, so to close others suffices.
+"""
+
+
 class Command(Protocol):
     """Has a worker run a command for a stream, after what waits there or, `urgent`, before."""
 
@@ -93,12 +100,16 @@ class Sweep:
     def _evict(self, actors: list[StreamActor]) -> None:
         """Close sessions, the least recently used first, while all together keep more than the process may."""
         held = [(actor.meter.active_ns, actor.held_bytes, actor) for actor in actors]
-        excess = sum(size for _, size, _ in held) - self._memory_mb * MEGABYTE // 2
+        most = self._memory_mb * MEGABYTE // 2
+        excess = sum(size for _, size, _ in held) - most
         if excess <= 0:
             return
+        little = LITTLE * most / len(held)
         for _, size, actor in sorted(held, key=lambda one: one[0]):
             if excess <= 0:
                 return
+            if size < little:
+                continue
             excess -= size
             self._report("refused", actor.stream, f"messages of at most {self._memory_mb} MB", "more, in all")
             self._command(actor.stream, lambda one: one.close_session("memory"), urgent=False)

@@ -7,9 +7,12 @@ import sys
 import weakref
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from optipmb_service.runtime.byte_budget import MEGABYTE
+from optipmb_service.runtime.sweep import Sweep
 from optipmb_service.session.session import Session
 from optipmb_service.session.state import size_of
 from optipmb_service.zenoh.transport import TRACKS_CACHE
@@ -75,6 +78,20 @@ def test_a_cloud_counts_once() -> None:
         kept.append(session.held_bytes)
     cloud, detections = SENSOR.points(0).xyz.nbytes, size_of(SENSOR.detections(0))
     assert kept == [seq * (cloud + detections) + one for seq in range(3) for one in (cloud, cloud + detections)]
+
+
+def test_sessions_that_keep_little_are_not_closed_for_memory() -> None:
+    """Beyond the memory sessions are closed, the least recently used first, but for those that keep next to nothing."""
+    kept_mb = [0.0, 0.01, 6.0, 0.2, 4.0, 9.0]  # the least recently used first; 10 MB may be kept
+    named = zip(map(str, range(6)), kept_mb, strict=True)
+    actors: Any = [
+        SimpleNamespace(stream=name, held_bytes=round(mb * MEGABYTE), meter=SimpleNamespace(active_ns=int(name)))
+        for name, mb in named
+    ]
+    closed, settings = list[str](), SimpleNamespace(stale_s=1.0, idle_s=1.0, memory_mb=20)
+    parts: Any = settings, None, None, None, lambda stream, *_, **__: closed.append(stream), lambda *_: None
+    Sweep(*parts)._evict(actors)
+    assert closed == ["2", "3", "4"]
 
 
 def test_a_session_is_freed_at_its_end() -> None:
