@@ -305,8 +305,8 @@ class StreamActor:
             self._fence = fence
             self._out.tracks.open(fence)
             session = self._opening.begin(restored, lineage, fence)
-            self._tracking.changed, self.session = False, session
             self._accounts.open(session)
+            self._tracking.changed, self.session = False, session
         else:
             self._opening.release()
         self._opening.end()
@@ -373,7 +373,7 @@ class StreamActor:
         self._caches.forget()
         self._missed.drop()
         self._out.tracks.close()
-        self._accounts.close(session)
+        self._accounts.close()
         self._context.release(self.stream, session.life)
         log.info(
             "session_closed", stream=self.stream, session=session.session, reason=reason, frames=session.counters.frames
@@ -389,7 +389,7 @@ class StreamActor:
 
     def totals(self) -> MessageCounters:
         """Return what became of messages since the actor is there; may be called by any thread."""
-        return self._accounts.totals(self.session)
+        return self._accounts.totals()
 
     def summary(self, now_ns: int) -> schemas.SessionSummary | None:
         """Return the line of the service's status; may be called by any thread."""

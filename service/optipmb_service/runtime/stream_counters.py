@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from optipmb_service.session.values import Counters, MessageCounters
 
@@ -14,6 +14,19 @@ if TYPE_CHECKING:
 
     from optipmb_service.runtime.mailbox import Mailbox
     from optipmb_service.session.session import Session
+
+
+class _Accounts(NamedTuple):
+    """What the totals are the sum of; replaced in one assignment, so whoever reads never sees them fall or doubled."""
+
+    session: Session | None
+    """The one that counts now."""
+    base: Counters
+    """What it had counted when it was opened."""
+    opened: MessageCounters
+    """The traffic at that time."""
+    traffic: MessageCounters
+    """What was counted beside it, and by the sessions before it."""
 
 
 class StreamCounters:
@@ -27,25 +40,24 @@ class StreamCounters:
 
     def __init__(self, mailbox: Mailbox) -> None:
         self._mailbox = mailbox
-        self._traffic = MessageCounters()
-        self._base = Counters()
-        self._opened = MessageCounters()
+        self._accounts = _Accounts(None, Counters(), MessageCounters(), MessageCounters())
         self._shed_told = 0
         self._clouds_shed_told = 0
 
     def receive(self, *, frame: bool) -> None:
         """Count a message that goes to the session."""
-        self._traffic.received += frame
+        self._accounts.traffic.received += frame
 
     def refuse(self, session: Session | None, *, frame: bool) -> None:
         """Count a message that was none, or had no room."""
+        traffic = self._accounts.traffic
         if not frame:
-            self._traffic.clouds_refused += 1
+            traffic.clouds_refused += 1
         elif session is not None:
             session.refuse()
         else:
-            self._traffic.received += 1
-            self._traffic.refused += 1
+            traffic.received += 1
+            traffic.refused += 1
 
     def drop(self, dropped: Sequence[bool]) -> int:
         """Count messages that were dropped while they waited, each with whether it was a frame; returns the frames."""
@@ -57,37 +69,40 @@ class StreamCounters:
 
     def pass_on(self, frames: int) -> None:
         """Do not count frames that waited here and will be tracked, and counted, by another instance."""
-        self._traffic.received -= frames
+        self._accounts.traffic.received -= frames
 
     def shed(self) -> int:
         """Count what the mailbox shed since the last time; returns how many frames."""
         shed, _, clouds = self._mailbox.counts()
         fresh, self._shed_told = shed - self._shed_told, shed
-        self._traffic.clouds_shed += clouds - self._clouds_shed_told
+        traffic = self._accounts.traffic
+        traffic.clouds_shed += clouds - self._clouds_shed_told
         self._clouds_shed_told = clouds
-        self._traffic.shed += fresh
-        self._traffic.received += fresh
+        traffic.shed += fresh
+        traffic.received += fresh
         return fresh
 
     def open(self, session: Session) -> None:
         """Begin to count with a session, which may have counted elsewhere before."""
-        self._base, self._opened = session.counters, replace(self._traffic)
+        traffic = self._accounts.traffic
+        self._accounts = _Accounts(session, session.counters, replace(traffic), traffic)
 
-    def close(self, session: Session) -> None:
-        """Take over what a session that ends has counted here."""
-        self._traffic = self._traffic.since(self._base, session.counters)
+    def close(self) -> None:
+        """Take over what the session that ends has counted here."""
+        self._accounts = self._accounts._replace(session=None, traffic=self.totals())
 
-    def totals(self, session: Session | None) -> MessageCounters:
-        """Return what became of messages since the actor is there."""
-        return self._traffic if session is None else self._traffic.since(self._base, session.counters)
+    def totals(self) -> MessageCounters:
+        """Return what became of messages since the actor is there; may be called by any thread."""
+        session, base, _, traffic = self._accounts
+        return traffic if session is None else traffic.since(base, session.counters)
 
     def state(self, session: Session) -> schemas.SessionState:
         """Return the state of a session with what was received and shed since it was opened."""
         shed, waiting, _ = self._mailbox.counts()
         untold = shed - self._shed_told
-        base, opened = self._base, self._opened
+        _, base, opened, traffic = self._accounts
         before = base.frames + base.duplicates + base.late + base.refused
-        state = session.state(shed=self._traffic.shed - opened.shed + untold, queue=waiting)
-        received = before + self._traffic.received - opened.received + untold + waiting
-        clouds_refused = self._traffic.clouds_refused - opened.clouds_refused
+        state = session.state(shed=traffic.shed - opened.shed + untold, queue=waiting)
+        received = before + traffic.received - opened.received + untold + waiting
+        clouds_refused = traffic.clouds_refused - opened.clouds_refused
         return state.model_copy(update={"received": received, "clouds_refused": clouds_refused})

@@ -1,0 +1,146 @@
+"""The counts of messages over all streams, as the metrics show them: they only grow, and each message counts once."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from optipmb_schemas import Detections, Keys, encode, encoding_of
+from optipmb_service.observability.metrics import Metrics
+from optipmb_service.observability.problem_reporter import ProblemReporter
+from optipmb_service.runtime import stream_actor, stream_counters
+from optipmb_service.runtime.missed_frames import NoLog
+from optipmb_service.runtime.persistence import NoPersistence
+from optipmb_service.runtime.ports import Packet
+from optipmb_service.runtime.profiles import Profiles
+from optipmb_service.runtime.registry import Registry
+from optipmb_service.session.values import MessageCounters
+from optipmb_service.settings.model import Settings
+from router import Sensor
+from sessions import chained
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType
+
+    from optipmb_service.session.checkpoint import Checkpoint
+
+SENSOR = Sensor()
+TRACED = {str(Path(module.__file__)) for module in (stream_actor, stream_counters)}
+
+
+class Around(NoPersistence):
+    """Everything around the streams: it grants them all, keeps their states, and runs their actors when told to."""
+
+    strained = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._working: list[Any] = []
+        self._kept: dict[str, Checkpoint] = {}
+
+    def submit(self, actor: Any) -> None:
+        """Take an actor that has something to do."""
+        self._working.append(actor)
+
+    def run(self) -> None:
+        """Run the actors until none has anything to do."""
+        while self._working:
+            actor = self._working.pop(0)
+            if actor.work():
+                self._working.append(actor)
+
+    def put(self, checkpoint: Checkpoint, _: int | None, then: Callable[[], None] | None = None) -> None:
+        """Keep a state."""
+        self._kept[checkpoint.stream] = checkpoint
+        if then is not None:
+            then()
+
+    def recall(self, stream: str, restore: Callable[[Checkpoint], Any], then: Callable[[Any], None]) -> None:
+        """Restore what was kept."""
+        then(restore(self._kept[stream]) if stream in self._kept else None)
+
+    def holds(self, _: str) -> bool:
+        """Every stream is tracked here."""
+        return True
+
+    def fence(self, _: str) -> int:
+        """Return the fence of all streams."""
+        return 1
+
+    def may_write(self, *_: object) -> bool:
+        """All may be published."""
+        return True
+
+    def claim(self, _: str) -> Around:
+        """Be the publisher of a stream."""
+        return self
+
+    def look(self) -> None:
+        """Nobody waits for anything."""
+
+    release = look
+
+    def publish(self, _: bytes) -> None:
+        """Tracks go nowhere."""
+
+
+def registry_of(around: Around) -> Registry:
+    """Return the streams of a process with these around it."""
+    parts: Any = around  # in the place of several
+    return Registry(
+        Settings(instance="test", store="none"),
+        Profiles.read("nuscenes", {}),
+        sink=parts,
+        reporter=ProblemReporter(lambda _: None, lambda *_: None),
+        scheduler=parts,
+        member=parts,
+        persistence=parts,
+        missed=NoLog(),
+        arm=lambda *_: None,
+        metrics=Metrics(),
+        tracker=chained,
+    )
+
+
+def packet(seq: int) -> Packet:
+    """Return a frame as it comes."""
+    payload = encode(SENSOR.detections(seq))
+    key = Keys().detections(SENSOR.stream)
+    return Packet(key, payload, len(payload), encoding_of(Detections), time.time_ns(), time.monotonic_ns())
+
+
+def test_totals_never_fall_and_count_nothing_twice() -> None:
+    """Between any two lines that open, close or restore a session the totals are what they were, or more."""
+    around = Around()
+    registry, seen = registry_of(around), [MessageCounters()]
+
+    def look(frame: FrameType, *_: object) -> Any:
+        if frame.f_code.co_filename not in TRACED:
+            return None
+        if not registry._actors._lock.locked():  # another thread would wait for it
+            seen.append(registry.totals())
+        return look
+
+    before = sys.gettrace()
+    sys.settrace(look)
+    try:
+        for seq in (0, 1, 2, 2, 3):
+            registry.frame(packet(seq))
+        around.run()
+        registry.command(SENSOR.stream, lambda actor: actor.close_session("idle"), urgent=False)
+        around.run()
+        assert registry.actor(SENSOR.stream) is None
+        for seq in (3, 4, 5):
+            registry.frame(packet(seq))
+        around.run()
+    finally:
+        sys.settrace(before)
+    for name in (field.name for field in fields(MessageCounters)):
+        values = [getattr(one, name) for one in seen]
+        assert values == sorted(values), name
+    assert (seen[-1].received, seen[-1].frames, seen[-1].duplicates) == (8, 6, 2)
+    assert registry.totals() == seen[-1]
