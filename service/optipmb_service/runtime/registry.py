@@ -155,7 +155,7 @@ class Registry:
             stream, session = self.parsed(packet.key)
         except schemas.MessageError as error:
             # Whoever receives it receives the detections of all: it is one of all members.
-            self._count_refused()
+            self._count_refused(frame=frame)
             self._report("invalid_value", "", error.expected, error.received)
             return
         own = self._member.holds(session)
@@ -192,7 +192,7 @@ class Registry:
         """Have a worker run a command for a stream; False when the service takes no more streams."""
         if self._actors.offer(stream, lambda actor: actor.mailbox.offer_command(lambda: command(actor), urgent=urgent)):
             return True
-        self._refuse(stream)
+        self._report_shed(stream)
         return False
 
     # What is there
@@ -302,7 +302,7 @@ class Registry:
         exceeded = self._admission.exceeded(stream, packet.size, packet.now_ns)
         if not exceeded:
             return False
-        self._actors.count(MessageCounters(received=frame, refused=frame, clouds_refused=not frame))
+        self._count_refused(frame=frame)
         self._report("quota", stream, exceeded, "more")
         return True
 
@@ -325,10 +325,6 @@ class Registry:
             self._let_in()
         return lineage
 
-    def _refuse(self, stream: str) -> None:
-        self._count_refused()
-        self._report_shed(stream)
-
     def _lose(self, stream: str, lost: list[bool]) -> None:
         """Count messages that were dropped before their stream was tracked, each True: a frame."""
         frames = sum(lost)
@@ -338,8 +334,8 @@ class Registry:
     def _report_shed(self, stream: str) -> None:
         self._report("shed", stream, f"fewer than {MAX_UNPROVEN} new streams at once", "more than can wait")
 
-    def _count_refused(self) -> None:
-        self._actors.count(MessageCounters(received=1, refused=1))
+    def _count_refused(self, *, frame: bool) -> None:
+        self._actors.count(MessageCounters(received=frame, refused=frame, clouds_refused=not frame))
 
     def parsed(self, key: str) -> tuple[str, str]:
         """Return the stream of a key and its session, remembered.

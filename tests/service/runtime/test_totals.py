@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from optipmb_schemas import Detections, Keys, encode, encoding_of
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter
-from optipmb_service.runtime import stream_actor, stream_counters
+from optipmb_service.runtime import actor_table, stream_actor, stream_counters
 from optipmb_service.runtime.missed_frames import NoLog
 from optipmb_service.runtime.persistence import NoPersistence
 from optipmb_service.runtime.ports import Packet
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from types import FrameType
 
+    import pytest
     from optipmb_service.session.checkpoint import Checkpoint
 
 SENSOR = Sensor()
@@ -144,3 +145,20 @@ def test_totals_never_fall_and_count_nothing_twice() -> None:
         assert values == sorted(values), name
     assert (seen[-1].received, seen[-1].frames, seen[-1].duplicates) == (8, 6, 2)
     assert registry.totals() == seen[-1]
+
+
+def test_a_command_without_room_is_no_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A query on a stream that finds no room among those that are new is told so, and counts as no frame."""
+    monkeypatch.setattr(actor_table, "MAX_UNPROVEN", 0)
+    registry = registry_of(Around())
+    assert not registry.command(SENSOR.stream, lambda _: None, urgent=True)
+    assert registry.totals() == MessageCounters()
+
+
+def test_a_message_on_a_key_of_no_stream_is_refused_as_what_it_is() -> None:
+    """A cloud on a key that names no stream counts among the clouds refused, detections among the frames."""
+    registry, bad = registry_of(Around()), Packet("optipmb/v1/nothing", b"", 0, "", 0, 0)
+    registry.cloud(bad)
+    assert registry.totals() == MessageCounters(clouds_refused=1)
+    registry.frame(bad)
+    assert registry.totals() == MessageCounters(received=1, refused=1, clouds_refused=1)
