@@ -58,11 +58,11 @@ class ActorContext:
         mailbox_bytes: most bytes waiting per stream.
         mailboxes: bytes that may wait, over all streams.
         step_limit_ns: processor time that one message may take.
-        outlet: where results go.
-        problem reporter: where problems go.
+        sink: where results go.
+        reporter: where problems go.
         parameters_of: profile of a stream.
         member: says which streams are tracked here.
-        checkpoint writer: where checkpoints go and come from.
+        persistence: where checkpoints go and come from.
         missed: what is known of the frames that a session has missed.
         buffer: makes buffers for packets that wait for their session.
         keep: takes a packet of a stream that another instance is to track.

@@ -65,12 +65,6 @@ class Mailbox:
         """Whether no worker is needed or at work."""
         return not self._scheduled
 
-    @property
-    def waiting(self) -> int:
-        """Frames that wait."""
-        with self._lock:
-            return self._waiting_frames()
-
     def shed_since(self) -> dict[str, int]:
         """Return the frames shed since this was asked last, by `Packet.origin`."""
         with self._lock:

@@ -57,11 +57,11 @@ class Registry:
     Args:
         settings: what is in force.
         profiles: the parameters that can be had.
-        outlet: where results go.
-        problem reporter: where problems go.
+        sink: where results go.
+        reporter: where problems go.
         scheduler: the workers.
         member: says which streams this instance tracks.
-        checkpoint writer: where checkpoints go and come from.
+        persistence: where checkpoints go and come from.
         missed: what is known of the frames that a session has missed.
         arm: has `StreamActor.wake` called at a monotonic time (ns).
         metrics: counts what comes and goes.

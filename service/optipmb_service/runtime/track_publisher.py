@@ -48,7 +48,7 @@ class TrackPublisher:
     Args:
         stream: `site/node/sensor`.
         instance: name of the service.
-        outlet: the network.
+        sink: the network.
         meter: the figures of the stream, told of every publication.
         metrics: the figures of the process, told too.
         member: says whether the write lease holds; tracks wait while it does not.

@@ -61,7 +61,7 @@ class Checkpoint:
         head: the present state.
         deliveries: what was not tracked, and what was corrected.
         newest_cloud_ns: stamp of the cloud that arrived last, by sensor.
-        run: how often the session was taken up again.
+        run: see `Session.run`: the sum of the fences under which the session began and was taken up again.
         software: version of the service that wrote it.
     """
 

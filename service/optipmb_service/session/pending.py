@@ -43,7 +43,7 @@ class Held:
 
     Attributes:
         message: as it came.
-        mark: what identifies it.
+        frame_id: what identifies it.
         order: where it belongs among the others.
         frame: what the tracker takes.
         ignored: objects left out of it.

@@ -129,7 +129,7 @@ class SensorQueues:
         return sum(entry.weight for entry in entries) + sum(waiting)
 
     def newest_cloud_ns(self) -> dict[str, int]:
-        """Return the stamp of the newest cloud of each sensor that has sent one."""
+        """Return the stamp of the cloud that arrived last, of each sensor that has sent one."""
         newest = ((name, one.clouds.newest_ns) for name, one in self.pending.items())
         return {name: newest_ns for name, newest_ns in newest if newest_ns is not None}
 

@@ -132,7 +132,7 @@ class Entry:
     """A frame that is or was processed.
 
     Attributes:
-        mark: which.
+        frame_id: which.
         place: where it belongs.
         message: its detections.
         points: its cloud.

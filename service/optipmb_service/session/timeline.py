@@ -200,7 +200,7 @@ class Timeline:
         epochs: what came of each epoch, in the order of their appearance; the last one is in force.
         base: the course up to the window.
         floor: the last frame before the window in the order of processing; nothing goes before it.
-        marks: the frames of the window in their publisher's order.
+        frame_ids: the frames of the window in their publisher's order.
         tip: the course after all of them.
     """
 
@@ -354,7 +354,7 @@ def hold_until(
         has_points: what the frame says: a cloud comes, none comes, or nothing (None).
         stamp_ns: the frame's sensor stamp.
         arrived_ns: monotonic time of the frame's arrival.
-        newest_cloud_ns: highest stamp of the clouds that the stream has sent so far.
+        newest_cloud_ns: stamp of the cloud of the stream that arrived last; None before the first.
         cloud_wait_ns: the longest wait.
         cloud_memory_ns: when the frame says nothing, it waits only if its stamp is this close to a cloud's.
     """

@@ -109,7 +109,7 @@ class Tracked:
         tracks: the message.
         ticket: what the caller gave with the detections.
         step_ns: time that conversion and tracking took.
-        run: how often the session had been taken up again.
+        run: see `Session.run`.
     """
 
     tracks: schemas.Tracks

@@ -2,9 +2,12 @@
 
 Conventions: payloads are bytes, keys are text. Rules that avoid Zenoh's known traps:
 
-- Nothing runs in Zenoh's callbacks. Every subscription is a FIFO channel that one thread always drains; what it calls
-  must only put the message into a queue. The thread reads the channel's handler, not the subscription: a subscription
-  that is being read cannot be undeclared.
+- What a member receives of streams is handed over on the thread of Zenoh that brings it (`inputs`): what is called
+  there puts the message into a mailbox and does not wait. Queries, tokens, links and all other subscriptions have a
+  channel each, which one thread always drains. It reads the channel, not the subscription: a subscription that is being
+  read cannot be undeclared.
+- The callback of a subscription is given with something to read (`handles.directly`): with a callback alone Zenoh does
+  not withdraw what was declared for recovery beside it.
 - References to publishers, tokens and subscriptions are kept: Zenoh withdraws what nobody refers to. Those with
   heartbeats are withdrawn so and never undeclared (`handles.Publisher`).
 - Closing goes from the outside in: the alive token, subscriptions and queryables (their threads read on until the

@@ -212,7 +212,7 @@ def test_no_sensor_takes_the_room_of_another() -> None:
     while (one := box.take()) is not None:
         taken.append((one[0], getattr(one[1], "origin", "")))
     assert {("frame", "p/a/b/slow"), ("cloud", "p/a/b/slow")} <= set(taken)
-    assert box.waiting == 0
+    assert box.counts()[1] == 0
 
 
 def test_the_sensors_of_a_session_have_one_owner() -> None:
