@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.scheduler import Scheduler
     from optipmb_service.runtime.stream_actor import StreamActor
 
-MAX_UNPROVEN: Final = 256
+MAX_UNPROVEN_ACTORS: Final = 256
 """Actors at once of streams that have not sent a valid message yet."""
 
-MAX_UNPROVEN_STRAINED: Final = 16
+MAX_UNPROVEN_ACTORS_STRAINED: Final = 16
 """The same while the lease is renewed late: each of them delays that."""
 
 
@@ -120,7 +120,7 @@ class ActorTable:
 
     def _crowded(self) -> bool:
         """Whether too many streams have not sent a valid message yet, as far as is known; called with the lock."""
-        most = MAX_UNPROVEN_STRAINED if self._member.strained else MAX_UNPROVEN
+        most = MAX_UNPROVEN_ACTORS_STRAINED if self._member.strained else MAX_UNPROVEN_ACTORS
         if len(self._unproven) >= most:
             known = self._actors.get
             self._unproven = {one for one in self._unproven if not one.occupied and known(one.stream) is one}

@@ -30,7 +30,7 @@ BACK_NS: Final = 5 * SECOND
 
 Sessions wait no longer than `recovery_wait_s` in any case."""
 
-MAX_UNPROVEN: Final = 256
+MAX_UNPROVEN_ANNOUNCED: Final = 256
 """Streams without a session that this instance announces at once: each costs members a token and subscriptions."""
 
 UNPROVEN_NS: Final = 30 * SECOND
@@ -192,7 +192,7 @@ class StreamDirectory:
         """Whether a stream may be announced: it has a session, or not too many wait for one."""
         if self._has_session(stream):
             return True
-        if len(self._unproven) >= MAX_UNPROVEN:
+        if len(self._unproven) >= MAX_UNPROVEN_ANNOUNCED:
             if stream in self._queued or len(self._queued) < MAX_STREAMS:
                 self._queued[stream] = now_ns
             return False
@@ -216,7 +216,7 @@ class StreamDirectory:
                 self._settled(known, now_ns)
                 if len(self._queued) < MAX_STREAMS:
                     self._queued.setdefault(stream, known.seen_ns)
-        while self._queued and len(self._unproven) < MAX_UNPROVEN:
+        while self._queued and len(self._unproven) < MAX_UNPROVEN_ANNOUNCED:
             stream = next(iter(self._queued))
             seen_ns = self._queued.pop(stream)
             if now_ns - seen_ns <= QUEUED_NS and (known := self._found(stream)) is not None and not known.tokens:

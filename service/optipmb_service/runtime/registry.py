@@ -16,7 +16,7 @@ import optipmb_schemas as schemas
 import optipmb
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.runtime import dumps
-from optipmb_service.runtime.actor_table import MAX_UNPROVEN, ActorTable
+from optipmb_service.runtime.actor_table import MAX_UNPROVEN_ACTORS, ActorTable
 from optipmb_service.runtime.admission import Admission
 from optipmb_service.runtime.byte_budget import MEGABYTE, ByteBudget
 from optipmb_service.runtime.context import Actor, ActorContext, part_of, policy_of
@@ -332,7 +332,7 @@ class Registry:
         self._report_shed(stream)
 
     def _report_shed(self, stream: str) -> None:
-        self._report("shed", stream, f"fewer than {MAX_UNPROVEN} new streams at once", "more than can wait")
+        self._report("shed", stream, f"fewer than {MAX_UNPROVEN_ACTORS} new streams at once", "more than can wait")
 
     def _count_refused(self, *, frame: bool) -> None:
         self._actors.count(MessageCounters(received=frame, refused=frame, clouds_refused=not frame))

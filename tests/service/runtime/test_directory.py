@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from optipmb_service.runtime.directory import BACK_NS, MAX_UNPROVEN, QUEUED_NS, UNPROVEN_NS, StreamDirectory
+from optipmb_service.runtime.directory import BACK_NS, MAX_UNPROVEN_ANNOUNCED, QUEUED_NS, UNPROVEN_NS, StreamDirectory
 from optipmb_service.session.values import SECOND
 
 IDLE_NS = 600 * SECOND
@@ -50,12 +50,12 @@ def names(count: int, site: str = "site") -> list[str]:
 
 def test_names_without_a_session_cost_a_bounded_number_of_tokens() -> None:
     """Of many streams that get no session a few are announced at once, and all are forgotten soon."""
-    one, many = Discoverer(), names(50 * MAX_UNPROVEN)
-    assert one.hear(0, *many) == set(many[:MAX_UNPROVEN])
-    assert len(one.directory.streams()) == MAX_UNPROVEN
+    one, many = Discoverer(), names(50 * MAX_UNPROVEN_ANNOUNCED)
+    assert one.hear(0, *many) == set(many[:MAX_UNPROVEN_ANNOUNCED])
+    assert len(one.directory.streams()) == MAX_UNPROVEN_ANNOUNCED
     for turn in range(1, QUEUED_NS // UNPROVEN_NS + 3):
-        assert len(one.hear(turn * (UNPROVEN_NS + 1))) <= MAX_UNPROVEN
-        assert len(one.directory.streams()) <= 3 * MAX_UNPROVEN
+        assert len(one.hear(turn * (UNPROVEN_NS + 1))) <= MAX_UNPROVEN_ANNOUNCED
+        assert len(one.directory.streams()) <= 3 * MAX_UNPROVEN_ANNOUNCED
     one.hear(QUEUED_NS + 5 * UNPROVEN_NS)
     assert one.directory.streams() == {}
 
@@ -65,7 +65,7 @@ def test_a_fleet_that_begins_at_once_is_announced() -> None:
     one, fleet = Discoverer(), names(10_000)
     announced, now_ns = one.hear(0, *fleet), 0
     while len(announced) < len(fleet):
-        assert len(announced - one.sessions) == MAX_UNPROVEN
+        assert len(announced - one.sessions) == MAX_UNPROVEN_ANNOUNCED
         one.sessions |= announced
         now_ns += SECOND
         announced = one.hear(now_ns)
@@ -78,13 +78,13 @@ def test_a_stream_with_a_session_is_announced_at_once() -> None:
     """What is tracked already waits for nobody: a discoverer that begins hears of all streams at once."""
     one, fleet = Discoverer(), names(10_000)
     one.sessions |= set(fleet)
-    one.hear(0, *names(2 * MAX_UNPROVEN, "other"))
+    one.hear(0, *names(2 * MAX_UNPROVEN_ANNOUNCED, "other"))
     assert set(fleet) <= one.hear(1, *fleet)
 
 
 def test_a_stream_that_got_no_session_in_its_time_has_another_turn() -> None:
     """Where members are slow, a stream that sent one message is announced again after others have had their turn."""
-    one, fleet = Discoverer(), names(2 * MAX_UNPROVEN)
-    assert one.hear(0, *fleet) == set(fleet[:MAX_UNPROVEN])
-    assert one.hear(UNPROVEN_NS + 1) == set(fleet[MAX_UNPROVEN:])
-    assert one.hear(2 * (UNPROVEN_NS + 1)) == set(fleet[:MAX_UNPROVEN])
+    one, fleet = Discoverer(), names(2 * MAX_UNPROVEN_ANNOUNCED)
+    assert one.hear(0, *fleet) == set(fleet[:MAX_UNPROVEN_ANNOUNCED])
+    assert one.hear(UNPROVEN_NS + 1) == set(fleet[MAX_UNPROVEN_ANNOUNCED:])
+    assert one.hear(2 * (UNPROVEN_NS + 1)) == set(fleet[:MAX_UNPROVEN_ANNOUNCED])

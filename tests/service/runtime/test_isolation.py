@@ -488,7 +488,7 @@ def test_the_first_frames_of_many_new_streams_wait_for_room(
 ) -> None:
     """Three times as many streams as may be new at once begin while a step does not end: each is tracked afterwards."""
     gate, entered, most = threading.Event(), threading.Event(), 16
-    monkeypatch.setattr("optipmb_service.runtime.actor_table.MAX_UNPROVEN", most)
+    monkeypatch.setattr("optipmb_service.runtime.actor_table.MAX_UNPROVEN_ACTORS", most)
 
     class Waits:
         def __init__(self, parameters: optipmb.Parameters) -> None:

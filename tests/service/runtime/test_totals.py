@@ -149,7 +149,7 @@ def test_totals_never_fall_and_count_nothing_twice() -> None:
 
 def test_a_command_without_room_is_no_message(monkeypatch: pytest.MonkeyPatch) -> None:
     """A query on a stream that finds no room among those that are new is told so, and counts as no frame."""
-    monkeypatch.setattr(actor_table, "MAX_UNPROVEN", 0)
+    monkeypatch.setattr(actor_table, "MAX_UNPROVEN_ACTORS", 0)
     registry = registry_of(Around())
     assert not registry.command(SENSOR.stream, lambda _: None, urgent=True)
     assert registry.totals() == MessageCounters()
