@@ -175,6 +175,7 @@ class CheckpointWriter:
         self._leases = leases
         self._lock = threading.Lock()
         self._pending: dict[str, tuple[Checkpoint, int | None]] = {}
+        self._writing: dict[str, tuple[Checkpoint, int | None]] = {}
         self._thens: list[tuple[str, Callable[[], None]]] = []
         self._reading = ThreadPoolExecutor(READ_AT_ONCE if store.remote else 1, "restore")
         self._hurry = threading.Event()
@@ -243,7 +244,7 @@ class CheckpointWriter:
         the stream is to be tracked here: to begin anew would use track ids a second time.
         """
         with self._lock:
-            pending, fence = self._pending.get(stream, (None, None))
+            pending, fence = self._pending.get(stream) or self._writing.get(stream, (None, None))
         if pending is not None and fence == self._leases.fence(stream):
             return restore(pending)
         while True:
@@ -314,7 +315,7 @@ class CheckpointWriter:
         with self._lock:
             thens, self._thens = self._thens, []
             streams = {stream for stream, _ in thens} if waited_for else self._pending.keys()
-            taken = {stream: one for stream, one in self._pending.items() if stream in streams}
+            taken = self._writing = {stream: one for stream, one in self._pending.items() if stream in streams}
             self._pending = {stream: one for stream, one in self._pending.items() if stream not in streams}
         mine = {stream: one for stream, one in taken.items() if self._leases.may_write(stream, one[1])}
         # A lease that lapsed is renewed, or the stream is lost: until that is known its newest state is kept.
@@ -349,7 +350,7 @@ class CheckpointWriter:
             for stream in lost:
                 log.warning("checkpoint_refused", stream=stream)
         with self._lock:
-            self._pending = later | self._pending
+            self._pending, self._writing = later | self._pending, {}
             self._thens += [one for one in thens if one[0] in later]
         for stream, then in thens:
             if stream not in later:

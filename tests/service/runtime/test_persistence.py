@@ -1,0 +1,78 @@
+"""The checkpoint writer: what it keeps in memory while the store fails, and whom it keeps waiting."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from lease_log import Alone
+from optipmb_service.cluster.sqlite import SqliteStore
+from optipmb_service.cluster.store import StoreError
+from optipmb_service.runtime.persistence import CheckpointWriter
+from optipmb_service.session.session import Session
+from router import Sensor, until
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from optipmb_service.cluster.store import Fenced
+    from optipmb_service.session.checkpoint import Checkpoint
+
+FIRST, SECOND = Sensor("site/first/lidar"), Sensor("site/second/lidar")
+
+
+def snapshot(sensor: Sensor) -> Checkpoint:
+    """The state of a session without a frame."""
+    return Session(sensor.stream, optipmb.load_profile("nuscenes")).snapshot()
+
+
+class Full(SqliteStore):
+    """A store that has no room when told so; a test sees each try, and says when it fails."""
+
+    def __init__(self) -> None:
+        super().__init__(None)
+        self.full = False
+        self.tries = threading.Semaphore(0)
+        self.may_fail = threading.Semaphore(0)
+
+    def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
+        """Save, or fail."""
+        if not self.full:
+            return super().save(checkpoints)
+        self.tries.release()
+        assert self.may_fail.acquire(timeout=60.0)
+        raise StoreError("database or disk is full")
+
+
+def test_the_newest_state_is_found_while_it_cannot_be_written() -> None:
+    """A session that is opened again while the store is full goes on from memory, also in the middle of a try."""
+    store, found = Full(), list[int]()
+    leases = Alone(store)
+    writer = CheckpointWriter(store, 0.3, leases)
+    fence, state = leases.fence(FIRST.stream), snapshot(FIRST)
+    old, tried = threading.Event(), threading.Event()
+
+    def recall() -> int:
+        writer.recall(FIRST.stream, lambda one: one.run, lambda run: found.append(run or 0))
+        until(lambda: found, "its state is read")
+        return found.pop()
+
+    writer.start(lambda: None)
+    writer.put(replace(state, run=1), fence, old.set)
+    assert old.wait(60.0)
+    assert recall() == 1
+    store.full = True
+    writer.put(replace(state, run=2), fence, tried.set)
+    for is_full in (True, False):  # after the try that somebody waits for, and after the next one
+        assert store.tries.acquire(timeout=60.0)
+        assert recall() == 2
+        store.full = is_full
+        store.may_fail.release()
+        assert tried.wait(60.0)
+    until(lambda: not writer.failure, "it is written")
+    assert recall() == 2
+    writer.close(5)
+    store.close()
