@@ -278,15 +278,17 @@ class CheckpointWriter:
                 self._expire()
                 self._gather()
                 if self._serve(SETTLE_S):
+                    if self._hurry.is_set():  # what somebody waits for was put just now
+                        self._ended.wait(LEAVE_SETTLE_S)
                     self._write()
         finally:
             self._write()
 
     def _serve(self, seconds: float) -> bool:
-        """For so long write at once what somebody waits for, and nothing else; False at the end."""
+        """For so long, and no longer, write at once what somebody waits for, and nothing else; False at the end."""
         ends = time.monotonic() + seconds
         while not self._ended.is_set():
-            if not self._hurry.wait(max(0.0, ends - time.monotonic())):
+            if (left_s := ends - time.monotonic()) <= 0.0 or not self._hurry.wait(left_s):
                 return True
             self._hurry.clear()
             if not self._ended.wait(LEAVE_SETTLE_S):

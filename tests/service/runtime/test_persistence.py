@@ -76,3 +76,23 @@ def test_the_newest_state_is_found_while_it_cannot_be_written() -> None:
     assert recall() == 2
     writer.close(5)
     store.close()
+
+
+def test_who_is_waited_for_keeps_no_other_waiting() -> None:
+    """Sessions close one after the other, each while the one before is written: all others are written, too."""
+    store, ended = SqliteStore(None), threading.Event()
+    leases = Alone(store)
+    writer = CheckpointWriter(store, 0.3, leases)
+    closing, other = snapshot(FIRST), snapshot(SECOND)
+
+    def close_another() -> None:
+        if not ended.is_set():
+            writer.put(closing, leases.fence(closing.stream), close_another)
+
+    writer.start(lambda: writer.put(other, leases.fence(other.stream)))
+    close_another()
+    until(lambda: other.stream in store.streams(), "the other one is written")
+    ended.set()
+    writer.close(5)
+    assert store.streams() == (FIRST.stream, SECOND.stream)
+    store.close()
