@@ -347,7 +347,7 @@ class CheckpointWriter:
             if encoded and self._store_failure:
                 self._store_failure = ""
                 log.info("store_back")
-            if not self.failure:
+            if not (waited_for or later or self.failure):  # all sessions that changed have given their states
                 self.complete_ns = time.monotonic_ns()
             for stream in lost:
                 log.warning("checkpoint_refused", stream=stream)

@@ -96,3 +96,45 @@ def test_who_is_waited_for_keeps_no_other_waiting() -> None:
     writer.close(5)
     assert store.streams() == (FIRST.stream, SECOND.stream)
     store.close()
+
+
+def test_what_somebody_waits_for_is_not_all() -> None:
+    """A state written at once leaves the age of what the store has as it was: others may wait for their round."""
+    store, kept = SqliteStore(None), threading.Event()
+    leases = Alone(store)
+    writer = CheckpointWriter(store, 60.0, leases)
+    before_ns = writer.complete_ns
+    writer.start(lambda: None)
+    writer.put(snapshot(SECOND), leases.fence(SECOND.stream))
+    writer.put(snapshot(FIRST), leases.fence(FIRST.stream), kept.set)
+    assert kept.wait(60.0)
+    assert (store.streams(), writer.complete_ns) == ((FIRST.stream,), before_ns)
+    writer.close(5)
+    assert store.streams() == (FIRST.stream, SECOND.stream)
+    assert writer.complete_ns > before_ns
+    store.close()
+
+
+def test_what_waits_for_its_lease_grows_older() -> None:
+    """While a lease has lapsed the store has not all; with nothing to write it has, round after round."""
+    store, rounds = SqliteStore(None), [0]
+    leases = Alone(store)
+    writer = CheckpointWriter(store, 0.05, leases)
+
+    def gather() -> None:
+        rounds[0] += 1
+
+    leases.lapsed = True
+    writer.put(snapshot(FIRST), leases.fence(FIRST.stream))
+    before_ns = writer.complete_ns
+    writer.start(gather)
+    until(lambda: rounds[0] > 3, "rounds")
+    assert (store.streams(), writer.complete_ns) == ((), before_ns)
+    leases.lapsed = False
+    until(lambda: writer.complete_ns > before_ns, "it is written")
+    assert store.streams() == (FIRST.stream,)
+    written_ns = writer.complete_ns
+    until(lambda: writer.complete_ns > written_ns, "a round without anything to write")
+    assert (writer.written, writer.failure) == (1, "")
+    writer.close(5)
+    store.close()
