@@ -51,7 +51,7 @@ class FusedTimeline:
         floor: the last frame before the window in the order of processing; nothing goes before it.
         frame_ids: the frames of the window in the order of processing; all are of the present generation.
         generation: number of jumps that were believed.
-        clock: newest stamp of each sensor in this generation.
+        clock: newest stamp in this generation of each sensor that is seen.
         jumped: frames with another clock, by sensor.
     """
 
@@ -170,11 +170,12 @@ class FusedTimeline:
                 for name, one in jumped.items()
                 if name != frame_id.sensor
             }
+        seen = self._remembering(frame_id)
         timeline = replace(
             self,
-            seen=self._remembering(frame_id),
+            seen=seen,
             frame_ids=(*self.frame_ids[:at], frame_id, *self.frame_ids[at:]),
-            clock=self._moved(frame_id),
+            clock=self._moved(frame_id, seen),
             jumped=jumped,
         )
         return Decision(opens if last else Verdict.INSERTED, self._place, last=last), timeline
@@ -205,9 +206,11 @@ class FusedTimeline:
     def _refuse(self, frame_id: FrameId, verdict: Verdict) -> tuple[Decision, FusedTimeline]:
         return Decision(verdict, replace(self._place, jump_ns=self._jump_ns(frame_id))), self
 
-    def _moved(self, frame_id: FrameId) -> Mapping[str, int]:
+    def _moved(self, frame_id: FrameId, seen: Mapping[str, object]) -> Mapping[str, int]:
+        """Return the clock with a frame; of sensors that are seen no more, which were not live, nothing is left."""
         before = self.clock.get(frame_id.sensor, frame_id.stamp_ns)
-        return {**self.clock, frame_id.sensor: max(before, frame_id.stamp_ns)}
+        clock = {**self.clock, frame_id.sensor: max(before, frame_id.stamp_ns)}
+        return {name: stamp_ns for name, stamp_ns in clock.items() if name in seen}
 
     def _remembering(self, frame_id: FrameId) -> Mapping[str, tuple[SeenNumbers, ...]]:
         seen = {**self.seen, frame_id.sensor: remembered(self.seen.get(frame_id.sensor, ()), frame_id)}

@@ -250,6 +250,22 @@ def test_a_sensor_that_is_silent_makes_room_for_another() -> None:
         assert FRONT.stream in kept
 
 
+def test_what_is_remembered_of_sensors_is_bounded() -> None:
+    """Names may come, go and come again without a restart, too; one in between changes neither state nor tracks."""
+    one, other, merged, again = fused(), fused(), Merged(), Merged()
+    for seq in range(400):  # twenty of them were heard lately, and each comes again when it is forgotten
+        frame = replace(FRONT, stream=f"site/node/s{seq * 7 % 150}").detections(seq)
+        merged.take(given_to(one, [frame]))
+        if seq % 90 == 0:
+            other = Session.restore(decode_checkpoint(encode_checkpoint(other.snapshot())), 0, tracker=chained)
+            other.recovered(0)
+        again.take(given_to(other, [frame]), other.run)
+    assert len(one._processed.timeline.seen) == MAX_SENSORS
+    assert len(one._processed.timeline.clock) == MAX_SENSORS
+    assert state_bytes(one.snapshot()) == state_bytes(other.snapshot())
+    assert merged.plain() == again.plain()
+
+
 class Tired(optipmb.Tracker):
     """Refuses frames of seven objects for their effort."""
 
