@@ -5,16 +5,20 @@ from __future__ import annotations
 import contextlib
 import time
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from optipmb_service.runtime.directory import BACK_NS
 from optipmb_service.runtime.ports import TransportError
+from optipmb_service.session.values import MAX_SENSORS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.runtime.ports import Caches, Packet
     from optipmb_service.session.session import Session
+
+MOST: Final = 4 * MAX_SENSORS
+"""Streams whose caches have answered; when there are more, those are forgotten whose publishers have gone."""
 
 
 class AwaitedCaches:
@@ -30,11 +34,17 @@ class AwaitedCaches:
         self._caches = caches
         self._answered: set[str] = set()
         self._asked: set[str] = set()
+        self._most = MOST
 
     def answered(self, *streams: str) -> None:
         """Note that all has come which the caches of these streams held."""
         self._answered.update(streams)
         self._asked.update(streams)
+        if len(self._answered) > self._most:
+            there = self._caches().awaited(self._stream, self._answered).keys()
+            self._answered &= there
+            self._asked &= there
+            self._most = max(MOST, 2 * len(self._answered))  # publishers that are there are not gone over each time
 
     def ask_again(self, stream: str) -> None:
         """Note that the cache of a stream has not answered in full."""
@@ -44,6 +54,7 @@ class AwaitedCaches:
         """Begin again: the session has ended."""
         self._answered.clear()
         self._asked.clear()
+        self._most = MOST
 
     def awaited(self, session: Session, take: Callable[[str, list[tuple[Packet, bool]], bool], None]) -> bool:
         """Whether the caches of sensors may hold what has not come; those that have not answered are asked.
