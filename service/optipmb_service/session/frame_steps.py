@@ -143,8 +143,10 @@ class FrameSteps:
     def _fail(self, error: Exception, placed: list[Entry], frame_id: FrameId) -> list[Output]:
         """Take no more frames of the sensor; the one that failed and what is held go, unprocessed."""
         reason = self._sensors.quarantine[frame_id.sensor] = f"{type(error).__name__}: {error}"[:MAX_ERROR]
-        self._reporting.deliveries.refused += 1 + self._sensors.pending[frame_id.sensor].clear()
-        self._processed.note(frame_id)
+        came = len(placed) - len(self._processed.entries)  # none with a late cloud, whose numbers are no frame's
+        self._reporting.deliveries.refused += came + self._sensors.pending[frame_id.sensor].clear()
+        if came:
+            self._processed.note(frame_id)
         self._sensors.follow()
         dump = dump_of(self._processed.transition, self._processed.base, placed, error)
         return [self._reporting.complain.failed(frame_id, reason), Quarantined(reason, dump)]

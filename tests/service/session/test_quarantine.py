@@ -17,6 +17,7 @@ from optipmb_client.errors import UsageError
 from optipmb_service.runtime.dumps import FOLDER, MOST, save
 from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
+from optipmb_service.session.values import Policy
 from router import Sensor
 from sessions import Failing, Merged, begun, dumps, feed, problems, tracks
 
@@ -90,6 +91,32 @@ def test_a_late_frame_that_fails_leaves_the_rest_alone() -> None:
     assert tracks(outputs) == []
     assert one.density is density
     assert client.replay(schemas.decode_dump(dumps(outputs)[0].dump), Failing).seq == 2
+
+
+class FailingClouds(optipmb.Tracker):
+    """Raises for a cloud of seven points."""
+
+    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+        """Step, or raise."""
+        if frame.cloud is not None and len(frame.cloud.xyz) == 7:
+            raise ZeroDivisionError("seven")
+        return super().step(density, frame)
+
+
+@pytest.mark.parametrize("epoch", [SENSOR.epoch, b"c" * 16])
+def test_a_late_cloud_that_fails_is_no_frame(epoch: bytes) -> None:
+    """None is counted as refused by it; after a reset the publisher goes on, also with the number of the cloud."""
+    one = Session(SENSOR.stream, NUSCENES, Policy(late_clouds=True), tracker=FailingClouds)
+    feed(one, range(4), SENSOR)
+    density, stamp_ns = one.density, SENSOR.stamp_ns(2)
+    outputs = one.on_points(SENSOR.points(6, count=7, epoch=epoch, stamp_ns=stamp_ns), 0)
+    assert ([p.code for p in problems(outputs)], len(dumps(outputs))) == (["internal"], 1)
+    assert (one.density is density, one.counters.frames, one.counters.refused) == (True, 4, 0)
+    assert [p.code for p in problems(feed(one, [4], SENSOR))] == ["quarantined"]
+    one.reset()
+    outputs = feed(one, range(5, 8), SENSOR, has_points=False)
+    assert ([m.seq for m in tracks(outputs)], problems(outputs)) == ([5, 6, 7], [])
+    assert (one.counters.frames, one.counters.refused, one.counters.duplicates) == (7, 1, 0)
 
 
 def test_others_go_on() -> None:
