@@ -61,10 +61,10 @@ class StreamCounters:
 
     def drop(self, dropped: Sequence[bool]) -> int:
         """Count messages that were dropped while they waited, each with whether it was a frame; returns the frames."""
-        frames = sum(dropped)
-        self._traffic.shed += frames
-        self._traffic.received += frames
-        self._traffic.clouds_shed += len(dropped) - frames
+        frames, traffic = sum(dropped), self._accounts.traffic
+        traffic.shed += frames
+        traffic.received += frames
+        traffic.clouds_shed += len(dropped) - frames
         return frames
 
     def pass_on(self, frames: int) -> None:
