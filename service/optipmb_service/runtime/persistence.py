@@ -244,7 +244,7 @@ class CheckpointWriter:
         the stream is to be tracked here: to begin anew would use track ids a second time.
         """
         with self._lock:
-            pending, fence = self._pending.get(stream) or self._writing.get(stream, (None, None))
+            pending, fence = self._pending.get(stream) or self._writing.get(stream) or (None, None)
         if pending is not None and fence == self._leases.fence(stream):
             return restore(pending)
         while True:

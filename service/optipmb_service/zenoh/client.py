@@ -190,6 +190,18 @@ class Client:
             raise TransportError(line(error)) from error
         return answers
 
+    def alive(self, pattern: str, timeout: float) -> list[str]:
+        """Return the keys of the liveliness tokens under a pattern, sorted.
+
+        Raises:
+            TransportError: the session is closed.
+        """
+        try:
+            replies = self._session.liveliness().get(pattern, timeout=timeout)
+            return sorted({str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None})
+        except zenoh.ZError as error:
+            raise TransportError(line(error)) from error
+
 
 def _message(sample: zenoh.Sample) -> Message:
     return Message(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
