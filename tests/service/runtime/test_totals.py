@@ -93,7 +93,7 @@ def registry_of(around: Around) -> Registry:
     """Return the streams of a process with these around it."""
     parts: Any = around  # in the place of several
     return Registry(
-        Settings(instance="test", store="none"),
+        Settings(instance="test", store="none", step_limit_s=60),  # kernels may have to be compiled
         Profiles.read("nuscenes", {}),
         sink=parts,
         reporter=ProblemReporter(lambda _: None, lambda *_: None),
