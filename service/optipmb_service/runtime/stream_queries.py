@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
-MOST_OF_MANY: Final = 4
-"""Questions about many streams that may be open at once: each has a checkpoint of every stream that it matches."""
+MOST_WILDCARDS: Final = 4
+"""Queries with wildcards that may be open at once: each has a checkpoint of every stream that it matches."""
 
 NO_SESSION = "0" * 32
 """Session id in the state of a stream that has none."""
@@ -55,7 +55,7 @@ class StreamQueries:
         self._tracks = tracks
         self._keys = registry.keys
         self._digests = ThreadPoolExecutor(1, "digest")
-        self._room_of_many = threading.Semaphore(MOST_OF_MANY)
+        self._room_for_wildcards = threading.Semaphore(MOST_WILDCARDS)
 
     def answer(self, request: Request) -> None:
         """Answer what concerns sessions, here or on the worker of the stream."""
@@ -132,15 +132,15 @@ class StreamQueries:
         if not actors:
             request.finish()
             return
-        if not self._room_of_many.acquire(blocking=False):
+        if not self._room_for_wildcards.acquire(blocking=False):
             full = schemas.MessageError(
-                "too_large", "key", f"at most {MOST_OF_MANY} queries about many streams open at once", "another one"
+                "too_large", "key", f"at most {MOST_WILDCARDS} queries about many streams open at once", "another one"
             )
             guarded(request, lambda: request.refuse(self._problem("", full, code="refused")))
             return
 
         def finish() -> None:
-            self._room_of_many.release()
+            self._room_for_wildcards.release()
             request.finish()
 
         left = _Countdown(len(actors), finish)

@@ -14,10 +14,15 @@ DEFAULT_GRPC: Final = "127.0.0.1:50051"
 DEFAULT_NATS: Final = "127.0.0.1:4222"
 
 
-def _endpoint(value: str) -> str:
-    if not re.fullmatch(r"[a-z0-9]+/[^\s/#?]+:\d+([?#]\S*)?|[a-z0-9-]+/\S+", value):
-        raise ValueError(f"an endpoint looks like {DEFAULT_LISTEN}, received {value!r}")
-    return value
+def form_of(pattern: str, expected: str) -> AfterValidator:
+    """Return the check of a text: it matches a regular expression in full, or the error says what was expected."""
+
+    def check(value: str) -> str:
+        if not re.fullmatch(pattern, value):
+            raise ValueError(f"{expected}, received {value!r}")
+        return value
+
+    return AfterValidator(check)
 
 
 def address(value: str) -> str:
@@ -28,12 +33,6 @@ def address(value: str) -> str:
     """
     if value and not re.fullmatch(r"([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.%]+\]):\d{1,5}", value):
         raise ValueError(f"an address looks like 127.0.0.1:8080, received {value!r}")
-    return value
-
-
-def _prefix(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*", value):
-        raise ValueError(f"chunks of [A-Za-z0-9_.-] separated by '/', received {value!r}")
     return value
 
 
@@ -49,21 +48,17 @@ def _listed(value: Any) -> Any:
         raise ValueError(f"names separated by commas, or a JSON list, received {value!r}") from error
 
 
-def _server(value: str) -> str:
-    if not re.fullmatch(r"(nats|tls)://\S+", value):
-        raise ValueError(f"a NATS server looks like nats://127.0.0.1:4222, received {value!r}")
-    return value
-
-
-def _pattern(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_.*-]+(/[A-Za-z0-9_.*-]+){2}", value):
-        raise ValueError(f"a pattern of streams looks like site/*/lidar*, received {value!r}")
-    return value
-
-
-Prefix = Annotated[str, AfterValidator(_prefix)]
+Prefix = Annotated[str, form_of(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*", "chunks of [A-Za-z0-9_.-] separated by '/'")]
 Address = Annotated[str, AfterValidator(address)]
+Pattern = Annotated[
+    str, form_of(r"[A-Za-z0-9_.*-]+(/[A-Za-z0-9_.*-]+){2}", "a pattern of streams looks like site/*/lidar*")
+]
+Server = Annotated[str, form_of(r"(nats|tls)://\S+", "a NATS server looks like nats://127.0.0.1:4222")]
+Endpoint = Annotated[
+    str,
+    form_of(r"[a-z0-9]+/[^\s/#?]+:\d+([?#]\S*)?|[a-z0-9-]+/\S+", f"an endpoint looks like {DEFAULT_LISTEN}"),
+]
 Names = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)]
-Patterns = Annotated[tuple[Annotated[str, AfterValidator(_pattern)], ...], NoDecode, BeforeValidator(_listed)]
-Servers = Annotated[tuple[Annotated[str, AfterValidator(_server)], ...], NoDecode, BeforeValidator(_listed)]
-Endpoints = Annotated[tuple[Annotated[str, AfterValidator(_endpoint)], ...], NoDecode, BeforeValidator(_listed)]
+Patterns = Annotated[tuple[Pattern, ...], NoDecode, BeforeValidator(_listed)]
+Servers = Annotated[tuple[Server, ...], NoDecode, BeforeValidator(_listed)]
+Endpoints = Annotated[tuple[Endpoint, ...], NoDecode, BeforeValidator(_listed)]

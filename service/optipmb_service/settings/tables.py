@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from typing import Annotated, Literal
 
 from optipmb_schemas import DEFAULT, Keys, Limits, MessageError
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from optipmb_service.settings.forms import form_of
 
 
 class LimitSettings(BaseModel):
@@ -25,13 +26,7 @@ class LimitSettings(BaseModel):
         return Limits(**self.model_dump())
 
 
-def _topic(value: str) -> str:
-    if value and not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", value):
-        raise ValueError(f"a topic looks like /lidar/points, received {value!r}")
-    return value
-
-
-Topic = Annotated[str, AfterValidator(_topic)]
+Topic = Annotated[str, form_of(r"((/[A-Za-z_][A-Za-z0-9_]*)+)?", "a topic looks like /lidar/points")]
 
 
 class Ros2Stream(BaseModel):

@@ -26,7 +26,7 @@ ASKED: Final = 10
     ("module", "name", "key"),
     [
         (optipmb_service.zenoh.queries, "MOST_OPEN", KEYS.query(SENSOR.stream, "state")),
-        (stream_queries, "MOST_OF_MANY", f"{KEYS.prefix}/*/*/*/q/state"),
+        (stream_queries, "MOST_WILDCARDS", f"{KEYS.prefix}/*/*/*/q/state"),
     ],
     ids=["of one stream", "of many"],
 )
