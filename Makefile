@@ -85,13 +85,14 @@ kernels: $(VENV)/.installed
 
 # Twice as many as two processors: what starts processes and waits for them leaves half of the time free. Files run in
 # the order of their folders, for those with few tests and long ones would otherwise come last, with nothing beside them.
+# A process that ends is not replaced: the next one would run the same test again, and wait as long.
 JOBS ?= 4
 tests: kernels
-	$(BIN)/pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder -m "not accuracy and not alone and not bounds and not ray"
+	$(BIN)/pytest -n $(JOBS) --max-worker-restart 0 --dist loadfile --no-loadscope-reorder -m "not accuracy and not alone and not bounds and not ray"
 
 # The figures of accuracy that docs/tuning.md and docs/ablation.md give, on the KITTI and nuScenes data.
 accuracy: kernels
-	$(BIN)/pytest -n $(JOBS) tests/clients -m accuracy
+	$(BIN)/pytest -n $(JOBS) --max-worker-restart 0 tests/clients -m accuracy
 
 # What measures memory, latency and outages, one test after the other.
 alone: kernels
@@ -197,11 +198,11 @@ ablate: install
 
 # A hundred SIGKILLs in the middle of recorded sequences, which CI does three times; needs the KITTI data.
 kills: install
-	OPTIPMB_TEST_KILLS=100 $(BIN)/pytest -q tests/e2e/test_kill.py --timeout 0
+	OPTIPMB_TEST_KILLS=100 $(BIN)/pytest -q tests/e2e/test_kill.py -o faulthandler_timeout=0
 
 # An hour of load, which CI does for seconds.
 soak: install
-	OPTIPMB_TEST_SOAK_S=3600 OPTIPMB_TEST_SOAK_STREAMS=10 $(BIN)/pytest -q tests/e2e/test_soak.py --timeout 0
+	OPTIPMB_TEST_SOAK_S=3600 OPTIPMB_TEST_SOAK_STREAMS=10 $(BIN)/pytest -q tests/e2e/test_soak.py -o faulthandler_timeout=0
 
 # What is found is kept in tests/fuzz/found, where the tests take it up. `make -j2 fuzz` searches two decoders at once.
 FUZZ_S ?= 1800

@@ -15,7 +15,7 @@ constraints=${3:-/dev/null}
 "$bin/python" -m build --wheel --outdir "$work/dist" "$root" >"$work/build.log" 2>&1 || { cat "$work/build.log"; exit 1; }
 "$python" -m venv "$work/venv"
 "$work/venv/bin/python" -m pip install --quiet --disable-pip-version-check --constraint "$constraints" \
-  "$(ls "$work"/dist/optipmb-*.whl)[grpc,plot,record,service,table,tune]" hypothesis pytest pytest-asyncio pytest-timeout pytest-xdist \
+  "$(ls "$work"/dist/optipmb-*.whl)[grpc,plot,record,service,table,tune]" hypothesis pytest pytest-asyncio pytest-xdist \
   foxglove-schemas-protobuf mcap-protobuf-support mcap-ros2-support websocket-client
 "$work/venv/bin/python" -m pip check --disable-pip-version-check
 mkdir "$work/away" && cd "$work/away" # nothing of the source tree is importable from here, but for what tests share

@@ -109,7 +109,6 @@ def _held(member: ServiceProcess) -> int:
     return int(lines[-1].partition("held=")[2].split()[0]) if lines else 0
 
 
-@pytest.mark.timeout(600)
 def test_members_take_over(cluster: Cluster, capsys: pytest.CaptureFixture[str]) -> None:
     """Fault 17: a member is killed, one on another router frozen and woken, a third ended: all goes on, to the byte.
 
@@ -189,7 +188,6 @@ class Sending:
             self.frames += 1
 
 
-@pytest.mark.timeout(600)
 def test_all_members_are_restarted_in_turn(cluster: Cluster, capsys: pytest.CaptureFixture[str]) -> None:
     """While a replay goes on each of three members ends in order and comes back: no frame is lost, to the byte."""
     names = ("a", "b", "c")
@@ -214,7 +212,6 @@ def test_all_members_are_restarted_in_turn(cluster: Cluster, capsys: pytest.Capt
         print(f"\nsilent for {silent_s:.2f} s at most while three members were restarted in turn")  # noqa: T201 - the figure
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("cluster", ["nats"], indirect=True)
 def test_a_machine_becomes_a_cluster(cluster: Cluster, tmp_path: Path) -> None:
     """Sessions that were copied out of a folder go on in the cluster, to the byte; used folders and clusters refuse."""
@@ -248,7 +245,6 @@ def test_a_machine_becomes_a_cluster(cluster: Cluster, tmp_path: Path) -> None:
     assert (status, "tracks in the cluster: end its members, copy, and start them again" in text) == (1, True)
 
 
-@pytest.mark.timeout(600)
 def test_a_site_that_is_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A router 30 ms away loses the way to the others, and its member that to the server: the rest goes on without it.
 
@@ -291,7 +287,6 @@ def test_a_site_that_is_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[st
         print(f"\nsilent for {silent_s:.2f} s at most after a site was cut off (lease 2 s)")  # noqa: T201 - the figure
 
 
-@pytest.mark.timeout(600)
 def test_a_member_drains(cluster: Cluster, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Fault 18: an operator drains a member while all streams go on, has it back, and another ends: no frame is lost.
 
@@ -339,7 +334,6 @@ def test_a_member_drains(cluster: Cluster, capsys: pytest.CaptureFixture[str], m
         print(f"\nsilent after a drain {drained_s:.2f} s, SIGTERM {ended_s:.2f} s, at 10 Hz")  # noqa: T201 - the figures
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("cluster", ["nats"], indirect=True)
 def test_the_server_is_gone_for_longer_than_a_lease(cluster: Cluster) -> None:
     """Nothing is published without the server, and the service says so; when it is back all is tracked, to the byte.
@@ -380,7 +374,6 @@ def test_the_server_is_gone_for_longer_than_a_lease(cluster: Cluster) -> None:
     assert service.end()[0] == 0
 
 
-@pytest.mark.timeout(600)
 def test_the_topology_of_kubernetes_runs_as_processes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The example starts it with one command, tracks come through either router, and an interrupt ends all of it."""
     routers = [free_endpoint() for _ in range(2)]

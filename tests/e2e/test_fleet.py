@@ -23,7 +23,6 @@ def _compiled() -> None:
     optipmb.warm_up()
 
 
-@pytest.mark.timeout(600)
 def test_terminated_in_the_middle(tmp_path: Path) -> None:
     """Fault 18: SIGTERM among frames under way: status 0 in time, and the next process goes on to the byte.
 
@@ -51,7 +50,6 @@ def test_terminated_in_the_middle(tmp_path: Path) -> None:
         check(node, 60, owner="a")
 
 
-@pytest.mark.timeout(600)
 def test_a_router_that_is_killed(tmp_path: Path) -> None:
     """Fault 16: no router for longer than the lease: the owner goes on, recovers all, applies nothing twice."""
     with Fleet(tmp_path, lease_s=1.0) as fleet, Node(fleet.endpoint) as node:
@@ -67,7 +65,6 @@ def test_a_router_that_is_killed(tmp_path: Path) -> None:
         assert state.duplicates + state.frames == state.received
 
 
-@pytest.mark.timeout(600)
 def test_killed_before_its_first_checkpoint(tmp_path: Path) -> None:
     """Fault 2: whoever begins the session once more publishes under a higher run, which replaces the others."""
     with Fleet(tmp_path, checkpoint_s=3600.0) as fleet, Node(fleet.endpoint) as node:
@@ -83,7 +80,6 @@ def test_killed_before_its_first_checkpoint(tmp_path: Path) -> None:
     assert max(runs[0]) < max(runs[1]) < max(runs[2])
 
 
-@pytest.mark.timeout(600)
 def test_a_full_disk(tmp_path: Path) -> None:
     """Fault 19: no byte more can be written: tracking goes on, the status says degraded; with room again it is ready.
 

@@ -62,7 +62,6 @@ def moved_with_its_sensor(node: Node, before: SessionState) -> None:
     assert (after.session, after.frames >= before.frames) == (before.session, True)
 
 
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("workers", [1, 2])
 def test_killed_while_two_sensors_feed_one_session(tmp_path: Path, workers: int) -> None:
     """State and tracks are those of no kill, to the byte, with one process and with workers."""

@@ -34,7 +34,6 @@ def _compiled() -> None:
     optipmb.warm_up()
 
 
-@pytest.mark.timeout(240 + 60 * KILLS)
 def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Fault 1: four recorded streams, SIGKILL in the middle, a new process: state and tracks are those of no kill.
 

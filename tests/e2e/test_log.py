@@ -107,7 +107,6 @@ def logged(tmp_path: Path) -> Iterator[Logged]:
         logged.log.connection.close(10.0)
 
 
-@pytest.mark.timeout(600)
 def test_a_successor_reads_what_nobody_tracked(logged: Logged) -> None:
     """A member is killed, frames come while there is none, another one goes on from its checkpoint, to the byte.
 
@@ -141,7 +140,6 @@ def test_a_successor_reads_what_nobody_tracked(logged: Logged) -> None:
         gateway.end()
 
 
-@pytest.mark.timeout(600)
 def test_two_bridges_write_once_and_wait_for_the_servers(logged: Logged) -> None:
     """Each message is in the log once, also those that were published while no server was there."""
     first = logged.bridge

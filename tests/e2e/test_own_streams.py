@@ -133,7 +133,6 @@ def only_own(pair: Pair) -> bool:
     return (clouds(pair, "received_total"), clouds(pair, "foreign_total")) == (own, foreign)
 
 
-@pytest.mark.timeout(600)
 def test_a_member_receives_its_own_streams(pair: Pair, capsys: pytest.CaptureFixture[str]) -> None:
     """Bytes that reach a member are those of its streams and 2 % more; of clouds of others nothing."""
     node = pair.node
@@ -162,7 +161,6 @@ def test_a_member_receives_its_own_streams(pair: Pair, capsys: pytest.CaptureFix
     assert clouds(pair, "received_total") == list(map(operator.add, received, sent))
 
 
-@pytest.mark.timeout(600)
 def test_a_publisher_without_a_token_is_tracked_from_its_first_frame(pair: Pair) -> None:
     """Its frames are tracked wherever its partition is, and after a kill -9 of whoever discovers, all of them."""
     node = pair.node
@@ -188,7 +186,6 @@ def test_a_publisher_without_a_token_is_tracked_from_its_first_frame(pair: Pair)
     until(lambda: {KEYS.instance_of(one) for one in node.alive(KEYS.all_discovered())} == {left}, "it discovers now")
 
 
-@pytest.mark.timeout(600)
 def test_streams_that_move_lose_no_frame_and_no_cloud(pair: Pair) -> None:
     """Streams without a cache move from member to member while they come: tracks are those of a session left alone."""
     node, sensors = pair.node, SENSORS[:2]
@@ -227,7 +224,6 @@ def begins(node: Node, sensor: Sensor) -> bool:
     return len(distinct(node, sensor)) == 1
 
 
-@pytest.mark.timeout(600)
 def test_what_waits_in_a_session_moves_with_it(pair: Pair) -> None:
     """A frame that is held for its cloud, and a cloud before its frame, are there where the stream goes on."""
     node, sensor = pair.node, SENSORS[0]

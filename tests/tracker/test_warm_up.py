@@ -8,15 +8,17 @@ import subprocess
 import sys
 from pathlib import Path
 from types import FunctionType, ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numba
-import pytest
 from numba.core import event
 
 import optipmb
 from optipmb import compiled
 from optipmb.warm import kernels
+
+if TYPE_CHECKING:
+    import pytest
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 
@@ -71,7 +73,6 @@ def fresh() -> dict[str, Any]:
     return counts
 
 
-@pytest.mark.timeout(290)
 def test_after_a_warm_up_nothing_is_compiled() -> None:
     """The first process may prepare; the next one loads everything, and no frame brings a kernel anything new."""
     optipmb.warm_up()

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import threading
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_service.zenoh.queries
 import pytest
 from optipmb_schemas import Keys, Problem, SessionState, decode
 from optipmb_service.runtime import stream_queries
-from router import Node, Sensor
+from router import Node, Sensor, until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,8 +47,7 @@ def test_queries_beyond_those_that_may_be_open_are_refused(
         node.send(SENSOR.detections(0))
         node.tracks(SENSOR.stream, 1)
         asked = [asking.submit(node.query, key, None, ASK_S) for _ in range(ASKED)]
-        while len(done := [one for one in asked if one.done()]) < ASKED - MOST:
-            wait({*asked} - {*done}, ASK_S, "FIRST_COMPLETED")
+        until(lambda: sum(one.done() for one in asked) == ASKED - MOST, "the refusals")
         node.send(SENSOR.detections(1))
         node.tracks(SENSOR.stream, 2)
         gate.set()
