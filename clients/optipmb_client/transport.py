@@ -24,7 +24,7 @@ from typing import Protocol, Self, TypeVar, cast
 import zenoh
 import zenoh.ext
 from optipmb_schemas import Detections, Keys, Message, Points, Topic, decode, encode, encoding_of
-from optipmb_schemas.late_join import ANSWER_S, LateJoin
+from optipmb_schemas.late_join import ANSWER_S, CacheQueries, LateJoin
 
 from optipmb_client.errors import ConnectionFailed
 
@@ -194,7 +194,8 @@ class Subscription:
         self._subscriber = subscriber
         self._inbox = inbox
         self._session = session
-        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._receive, self._ask)
+        self._queries: CacheQueries[zenoh.Sample] = CacheQueries(self._ask)
+        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._receive, self._queries.ask)
         self._thread = threading.Thread(target=self._drain, name=f"drain {subscriber.key_expr}", daemon=True)
         self._thread.start()
 
@@ -235,7 +236,9 @@ class Subscription:
         """End the subscription; what is in the inbox stays readable."""
         with contextlib.suppress(zenoh.ZError):
             self._subscriber.undeclare()
-        self._thread.join(timeout=5.0)
+        if self._thread is not threading.current_thread():  # which closes what a program forgot, when it ends it all
+            self._thread.join(timeout=5.0)
+        self._queries.close()
         self._late_join.close()
 
 

@@ -10,12 +10,13 @@ new subscription takes over: the cache's answer to it may overtake messages on t
 It takes Zenoh's samples and imports no Zenoh.
 """
 
+import queue
 import threading
 from collections.abc import Callable, Container
 from dataclasses import dataclass
 from typing import Final, Generic, Protocol, TypeVar
 
-__all__ = ["ANSWER_S", "LateJoin"]
+__all__ = ["ANSWER_S", "CacheQueries", "LateJoin"]
 
 ANSWER_S: Final = 5.0
 """How long to wait for the answer of a cache; a publisher that has just sent a message answers within milliseconds."""
@@ -70,13 +71,55 @@ class _Gap(Generic[_S]):
     behind: list[_S]
 
 
+class CacheQueries(Generic[_S]):
+    """Sends the queries of a subscription on a thread of its own, which begins with the first.
+
+    A cache of the same session answers on the thread that asks, and calls back with its lock held. Who asked in such a
+    callback would ask with that lock held, and wait for ever where a message is being added to the cache.
+
+    Args:
+        query: sends one, with what `LateJoin` gives its `ask`; when it raises, as in a closed session, that is its end.
+    """
+
+    def __init__(self, query: Callable[[str, Callable[[_S], None], Callable[[bool], None]], object]) -> None:
+        self._query = query
+        self._waiting: queue.SimpleQueue[tuple[str, Callable[[_S], None], Callable[[bool], None]] | None]
+        self._waiting = queue.SimpleQueue()
+        self._starting = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def ask(self, selector: str, reply: Callable[[_S], None], end: Callable[[bool], None]) -> None:
+        """Have a query sent soon; never waits."""
+        self._waiting.put((selector, reply, end))
+        with self._starting:
+            if self._thread is None and not self._closed:
+                self._thread = threading.Thread(target=self._send, name="cache-queries", daemon=True)
+                self._thread.start()
+
+    def close(self) -> None:
+        """Send nothing any more: a session cannot be closed while a query is being sent."""
+        with self._starting:
+            self._closed = True
+        self._waiting.put(None)
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(ANSWER_S)
+
+    def _send(self) -> None:
+        while (query := self._waiting.get()) is not None and not self._closed:
+            try:
+                self._query(*query)
+            except Exception:  # noqa: BLE001 - an error of Zenoh, which is not imported here
+                query[2](False)
+
+
 class LateJoin(Generic[_S]):
     """Hands over the samples of one subscription, those of a publisher in order, from the oldest in its cache on.
 
     Args:
         receive: takes a sample; never called by two threads at once, nor after `close`. It must not raise.
         ask: queries a selector; calls its second argument with each reply, and its third when no more will come, with
-            whether all that were asked have answered, on any thread but the one that asks.
+            whether all that were asked have answered, on any thread but the one that asks (`CacheQueries`).
         answered: told the key of a publisher when all has been handed over that its cache held. It must not raise.
     """
 

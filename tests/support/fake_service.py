@@ -65,10 +65,7 @@ class FakeService:
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._lock = threading.Lock()
         self._opened: list[object] = []
-        history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-        self._opened.append(
-            Subscription(session, KEYS.all("detections"), self._on_detections, channel=1000, history=history)
-        )
+        self._opened.append(Subscription(session, KEYS.all("detections"), self._on_detections))
         self._work(session.declare_subscriber(KEYS.all("points"), zenoh.handlers.FifoChannel(1000)), self._on_points)
         for what, answer in (("parameters", self._on_parameters), ("reset", self._on_reset)):
             self._work(session.declare_queryable(KEYS.all_queries(what), zenoh.handlers.FifoChannel(100)), answer)

@@ -271,7 +271,7 @@ class Node:
         def take(sample: zenoh.Sample) -> None:
             collected.add(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
 
-        self._closing.append(Subscription(self.session, pattern, take, channel=10_000).close)
+        self._closing.append(Subscription(self.session, pattern, take).close)
         return collected
 
     def _drain(self, subscriber: Any, take: Callable[[Any], None]) -> None:

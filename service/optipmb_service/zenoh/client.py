@@ -15,7 +15,7 @@ import zenoh.ext
 
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import close, line, opened
-from optipmb_service.zenoh.handles import Publisher, cached_publisher, publish_problem
+from optipmb_service.zenoh.handles import Publisher, Replies, cached_publisher, publish_problem
 from optipmb_service.zenoh.subscription import Subscription
 
 if TYPE_CHECKING:
@@ -171,23 +171,25 @@ class Client:
         Raises:
             TransportError: the session is closed.
         """
-        answers = []
+        answers, replies = [], Replies(timeout)
         try:
-            for reply in self._session.get(
+            self._session.get(
                 key,
+                replies.handler,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,  # the default keeps one reply per key: of two services one
                 accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
                 timeout=timeout,
                 payload=payload or None,
                 encoding=encoding or None,
-            ):
-                if (sample := reply.ok) is not None:
-                    answers.append(_message(sample))
-                elif (error := reply.err) is not None and (said := error.payload.to_bytes()) != b"Timeout":
-                    answers.append(Message(key, said, str(error.encoding), good=False))
+            )
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
+        for reply in replies:
+            if (sample := reply.ok) is not None:
+                answers.append(_message(sample))
+            elif (error_reply := reply.err) is not None and (said := error_reply.payload.to_bytes()) != b"Timeout":
+                answers.append(Message(key, said, str(error_reply.encoding), good=False))
         return answers
 
     def alive(self, pattern: str, timeout: float) -> list[str]:
@@ -196,11 +198,12 @@ class Client:
         Raises:
             TransportError: the session is closed.
         """
+        replies = Replies(timeout)
         try:
-            replies = self._session.liveliness().get(pattern, timeout=timeout)
-            return sorted({str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None})
+            self._session.liveliness().get(pattern, replies.handler, timeout=timeout)
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
+        return sorted({str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None})
 
 
 def _message(sample: zenoh.Sample) -> Message:

@@ -6,6 +6,7 @@ import contextlib
 import queue
 import threading
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 
 import optipmb_schemas as schemas
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 
 FULL_S: Final = 0.005
 """How long the thread of the network waits before it looks again for room in a channel."""
+
+LATE_S: Final = 1.0
+"""How much later than its timeout a query may end."""
 
 HEARTBEAT_S: Final = 1.0
 """How long the loss of a newest message of a cached publisher may stay unnoticed when no other one follows.
@@ -55,13 +59,15 @@ class Channel(Generic[_T]):
     Zenoh's own channels wake who waits for them ten times a second, to look for signals.
 
     Args:
-        most: items that may wait; the thread of the network waits beyond that.
+        most: items that may wait once they are read; the thread of the network waits beyond that. Before, all may: what
+            is there already comes on the thread that declares, which is the one that begins to read.
     """
 
     def __init__(self, most: int) -> None:
         self._most = most
         # To put into this queue and to wake its reader takes half of what `queue.Queue` takes. It has no bound.
         self._waiting: queue.SimpleQueue[_T | None] = queue.SimpleQueue()
+        self._bounded = False
         self._closed = False
 
     @property
@@ -71,6 +77,7 @@ class Channel(Generic[_T]):
 
     def __iter__(self) -> Iterator[_T]:
         """Yield what comes until the end."""
+        self._bounded = True
         while (item := self._waiting.get()) is not None:
             yield item
         with contextlib.suppress(queue.Empty):
@@ -83,10 +90,36 @@ class Channel(Generic[_T]):
         self._waiting.put(None)
 
     def put(self, item: _T) -> None:
-        """Put something last; waits for room."""
-        while self._waiting.qsize() >= self._most and not self._closed:
+        """Put something last; waits for room where it is read."""
+        while self._bounded and self._waiting.qsize() >= self._most and not self._closed:
             time.sleep(FULL_S)
         self._waiting.put(item)
+
+
+class Replies:
+    """The replies to a query, for the thread that asks to iterate over.
+
+    What is in the same session answers on that thread before it can read: a channel with a bound, as Zenoh's own, would
+    wait for room for ever, with the lock of a cache held. The bound is the time.
+
+    Args:
+        timeout: of the query (s).
+    """
+
+    def __init__(self, timeout: float) -> None:
+        self._ends = time.monotonic() + timeout + LATE_S
+        self._waiting: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
+
+    @property
+    def handler(self) -> zenoh.handlers.Callback[zenoh.Reply]:
+        """What Zenoh is to be given."""
+        return zenoh.handlers.Callback(self._waiting.put, partial(self._waiting.put, None), indirect=False)
+
+    def __iter__(self) -> Iterator[zenoh.Reply]:
+        """Yield the replies until the last; nothing that comes later than the query may take."""
+        with contextlib.suppress(queue.Empty):
+            while (reply := self._waiting.get(timeout=max(0.0, self._ends - time.monotonic()))) is not None:
+                yield reply
 
 
 def directly(take: Callable[[Any], None]) -> tuple[Any, None]:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 import zenoh
 import zenoh.ext
-from optipmb_schemas.late_join import LateJoin
+from optipmb_schemas.late_join import CacheQueries, LateJoin
 
 from optipmb_service.runtime.intake import ALL
 from optipmb_service.runtime.ports import TransportError
@@ -70,9 +70,8 @@ class Topic:
         self._turn = threading.Lock()
         self._closed = threading.Event()
         self._subscribers: dict[str, tuple[str, Undeclared]] = {}
-        self._late_join: LateJoin[zenoh.Sample] = LateJoin(
-            self._hand_over, lambda *asked: ask_cache(session, *asked), answered
-        )
+        self._queries: CacheQueries[zenoh.Sample] = CacheQueries(lambda *query: ask_cache(session, *query))
+        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._hand_over, self._queries.ask, answered)
 
     def subscribe(
         self, name: str, key: str, passing: Callable[[zenoh.Sample], None] | None = None, *, cached: bool = True
@@ -126,6 +125,7 @@ class Topic:
         self._in_turn(self._closed.set)
         self._closed.wait(timeout)
         self._closed.set()
+        self._queries.close()
         self._late_join.close()
 
     def _take(self, handle: Callable[[zenoh.Sample], None], sample: zenoh.Sample) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import structlog
 import zenoh
 import zenoh.ext
-from optipmb_schemas.late_join import ANSWER_S, LateJoin
+from optipmb_schemas.late_join import ANSWER_S, CacheQueries, LateJoin
 
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import line
@@ -31,8 +32,6 @@ class Subscription:
         session: to subscribe on.
         key: the key expression.
         receive: called for each sample, one after the other.
-        channel: messages that may wait for the thread.
-        history: what to fetch of publishers that send nothing; by default what their heartbeats say that they hold.
 
     Raises:
         TransportError: the session is closed.
@@ -43,21 +42,17 @@ class Subscription:
         session: zenoh.Session,
         key: str,
         receive: Callable[[zenoh.Sample], None],
-        *,
-        channel: int = CHANNEL,
-        history: zenoh.ext.HistoryConfig | None = None,
     ) -> None:
-        self._session = session
         self._key = key
         self._receive = receive
-        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._hand_over, self._ask)
-        waiting: Channel[zenoh.Sample] = Channel(channel)
+        self._queries: CacheQueries[zenoh.Sample] = CacheQueries(partial(ask_cache, session))
+        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._hand_over, self._queries.ask)
+        waiting: Channel[zenoh.Sample] = Channel(CHANNEL)
         try:
             subscriber = zenoh.ext.declare_advanced_subscriber(
                 session,
                 key,
                 waiting.handler,
-                history=history,
                 recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
             )
         except zenoh.ZError as error:
@@ -68,6 +63,7 @@ class Subscription:
     def close(self, timeout: float = CLOSE_S) -> None:
         """End it; what came before is handed over within `timeout` seconds, and nothing afterwards."""
         self._readers.stop(timeout)
+        self._queries.close()
         self._late_join.close()
 
     def _take(self, sample: zenoh.Sample) -> None:
@@ -79,9 +75,6 @@ class Subscription:
             self._receive(sample)
         except Exception:
             log.exception("internal_error", reader=self._key)  # one message must not end the reading
-
-    def _ask(self, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[bool], None]) -> None:
-        ask_cache(self._session, selector, reply, end)
 
 
 def ask_cache(

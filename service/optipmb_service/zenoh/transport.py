@@ -21,6 +21,7 @@ from optipmb_service.zenoh.handles import (
     Channel,
     Publisher,
     Readers,
+    Replies,
     cached_publisher,
     publish_problem,
     undeclare,
@@ -174,24 +175,26 @@ class Transport:
 
         The question has the lowest priority: it overtakes no message on the way to who is asked.
         """
-        found = []
+        found, replies = [], Replies(RECENT_S)
         try:
-            for reply in self._session.get(
+            self._session.get(
                 self._keys.recent(),
+                replies.handler,
                 payload="\n".join(sessions),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 allowed_destination=zenoh.Locality.REMOTE,
                 priority=zenoh.Priority.BACKGROUND,
                 timeout=RECENT_S,
-            ):
-                if (sample := reply.ok) is not None and (about := sample.attachment) is not None:
-                    key, payload = about.to_string(), sample.payload.to_bytes()
-                    now = time.time_ns(), time.monotonic_ns()
-                    packet = Packet(key, payload, len(payload), str(sample.encoding), *now)
-                    found.append((packet, key.endswith("/detections")))
+            )
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
+        for reply in replies:
+            if (sample := reply.ok) is not None and (about := sample.attachment) is not None:
+                key, payload = about.to_string(), sample.payload.to_bytes()
+                now = time.time_ns(), time.monotonic_ns()
+                packet = Packet(key, payload, len(payload), str(sample.encoding), *now)
+                found.append((packet, key.endswith("/detections")))
         return found
 
     def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
@@ -227,11 +230,13 @@ class Transport:
 
     def ask(self, key: str, timeout: float, payload: bytes = b"", encoding: str = "") -> bytes | None:
         """Ask at a key and return the first answer; None when none comes in time (s)."""
-        with contextlib.suppress(zenoh.ZError):  # the session is closed
-            for reply in self._session.get(key, timeout=timeout, payload=payload, encoding=encoding or None):
-                if (sample := reply.ok) is not None:
-                    return bytes(sample.payload.to_bytes())
-        return None
+        replies = Replies(timeout)
+        try:
+            self._session.get(key, replies.handler, timeout=timeout, payload=payload, encoding=encoding or None)
+        except zenoh.ZError:  # the session is closed
+            return None
+        samples = (sample for reply in replies if (sample := reply.ok) is not None)
+        return next((bytes(sample.payload.to_bytes()) for sample in samples), None)
 
     def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
         queries = OpenQueries(self._instance)

@@ -1,0 +1,114 @@
+"""What the caches, tokens and publishers of a session's own bring: Zenoh calls back on the thread that asks for it.
+
+Each claim is tried on a thread of its own, for one that does not hold would wait for ever.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING, Final
+
+import optipmb_service.zenoh.transport
+import pytest
+from optipmb_schemas import Detections, Keys, Tracks
+from optipmb_service.settings.loading import load
+from optipmb_service.zenoh.client import Client
+from optipmb_service.zenoh.handles import Channel, cached_publisher
+from optipmb_service.zenoh.inputs import Topic
+from optipmb_service.zenoh.transport import Transport
+from router import until
+from routers import free_endpoint, open_router
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    import zenoh
+
+KEYS: Final = Keys()
+HANGS_S: Final = 60.0
+
+
+@pytest.fixture
+def session() -> Iterator[zenoh.Session]:
+    """A session that is a router itself."""
+    with open_router(free_endpoint()) as session:
+        yield session
+
+
+def ends(work: Callable[[], object]) -> None:
+    """Do something that could wait for ever."""
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    thread.join(HANGS_S)
+    assert not thread.is_alive()
+
+
+def test_a_question_has_as_many_answers_as_there_are(session: zenoh.Session) -> None:
+    """The caches of one's own hold more than any channel of Zenoh; what they cache is sent meanwhile."""
+    publishers = [cached_publisher(session, KEYS.tracks(f"site/node/{one}"), Tracks, 50) for one in range(8)]
+    for publisher in publishers:
+        for _ in range(50):
+            publisher.put(b"x")
+    found: list[object] = []
+    client = Client(session, KEYS.prefix, router=True)
+    ends(lambda: found.extend(client.recent(KEYS.all("tracks"), 10.0)))
+    assert len(found) == 400
+    ends(lambda: publishers[0].put(b"y"))
+
+
+def test_as_many_tokens_may_be_there_as_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is watched may be more than waits for a thread: owners, and the links of a router."""
+    monkeypatch.setattr(optipmb_service.zenoh.transport, "CHANNEL", 4)
+    endpoint = free_endpoint()
+    transport = Transport(load(None, {"listen": [endpoint], "instance": "one", "store": "none"}).settings)
+    owners: set[str] = set()
+    claims = [transport.claim(f"site/node/{one}") for one in range(10)]
+    ends(lambda: transport.watch_owners(lambda stream, _instance, _present: owners.add(stream)))
+    until(lambda: len(owners) == len(claims), "all owners")
+    ends(transport.watch)
+    ends(transport.close)
+
+
+def test_a_channel_waits_for_room_only_where_it_is_read() -> None:
+    """Before, who fills it is who will read it."""
+    channel: Channel[int] = Channel(2)
+    ends(lambda: [channel.put(one) for one in range(10)])
+    reading = iter(channel)
+    assert [next(reading) for _ in range(10)] == list(range(10))
+    for one in range(2):
+        channel.put(one)
+    third = threading.Thread(target=channel.put, args=(2,), daemon=True)
+    third.start()
+    time.sleep(0.1)
+    assert third.is_alive()
+    assert [next(reading) for _ in range(3)] == [0, 1, 2]
+    third.join(HANGS_S)
+    assert not third.is_alive()
+
+
+def test_subscribing_to_what_is_sent_in_the_same_session_waits_for_no_cache(session: zenoh.Session) -> None:
+    """A cache answers a new subscription with its lock held; asking it once more from there must not wait for it."""
+    received = []
+    topic = Topic("detections", session, received.append)
+
+    def subscribe(number: int) -> None:
+        key, over = KEYS.detections(f"site/node/{number}"), threading.Event()
+        publisher = cached_publisher(session, key, Detections, 200)
+        for _ in range(100):
+            publisher.put(bytes(2000))
+
+        def send() -> None:
+            while not over.is_set():
+                publisher.put(bytes(2000))
+
+        sending = threading.Thread(target=send, daemon=True)
+        sending.start()
+        topic.subscribe(str(number), key)
+        over.set()
+        sending.join()
+        topic.leave([str(number)])
+
+    ends(lambda: [subscribe(number) for number in range(20)])
+    topic.close(HANGS_S)
+    assert received
