@@ -27,7 +27,6 @@ import structlog
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
 from optipmb_service.runtime.directory import StreamDirectory, node_of
 from optipmb_service.runtime.handover import Handover, Others
-from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.values import SECOND
 
 if TYPE_CHECKING:
@@ -150,7 +149,7 @@ class Intake:
         self._wake = threading.Event()
         self._hurry = threading.Event()
         self._expires_ns = 0
-        self._ending = False
+        self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
 
     def start(self) -> None:
@@ -166,7 +165,7 @@ class Intake:
 
     def close(self, timeout: float) -> None:
         """Change nothing any more; a step that takes longer (s) is left to itself."""
-        self._ending = True
+        self._ending.set()
         self._hurry.set()
         self._wake.set()
         if self._thread.is_alive():
@@ -265,16 +264,16 @@ class Intake:
     # The thread
 
     def _run(self) -> None:
-        while not self._ending:
+        while not self._ending.is_set():
             self._wake.wait(EXPIRY_S)
             self._wake.clear()
             self._hurry.clear()
             began_s = time.thread_time()
             try:
                 self._step()
-            except TransportError:
-                return  # the end
             except Exception:
+                if self._ending.is_set():
+                    return  # the session is closed
                 log.exception("internal_error", thread="intake")
             # A step looks at all streams: where thousands begin, what comes meanwhile is seen to in one.
             self._hurry.wait(min(MOST_REST_S, REST * (time.thread_time() - began_s)))

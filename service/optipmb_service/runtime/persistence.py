@@ -340,6 +340,8 @@ class CheckpointWriter:
                 self._pending = mine | self._pending
         except Exception:
             log.exception("internal_error", thread="checkpoints")
+            with self._lock:
+                self._pending = mine | self._pending
         else:
             self.written += len(encoded) - len(lost)
             for stream in encoded:

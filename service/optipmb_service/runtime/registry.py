@@ -328,8 +328,9 @@ class Registry:
     def _lose(self, stream: str, lost: list[bool]) -> None:
         """Count messages that were dropped before their stream was tracked, each True: a frame."""
         frames = sum(lost)
-        self._actors.count(MessageCounters(received=frames, refused=frames, clouds_refused=len(lost) - frames))
-        self._report_shed(stream)
+        self._actors.count(MessageCounters(received=frames, shed=frames, clouds_shed=len(lost) - frames))
+        expected = "room for what waits for its session, for two minutes at most"
+        self._report("shed", stream, expected, f"{len(lost)} more; the oldest were dropped")
 
     def _report_shed(self, stream: str) -> None:
         self._report("shed", stream, f"fewer than {MAX_UNPROVEN_ACTORS} new streams at once", "more than can wait")

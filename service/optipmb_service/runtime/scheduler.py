@@ -7,6 +7,10 @@ import threading
 import time
 from typing import Final, Protocol
 
+import structlog
+
+log = structlog.get_logger("optipmb_service")
+
 
 class Runnable(Protocol):
     """What the scheduler runs."""
@@ -49,6 +53,9 @@ class Scheduler:
     def _run(self) -> None:
         while (runnable := self._queue.get()) is not self._END:
             self._began_ns = time.monotonic_ns()
-            if runnable.work():
-                self._queue.put(runnable)
+            try:
+                if runnable.work():
+                    self._queue.put(runnable)
+            except Exception:
+                log.exception("internal_error", thread="tracking")  # one stream must not end the thread of all
             self._began_ns = None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -40,6 +40,8 @@ NO_SESSION = "0" * 32
 """Session id in the state of a stream that has none."""
 
 _T = TypeVar("_T", bound=schemas.Message)
+_State: TypeAlias = "tuple[schemas.SessionState, Checkpoint | None]"
+"""The state of a session, and what its digest is made of."""
 
 
 class StreamQueries:
@@ -81,8 +83,8 @@ class StreamQueries:
         if name == "tracks":
             self._tracks.answer(request, stream)
             return
-        commands: dict[str, tuple[Callable[[StreamActor, Request], None], bool]] = {
-            "state": (lambda *_: None, True),
+        commands: dict[str, tuple[Callable[[StreamActor, Request], _State | None], bool]] = {
+            "state": (lambda actor, _: self._state(actor), True),
             "density": (self._density, True),
             "reset": (self._reset, False),
             "parameters": (self._parameters, False),
@@ -96,12 +98,12 @@ class StreamQueries:
         command, urgent = commands[name]
 
         def answer(actor: StreamActor) -> None:
-            if name == "state" and not actor.elsewhere:
-                state = self._state(actor)
-                self._digests.submit(guarded, request, lambda: self._tell(request, state))
-                return
             # Where several instances run, the one that tracks the stream answers.
-            guarded(request, lambda: None if actor.elsewhere else command(actor, request))
+            state = None if actor.elsewhere else self._run(request, lambda: command(actor, request))
+            if state is None:
+                request.finish()
+            else:
+                self._digests.submit(guarded, request, lambda: self._tell(request, state, request.key))
 
         # A stream can be set up ahead of its first frame, by a valid request.
         seeks = name == "parameters" and self._sets(request)
@@ -149,20 +151,25 @@ class StreamQueries:
                 left.one()
 
     def _one_of_many(self, request: Request, left: _Countdown) -> Callable[[StreamActor], None]:
-        def tell(state: tuple[schemas.SessionState, Checkpoint | None]) -> None:
+        def tell(state: _State) -> None:
             try:
-                self._tell(request, state)
+                self._tell(request, state, self._keys.query(state[0].stream, "state"))
             except TransportError as error:
                 log.warning("reply_failed", key=request.key, error=str(error))
             finally:
                 left.one()
 
         def command(actor: StreamActor) -> None:
-            self._digests.submit(tell, self._state(actor))
+            try:
+                state = self._state(actor)
+            except Exception:
+                left.one()
+                raise
+            self._digests.submit(tell, state)
 
         return command
 
-    def _tell(self, request: Request, state: tuple[schemas.SessionState, Checkpoint | None]) -> None:
+    def _tell(self, request: Request, state: _State, key: str) -> None:
         """Answer with a state and its digest, on the thread that makes digests: it encodes a whole checkpoint."""
         said, checkpoint = state
         if checkpoint is not None:
@@ -171,11 +178,24 @@ class StreamQueries:
             except Exception:
                 log.exception("internal_error", stream=said.stream)
                 raise
-        request.answer(self._keys.query(said.stream, "state"), said)
+        request.answer(key, said)
 
     # Run by the tracking thread
 
-    def _state(self, actor: StreamActor) -> tuple[schemas.SessionState, Checkpoint | None]:
+    @staticmethod
+    def _run(request: Request, command: Callable[[], _State | None]) -> _State | None:
+        """Return the state that is to be answered with its digest; None when all is answered, or cannot be."""
+        state = None
+        try:
+            state = command()
+        except TransportError as error:
+            log.warning("reply_failed", key=request.key, error=str(error))
+        except Exception:
+            request.finish()  # nobody is to wait for the timeout
+            raise
+        return state
+
+    def _state(self, actor: StreamActor) -> _State:
         state = actor.state()
         if state is None or actor.session is None:
             return self._nothing(actor.stream, "new"), None
@@ -192,21 +212,18 @@ class StreamQueries:
         )
         request.answer(self._keys.query(actor.stream, "density"), message)
 
-    def _reset(self, actor: StreamActor, request: Request) -> None:
+    def _reset(self, actor: StreamActor, request: Request) -> _State | None:
         asked = self._payload(actor, request, schemas.ResetRequest, schemas.ResetRequest())
         if asked is None:
-            return
+            return None
         session = actor.session
-        state = self._nothing(actor.stream, "closed" if asked.close else "new")
         if session is not None and asked.close:
             actor.close_session("query")
-            state = session.state(closed=True)
-        elif session is not None:
+            return session.state(closed=True), None
+        if session is not None:
             actor.deliver(session.reset())
-            state, checkpoint = self._state(actor)
-            if checkpoint is not None:
-                state = state.model_copy(update={"digest": digest_of(checkpoint)})
-        request.answer(self._keys.query(actor.stream, "reset"), state)
+            return self._state(actor)
+        return self._nothing(actor.stream, "closed" if asked.close else "new"), None
 
     def _parameters(self, actor: StreamActor, request: Request) -> None:
         empty = schemas.SessionParameters()

@@ -302,10 +302,11 @@ def test_a_stream_goes_on_when_its_lease_holds_again_in_the_middle_of_a_turn(
         node.tracks(CAREFUL.stream, 2)
 
 
+@pytest.mark.parametrize(("query", "frames"), [("state", 1), ("reset", 1)])
 def test_a_question_about_the_state_keeps_no_frame_waiting(
-    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, query: str, frames: int
 ) -> None:
-    """The digest of a state is made on a thread of its own: frames are tracked meanwhile."""
+    """The digest of a state, as a reset answers with it too, is made on a thread of its own: frames are tracked."""
     gate, asked = threading.Event(), threading.Event()
     digest = stream_queries.digest_of
 
@@ -319,12 +320,12 @@ def test_a_question_about_the_state_keeps_no_frame_waiting(
     with Node(endpoint) as node, ThreadPoolExecutor(1) as asking:
         node.send(CAREFUL.detections(0))
         node.tracks(CAREFUL.stream, 1)
-        answer = asking.submit(node.query, KEYS.query(CAREFUL.stream, "state"), None, 30.0)
+        answer = asking.submit(node.query, KEYS.query(CAREFUL.stream, query), None, 30.0)
         assert asked.wait(20)
         node.send(CAREFUL.detections(1))
         node.tracks(CAREFUL.stream, 2)
         gate.set()
-        assert decode(answer.result()[0][2], SessionState).frames == 1  # the state at the question
+        assert decode(answer.result()[0][2], SessionState).frames == frames  # the state at the question
 
 
 def test_a_stream_that_opens_keeps_no_other_waiting(

@@ -393,17 +393,17 @@ def test_what_is_put_off_counts_as_received() -> None:
     assert [len(offered) for offered in kept.offered] == [5]
 
 
-def test_what_is_put_off_and_dropped_is_refused() -> None:
-    """What the buffers have no room for, and what has waited for too long, counts as refused, with a problem."""
+def test_what_is_put_off_and_dropped_is_shed() -> None:
+    """What the buffers have no room for, and what has waited for too long, counts as shed, with a problem."""
     kept = Kept(standby=3 * detections(0, 1000).held)
     registry = kept.registry
     for number in range(50):
         registry.frame(detections(number, 1000))
-    assert (len(registry.untracked._buffers[STREAMS[0]]), registry.totals().refused) == (3, 47)
+    assert (len(registry.untracked._buffers[STREAMS[0]]), registry.totals().shed) == (3, 47)
     registry.cloud(detections(50, 1000))
-    assert registry.totals().clouds_refused == 1
+    assert registry.totals().clouds_shed == 1
     registry.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
-    assert (registry.totals().received, registry.totals().refused) == (50, 50)
+    assert (registry.totals().received, registry.totals().shed) == (50, 50)
     assert set(kept.problems) == {"shed"}
 
 
@@ -431,5 +431,5 @@ def test_what_a_session_passes_on_is_kept_until_it_is_asked_for(*, asked: bool) 
         assert registry.untracked.recent([STREAMS[0]])[:2] == passed
     registry.sweep(time.monotonic_ns() + UNASKED_NS + SECOND)
     assert not registry.untracked._buffers[STREAMS[0]]
-    assert registry.totals().refused == (0 if asked else 2)
+    assert registry.totals().shed == (0 if asked else 2)
     assert kept.metrics == {"foreign detections": 1}
