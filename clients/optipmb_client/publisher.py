@@ -72,7 +72,7 @@ class Publisher:
         Keys(prefix).detections(stream)  # checks both
         self.stream = stream
         self.frame = frame
-        self.epoch = secrets.token_bytes(16)  # tells this run of the publisher from the next one
+        self.epoch = secrets.token_bytes(16)  # identifies this start of the publisher
         self.last_put_ns = 0  # monotonic time just before the newest detections were handed to the network
         self._seq = 0
         self._points_seq = 0

@@ -163,7 +163,7 @@ class Delivery(Message):
     instance: Name = Field(description="Instance that published.")
     received_ns: Stamp = Field(description="Arrival of the detections by the service's clock, ns since 1970 UTC.")
     published_ns: Stamp = Field(description="Hand-over of the tracks to Zenoh, same clock.")
-    queue_ms: NonNegative = Field(description="Milliseconds spent waiting for a worker and the cloud.")
+    queue_ms: NonNegative = Field(description="Milliseconds spent waiting for the tracking thread and the cloud.")
     decode_ms: NonNegative = Field(description="Milliseconds spent decoding.")
     step_ms: NonNegative = Field(description="Milliseconds spent in the tracker.")
     run: Count = Field(

@@ -134,6 +134,9 @@ class _Work:
             while (work := self._next()) is not None:
                 self._turned = time.monotonic()
                 work()
+                if self._turned >= ends:  # more comes than can be handled, and the end may have been asked for
+                    self._filled.set()
+                    break
             self._turned = time.monotonic()
             self._bridge.go_on()
             if time.monotonic() >= self._next_diagnostics:

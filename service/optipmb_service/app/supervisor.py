@@ -4,8 +4,8 @@ With a router, the router lives in the parent, and the workers connect to it ove
 no password. Else the workers connect where the parent does. To the network the workers are one instance: the parent
 holds its alive token and answers its queries; the owner tokens of streams carry the names of the workers.
 
-A worker that gives no sign of life for `stuck_s` is killed. One that dies is started again at once; if it dies again
-soon, after a pause that doubles. Meanwhile the others have its streams.
+A worker that gives no sign of life for `stuck_s`, or for `START_S` while it starts, is killed. One that dies is started
+again at once; if it dies again soon, after a pause that doubles. Meanwhile the others have its streams.
 """
 
 from __future__ import annotations
@@ -39,6 +39,9 @@ FIRST_PAUSE_S: Final = 0.5
 LONGEST_PAUSE_S: Final = 30.0
 STEADY_S: Final = 60.0
 """A worker that has lived for so long is taken for sound: if it dies, it is started again at once."""
+
+START_S: Final = 900.0
+"""How long a worker may take to start: where the kernels are compiled, one compiles them and the others wait."""
 
 LATE_S: Final = 2.0
 """A control loop that turns so late was frozen, or starved, and knows nothing of its workers."""
@@ -122,7 +125,8 @@ class Supervisor:
                 continue
             for index, child in enumerate(self._children):
                 silent_s = now - self._heard[index]
-                if child is not None and self.states[index] == "ready" and silent_s > self._settings.stuck_s:
+                state = self.states[index]
+                if child is not None and silent_s > (self._settings.stuck_s if state == "ready" else START_S):
                     log.error("worker_stuck", worker=index, silent_s=round(silent_s, 3))
                     self._set(index, "down")
                     child.kill()
@@ -141,6 +145,7 @@ class Supervisor:
         while not self._over:
             child = self._children[index] = WorkerProcess(index, lambda event: self._take_in(index, event))
             self._set(index, "starting")
+            self._heard[index] = time.monotonic()
             self._was_ready[index] = False
             began = time.monotonic()
             status = await child.run(settings, self._private)

@@ -28,7 +28,7 @@ LINE_BYTES: Final = 1 << 20
 
 
 class WorkerProcess:
-    """One run of a worker process.
+    """A worker process, from its start to its end.
 
     Args:
         index: which worker.

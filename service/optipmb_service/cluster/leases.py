@@ -1,9 +1,9 @@
 """Leases of partitions: decisions only, no clock, no network, no threads.
 
-Streams are hashed to partitions. A member, one run of one process, holds partitions and tracks their streams. All that
-is agreed on is a record under a key in a store whose order of events is the only one there is: every write of a record
-states the revision that it replaces, is refused when that is not the newest, and gets a revision higher than all before
-it. No clock is ever compared with another one.
+Streams are hashed to partitions. A member, a process from its start to its end, holds partitions and tracks their
+streams. All that is agreed on is a record under a key in a store whose order of events is the only one there is: every
+write of a record states the revision that it replaces, is refused when that is not the newest, and gets a revision
+higher than all before it. No clock is ever compared with another one.
 
 - `member/<id>`: a member renews its record several times within a lease. Who has watched a record for a whole lease,
   by its own clock, without a new revision, writes `ended` over that revision; at once where the store knows that the
@@ -79,7 +79,7 @@ def wish_key(partition: int) -> str:
 
 
 def instance_of(member: str) -> str:
-    """Return the name of the instance whose run a member is."""
+    """Return the name of the instance to which a member belongs."""
     return member.rpartition("/")[0]
 
 
@@ -152,7 +152,7 @@ class LeaseTable:
     """What one member knows of all members and partitions. All times are its own, monotonic, ns.
 
     Attributes:
-        member: its id, that no other run of a process ever has.
+        member: its id, that no other process ever has.
         lease_ns: how long a member is watched before it is ended.
         position: the highest revision seen.
         held: partitions that it holds, each with its fence; may be read by any thread.

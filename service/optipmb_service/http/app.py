@@ -27,10 +27,10 @@ class Source(Protocol):
     """What the application tells of; every method may be called by any thread and answers at once."""
 
     def alive(self) -> bool:
-        """Tell whether the control loop turns."""
+        """Tell whether the control loop turns, and the tracking thread is not stuck."""
 
     def beat_age_s(self) -> float:
-        """Return the seconds since it last did."""
+        """Return the seconds since the control loop last turned."""
 
     def ready(self) -> bool:
         """Tell whether the service can be used."""

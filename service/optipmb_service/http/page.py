@@ -8,6 +8,7 @@ Files and data come from here alone, and the browser is told to accept nothing e
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import importlib.resources
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -129,8 +130,14 @@ class _Viewers:
         self._count -= 1
 
     async def _events(self, stream: str) -> AsyncIterator[str]:
-        newest = Newest(asyncio.get_running_loop())
-        release = await asyncio.to_thread(self._watched.tap, stream, newest.put)
+        loop = asyncio.get_running_loop()
+        newest = Newest(loop)
+        tapped = loop.run_in_executor(None, self._watched.tap, stream, newest.put)
+        try:
+            release = await asyncio.shield(tapped)
+        except asyncio.CancelledError:
+            tapped.add_done_callback(_undo)  # the viewer has gone; the thread makes the tap all the same
+            raise
         if release is None:
             return
         try:
@@ -146,4 +153,12 @@ class _Viewers:
                     yield f"data: {text}\n\n"
                 await asyncio.sleep(PERIOD_S)
         finally:
-            asyncio.get_running_loop().run_in_executor(None, release)  # not awaited: the viewer's task may be cancelled
+            loop.run_in_executor(None, release)  # not awaited: the viewer's task may be cancelled
+
+
+def _undo(tapped: asyncio.Future[Callable[[], None] | None]) -> None:
+    """Release a tap that nobody waits for any more."""
+    if tapped.cancelled() or tapped.exception() is not None or (release := tapped.result()) is None:
+        return
+    with contextlib.suppress(RuntimeError):  # the server ends, and its threads have been told
+        tapped.get_loop().run_in_executor(None, release)

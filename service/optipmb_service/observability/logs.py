@@ -76,7 +76,7 @@ EVENTS: Final = {
     "worker_killed": "A worker did not end or respond in time and was killed.",
     "metrics_unreadable": "The metrics of a worker cannot be read and are left out.",
     "parent_gone": "The parent has died; its worker ends.",
-    "stop_asked": "SIGINT or SIGTERM, or the parent ends its worker; it stops within two seconds.",
+    "stop_asked": "SIGINT or SIGTERM, or the parent ends its worker; it stops within 8 s + `grace_s`.",
     "stop_asked_again": "Another signal, which has no effect.",
     "stopped": "The service has stopped; `drained` is false when a step was abandoned.",
 }

@@ -18,7 +18,7 @@ SILENT_PERIODS: Final = 3
 
 
 class StreamMeter:
-    """Written by the worker of a stream, read by whoever asks."""
+    """Written by the tracking thread, read by whoever asks."""
 
     def __init__(self, now_ns: int) -> None:
         self._lock = threading.Lock()

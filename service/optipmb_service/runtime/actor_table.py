@@ -30,7 +30,7 @@ class ActorTable:
 
     Args:
         make: makes the actor of a stream.
-        scheduler: sends workers to them.
+        scheduler: gives them their turns.
         member: says whether the lease is renewed late.
     """
 
@@ -68,19 +68,19 @@ class ActorTable:
 
         Args:
             stream: of the actor.
-            offer: puts it into the mailbox; returns whether a worker must be sent, None when the actor has ended.
+            offer: puts it into the mailbox; returns whether the actor must be scheduled, None when the actor has ended.
             limited: whether none is made when too many streams are new.
         """
         while True:
             actor = self._actor(stream, limited=limited)
             if actor is None:
                 return False
-            sent = offer(actor)
-            if sent is not None:
+            must_schedule = offer(actor)
+            if must_schedule is not None:
                 break
             # The actor has closed since it was found: once more, with a new one.
             self.discard(actor)
-        if sent:
+        if must_schedule:
             self._scheduler.submit(actor)
         return True
 

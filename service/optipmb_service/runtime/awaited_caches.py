@@ -22,7 +22,7 @@ MOST: Final = 4 * MAX_SENSORS
 
 
 class AwaitedCaches:
-    """The caches of one session's streams; for its worker alone.
+    """The caches of one session's streams; for the tracking thread alone.
 
     Args:
         stream: the name of the session.

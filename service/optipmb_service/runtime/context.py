@@ -37,7 +37,7 @@ class Actor(Protocol):
         """Its stream, `site/node/sensor`."""
 
     def wake(self) -> None:
-        """Send a worker though nothing came."""
+        """Schedule the actor though nothing came."""
 
     def work(self) -> bool:
         """Take some of what waits; True: come again."""
@@ -72,7 +72,7 @@ class ActorContext:
         admit: asked before a session begins; returns what the stream had before, None when there is no room.
         release: called when a session has ended, or was not begun, with what a later one has to know.
         discard: called when an actor without a session has nothing left to do.
-        submit: sends a worker to an actor.
+        submit: schedules an actor.
         arm: has `wake` of an actor called at a monotonic time (ns).
         metrics: counts what is published.
         tracker: makes trackers.

@@ -1,8 +1,8 @@
 """The bounded mailbox of a session.
 
-Readers put in, one worker thread takes out. What is not urgent keeps its order. Point clouds go before frames, so that
-no frame goes on without a cloud that has long arrived; when too many of a stream wait, or too many bytes, its oldest is
-shed and counted. Where several streams feed the session, none takes the room of another.
+Readers put in, the tracking thread takes out. What is not urgent keeps its order. Point clouds go before frames, so
+that no frame goes on without a cloud that has long arrived; when too many of a stream wait, or too many bytes, its
+oldest is shed and counted. Where several streams feed the session, none takes the room of another.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class _Waiting:
 
 
 class Mailbox:
-    """What waits for a session's worker.
+    """What waits for a session.
 
     Args:
         frames: most frames of a stream waiting.
@@ -62,7 +62,7 @@ class Mailbox:
 
     @property
     def idle(self) -> bool:
-        """Whether no worker is needed or at work."""
+        """Whether its actor is neither scheduled nor at work."""
         return not self._scheduled
 
     def shed_since(self) -> dict[str, int]:
@@ -77,7 +77,7 @@ class Mailbox:
             return self.shed_frames, self._waiting_frames(), self.shed_clouds
 
     def offer_frame(self, packet: Packet) -> bool | None:
-        """Put a frame last; True: a worker must be sent, None: closed."""
+        """Put a frame last; True: the actor must be scheduled, None: closed."""
         with self._lock:
             if self._closed:
                 return None
@@ -93,7 +93,7 @@ class Mailbox:
             return self._schedule()
 
     def offer_cloud(self, packet: Packet) -> bool | None:
-        """Put a cloud last of the clouds; True: a worker must be sent, None: closed."""
+        """Put a cloud last of the clouds; True: the actor must be scheduled, None: closed."""
         with self._lock:
             if self._closed:
                 return None
@@ -109,7 +109,10 @@ class Mailbox:
             return self._schedule()
 
     def offer_command(self, command: Command, *, urgent: bool) -> bool | None:
-        """Put a command before everything, or after the frames that wait; True: a worker must be sent, None: closed."""
+        """Put a command before everything, or after the frames that wait.
+
+        True: the actor must be scheduled, None: closed.
+        """
         with self._lock:
             if self._closed:
                 return None
@@ -117,7 +120,7 @@ class Mailbox:
             return self._schedule()
 
     def ring(self) -> bool | None:
-        """Call for a worker though nothing came; True: it must be sent, None: closed."""
+        """Ask for a turn though nothing came; True: the actor must be scheduled, None: closed."""
         with self._lock:
             if self._closed:
                 return None
@@ -150,9 +153,9 @@ class Mailbox:
         return len(self._clouds)
 
     def leave(self, *, close: bool, urgent: bool = False) -> bool | None:
-        """End a worker's turn: True: it must come again, None: the mailbox was empty and is closed now, as asked.
+        """End the actor's turn: True: it needs another, None: the mailbox was empty and is closed now, as asked.
 
-        With `urgent`, what waits but is not urgent does not count: the worker is to come when it is sent for.
+        With `urgent`, what waits but is not urgent does not count: the actor waits until it is scheduled.
         """
         with self._lock:
             if self._urgent or self._rung or (not urgent and (self._clouds or self._frames)):

@@ -21,7 +21,7 @@ log = structlog.get_logger("optipmb_service")
 
 
 class MissedQueue:
-    """The packets that one session has missed and not taken yet; for its worker alone.
+    """The packets that one session has missed and not taken yet; for the tracking thread alone.
 
     Args:
         stream: the name of the session.

@@ -1,10 +1,9 @@
 """Checkpoints on their way to the store, off the path of the frames: one thread encodes and writes them all.
 
-A worker gives references to values that never change, which costs it microseconds. The checkpoint writer waits a moment
-before it
-writes: what a checkpoint contains must have left this process as tracks, or a kill between the two would swallow them
-(what is tracked again after a restore is published again, what the checkpoint holds is not). Then it writes all
-sessions that changed in one transaction.
+The tracking thread gives references to values that never change, which costs it microseconds. The checkpoint writer
+waits a moment before it writes: what a checkpoint contains must have left this process as tracks, or a kill between the
+two would swallow them (what is tracked again after a restore is published again, what the checkpoint holds is not).
+Then it writes all sessions that changed in one transaction.
 
 A store that fails (disk full, read-only, gone) costs durability and nothing else: tracking goes on, the status of the
 service is `degraded`, and every interval tries again with the newest state.

@@ -1,8 +1,8 @@
 """All streams of the service: hands messages to the actors of their streams, and tells these what the others decide.
 
-Called by threads of the network, the workers, the query thread and the control loop. `actor_table` has the actors,
-`untracked` what came of streams that others track, `admission` says who has room, and `sweep` looks at all of them now
-and then.
+Called by threads of the network, the tracking thread, the query thread and the control loop. `actor_table` has the
+actors, `untracked` what came of streams that others track, `admission` says who has room, and `sweep` looks at all of
+them now and then.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Registry:
         profiles: the parameters that can be had.
         sink: where results go.
         reporter: where problems go.
-        scheduler: the workers.
+        scheduler: runs the actors.
         member: says which streams this instance tracks.
         persistence: where checkpoints go and come from.
         missed: what is known of the frames that a session has missed.
@@ -189,7 +189,7 @@ class Registry:
             self._hand(stream, packet, frame=frame)
 
     def command(self, stream: str, command: Callable[[StreamActor], None], *, urgent: bool) -> bool:
-        """Have a worker run a command for a stream; False when the service takes no more streams."""
+        """Have the actor of a stream run a command; False when the service takes no more streams."""
         if self._actors.offer(stream, lambda actor: actor.mailbox.offer_command(lambda: command(actor), urgent=urgent)):
             return True
         self._report_shed(stream)
@@ -218,7 +218,7 @@ class Registry:
             self._metrics.foreign("detections", size)
 
     def waits(self, session: str) -> bool:
-        """Whether messages of a session wait for a worker."""
+        """Whether messages of a session wait for the tracking thread."""
         actor = self._actors.of(session)
         return actor is not None and (actor.occupied or not actor.mailbox.idle)
 
@@ -265,7 +265,7 @@ class Registry:
         self._sweep.run(now_ns, self._rivals)
 
     def changed(self, partition: int, change: Change) -> None:
-        """Tell the workers of streams what has become of their partition; those that came here are to be taken up."""
+        """Have actors run what a change of their partition asks for; those that came here are to be taken up."""
         if change is Change.HELD:
             return
         told = StreamActor.on_recalled if change is Change.RECALLED else StreamActor.on_lost
@@ -275,7 +275,7 @@ class Registry:
             actor.tell(told)
 
     def resume(self) -> None:
-        """Send workers to all streams: they paused, and need not any longer."""
+        """Schedule all actors: they paused, and need not any longer."""
         for actor in self.actors():
             actor.wake()
 
@@ -286,12 +286,12 @@ class Registry:
                 actor.tell(StreamActor.keep)
 
     def keep_now(self) -> None:
-        """Do the same in the calling thread, when the workers have ended."""
+        """Do the same in the calling thread, when the tracking thread has ended."""
         for actor in self.actors():
             actor.keep()
 
     def finish(self) -> None:
-        """Process what is held for clouds, in every session; the workers do it."""
+        """Process what is held for clouds, in every session, on the tracking thread."""
         for actor in self.actors():
             self.command(actor.stream, _flush, urgent=False)
 

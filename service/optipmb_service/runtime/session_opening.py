@@ -32,7 +32,7 @@ log = structlog.get_logger("optipmb_service")
 
 
 class SessionOpening:
-    """Restores or makes the session of one stream; for its worker alone.
+    """Restores or makes the session of one stream; for the tracking thread alone.
 
     Args:
         stream: the name of the session.

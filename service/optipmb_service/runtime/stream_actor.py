@@ -1,6 +1,6 @@
-"""A session's turns on the worker: it takes up, leaves and keeps the session of its stream, and hands it what waits.
+"""A session's turns on the tracking thread: takes up, leaves and keeps the session of a stream, hands it what waits.
 
-All is on one worker at a time, so nothing is locked. Where several streams share a session, the actor has its name.
+All is on that one thread, so nothing is locked. Where several streams share a session, the actor has its name.
 
 An actor is made for whatever arrives on the key of a stream whose partition this instance holds, its session only for a
 valid message: garbage costs an actor that is gone when its mailbox is empty. Clocks: `now_ns` monotonic for all
@@ -80,16 +80,16 @@ class StreamActor:
         self._fence: int | None = None
 
     def wake(self) -> None:
-        """Send a worker though nothing came: frames have waited long enough."""
+        """Schedule the actor though nothing came: frames have waited long enough."""
         if self.mailbox.ring():
             self._context.submit(self)
 
     def tell(self, command: Callable[[StreamActor], None]) -> None:
-        """Have the worker run a command before all that waits."""
+        """Run a command before all that waits."""
         if self.mailbox.offer_command(lambda: command(self), urgent=True):
             self._context.submit(self)
 
-    # The worker's turn
+    # A turn
 
     def work(self) -> bool:
         """Take some of what waits; True: come again."""
@@ -140,7 +140,7 @@ class StreamActor:
         return 0 if session is None else session.held_bytes
 
     def _guard(self, work: Callable[..., None], *arguments: Any, **named: Any) -> None:
-        """Do a piece of work; whatever it raises, the stream and its worker go on."""
+        """Do a piece of work; whatever it raises, the stream and the thread go on."""
         try:
             work(*arguments, **named)
         except Exception as error:
@@ -154,7 +154,7 @@ class StreamActor:
             item()
 
     def _settle(self) -> None:
-        """Let go what has waited long enough, and have the worker come back for what has not."""
+        """Let go what has waited long enough, and ask for a turn for what has not."""
         if self._accounts.shed():
             self._tracking.report_shed(self.mailbox)
         session = self.session
@@ -176,7 +176,7 @@ class StreamActor:
         else:
             self._tracking.accept(self.session, packet, frame=frame)
 
-    # Who tracks the stream; to be called by the worker alone
+    # Who tracks the stream; to be called by the tracking thread alone
 
     def take_up(self, packets: Sequence[tuple[Packet, bool]], answered: Collection[str] = ()) -> None:
         """Go on with a stream that has come here, and with what it sent before, each packet with whether it is a frame.
@@ -203,7 +203,7 @@ class StreamActor:
             self._tracking.recovered(session)
 
     def _take_cached(self, stream: str, packets: list[tuple[Packet, bool]], complete: bool) -> None:  # noqa: FBT001 - as the network calls it
-        """Have the worker take what a cache held; one that has not answered is asked again. Called on any thread."""
+        """Take what a cache held; one that has not answered is asked again. Called on any thread."""
 
         def take(cached: TakeoverBuffer) -> None:
             self._catch_up(cached)
@@ -268,7 +268,7 @@ class StreamActor:
         """Another instance is to have the stream: leave it as soon as its state is kept."""
         self.close_session("moved")
 
-    # Sessions; to be called by the worker alone
+    # Sessions; to be called by the tracking thread alone
 
     def _open(self, *, seeking: bool = False) -> bool:
         """Begin to open a session, while packets wait; False when there is no room."""
@@ -283,12 +283,12 @@ class StreamActor:
         )
 
     def _hand_over(self, packets: Sequence[tuple[Packet, bool]], command: Callable[[TakeoverBuffer], None]) -> None:
-        """Have the worker run a command with packets, within the bytes that may wait; called on any thread."""
+        """Post a command with packets to the mailbox, within the bytes that may wait; called on any thread."""
         missed = self._missed.bounded(packets)
-        must_send = self.mailbox.offer_command(lambda: command(missed), urgent=True)
-        if must_send:
+        must_schedule = self.mailbox.offer_command(lambda: command(missed), urgent=True)
+        if must_schedule:
             self._context.submit(self)
-        elif must_send is None:  # the actor has ended
+        elif must_schedule is None:  # the actor has ended
             missed.take()
 
     def _on_loaded(self, restored: Session | None, fence: int | None, missed: TakeoverBuffer) -> None:

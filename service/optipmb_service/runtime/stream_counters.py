@@ -32,7 +32,7 @@ class _Accounts(NamedTuple):
 class StreamCounters:
     """The counts of one stream, so kept that every message received ends in one of them.
 
-    Written by the worker of the stream, read by whoever asks.
+    Written by the tracking thread, read by whoever asks.
 
     Args:
         mailbox: of the stream; it counts what it sheds.

@@ -1,6 +1,6 @@
 """Answers to queries about streams: the state and density of sessions, resets, parameters, tracks of the past.
 
-What concerns a session is run by the worker of its stream, so that nothing else happens to it meanwhile: a question
+What concerns a session is run by the actor of its stream, so that nothing else happens to it meanwhile: a question
 about the state or the density goes before the frames that wait, a reset or a change of parameters takes its turn among
 them. The query thread itself only sorts. An error is a reply too: a `Problem`, as an error reply.
 """
@@ -60,7 +60,7 @@ class StreamQueries:
         self._room_for_wildcards = threading.Semaphore(MOST_WILDCARDS)
 
     def answer(self, request: Request) -> None:
-        """Answer what concerns sessions, here or on the worker of the stream."""
+        """Answer what concerns sessions, here or by the actor of the stream."""
         name = request.key.rpartition("/")[2]
         if "*" in request.key:
             self._answer_many(request)

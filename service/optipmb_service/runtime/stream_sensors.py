@@ -20,7 +20,7 @@ log = structlog.get_logger("optipmb_service")
 class StreamSensors:
     """The streams of one session.
 
-    Written by the worker of the session; the control loop looks for those that are silent.
+    Written by the tracking thread; the control loop looks for those that are silent.
 
     Args:
         stream: the name of the session.

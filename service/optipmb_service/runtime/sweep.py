@@ -34,7 +34,7 @@ It would free next to nothing. All such sessions keep less than a tenth of the m
 
 
 class Command(Protocol):
-    """Has a worker run a command for a stream, after what waits there or, `urgent`, before."""
+    """Has the actor of a stream run a command, after what waits there or, `urgent`, before."""
 
     def __call__(self, stream: str, command: Callable[[StreamActor], None], *, urgent: bool) -> bool:
         """Return False when there is no room for the stream."""
@@ -48,7 +48,7 @@ class Sweep:
         actors: those of the streams.
         member: says which streams this instance tracks.
         untracked: what is kept of streams that are not tracked here.
-        command: reaches the workers of streams.
+        command: reaches the actors of streams.
         report: reports a problem: code, stream, what was expected and what was received.
     """
 
@@ -85,7 +85,7 @@ class Sweep:
             if self._member.fence(actor.stream) is None:
                 # It began at the very moment in which its partition was left.
                 self._command(actor.stream, StreamActor.on_lost, urgent=True)
-            session = actor.session  # the worker may end it at any moment
+            session = actor.session  # the tracking thread may end it at any time
             if actor.fused and session is not None and session.awaits_caches and actor.mailbox.idle:
                 self._command(actor.stream, StreamActor.on_caches_answered, urgent=False)  # or a publisher may be gone
             actor.sensors.look_for_silent(now_ns, self._stale_s)
@@ -115,6 +115,6 @@ class Sweep:
             self._command(actor.stream, lambda one: one.close_session("memory"), urgent=False)
 
     def _close_idle(self, actor: StreamActor) -> None:
-        # Asked again: a message may have come between the sweep and the worker's turn.
+        # Asked again: a message may have come between the sweep and the actor's turn.
         if time.monotonic_ns() - actor.meter.active_ns > self._idle_ns:
             actor.close_session("idle")

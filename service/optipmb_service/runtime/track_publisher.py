@@ -1,6 +1,6 @@
 """The tracks of one stream on their way out: delivery, encoding, publisher, and what must wait for a write lease.
 
-Used by the worker of the stream alone.
+Used by the tracking thread alone.
 """
 
 from __future__ import annotations

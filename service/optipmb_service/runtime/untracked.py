@@ -2,7 +2,7 @@
 
 A session may be another member's, may be on its way to or from one, or may be new and wait for room. Once it is to be
 tracked here, what was kept goes first, so all that comes is kept until that has been handed over. Called by the
-network, the workers, the intake and the control loop; one lock guards it all.
+network, the tracking thread, the intake and the control loop; one lock guards it all.
 """
 
 from __future__ import annotations

@@ -64,8 +64,8 @@ CODES: Final = {
         "Nothing for the tracks. See the NATS servers; a successor has to get the frame from the publisher's cache.",
     ),
     "internal": (
-        "A bug in the service; the session is quarantined, its last frames are saved.",
-        "Report it with the saved file; `optipmb track --dump` replays it.",
+        "A bug in the service. If a tracking step failed, the session is quarantined and its last frames are saved.",
+        "Report it, with the saved file if there is one; `optipmb track --dump` replays it.",
     ),
     "quarantined": (
         "Tracking this stream failed, see `internal`; its frames are refused.",

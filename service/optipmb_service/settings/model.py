@@ -92,7 +92,10 @@ class Settings(BaseSettings):
         description="frames without `has_points` wait for a cloud if one came within this time, in stamps",
     )
     gap_limit_s: float = Field(
-        default=5.0, gt=0, le=86400, description="a larger step of the stamps, forward or back, restarts the session"
+        default=5.0,
+        gt=0,
+        le=86400,
+        description="a larger step of the stamps, forward or back, on which three frames agree, restarts the session",
     )
     rewind_s: float = Field(
         default=1.0,

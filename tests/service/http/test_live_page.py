@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import http.client
 import json
 import threading
@@ -19,7 +20,7 @@ from optipmb_service.http.page import VIEWERS
 from starlette.applications import Starlette
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, MutableMapping
 
 STREAM = "yard/gate/lidar"
 DEADLINE_S = 60.0
@@ -66,6 +67,8 @@ class Watched:
         self.now = "ready"
         self.gate = threading.Event()
         self.gate.set()
+        self.arrived: Callable[[], object] = lambda: None
+        self.released = 0
         self._changed = threading.Condition()
 
     def state(self) -> str:
@@ -81,6 +84,7 @@ class Watched:
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None] | None:
         """Keep what is to be called."""
         assert stream == STREAM
+        self.arrived()
         assert self.gate.wait(DEADLINE_S)
         number = id(receive)
         with self._changed:
@@ -90,6 +94,7 @@ class Watched:
         def release() -> None:
             with self._changed:
                 self.taps.pop(number, None)
+                self.released += 1
                 self._changed.notify_all()
 
         return release
@@ -98,6 +103,11 @@ class Watched:
         """Wait until so many look."""
         with self._changed:
             assert self._changed.wait_for(lambda: len(self.taps) == count, DEADLINE_S), len(self.taps)
+
+    def wait_released(self, count: int) -> None:
+        """Wait until so many taps have been released."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: self.released == count, DEADLINE_S), self.released
 
     def send(self, payload: bytes, topic: str = "tracks") -> None:
         """Hand something to everybody who looks."""
@@ -202,6 +212,28 @@ def test_viewers_get_the_newest_frame_and_not_too_often(watched: Watched, addres
                 break
     assert times == sorted(set(times), key=float)
     assert len(times) <= took / 0.1 + 3
+
+
+async def test_a_viewer_that_leaves_before_its_tap_is_made_leaves_none(watched: Watched) -> None:
+    """The connection is lost while a thread makes the tap: it is released as soon as it is there."""
+    watched.gate.clear()
+    arrived = asyncio.Event()
+    watched.arrived = functools.partial(asyncio.get_running_loop().call_soon_threadsafe, arrived.set)
+
+    async def receive() -> dict[str, object]:
+        await arrived.wait()
+        return {"type": "http.disconnect"}
+
+    async def send(_message: MutableMapping[str, object]) -> None:
+        pass
+
+    query = f"stream={STREAM}".encode()
+    scope = {"type": "http", "method": "GET", "path": "/live", "headers": [], "query_string": query}
+    await Starlette(routes=page(watched))(scope, receive, send)
+    assert watched.taps == {}
+    watched.gate.set()
+    await asyncio.to_thread(watched.wait_released, 1)
+    assert watched.taps == {}
 
 
 def test_the_end_of_the_service_ends_the_viewers(watched: Watched, address: str) -> None:

@@ -279,7 +279,7 @@ def test_a_checkpoint_waits_for_a_write_lease_that_lapsed() -> None:
 def test_a_stream_goes_on_when_its_lease_holds_again_in_the_middle_of_a_turn(
     start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A worker that has found the lease lapsed, and is rung before it looks for messages, leaves none behind."""
+    """A turn that has found the lease lapsed, and is asked for again before it takes messages, leaves none behind."""
     lapsed, may_write, take = threading.Event(), Member.may_write, Mailbox.take
 
     def lapses(self: Member, stream: str, fence: int | None) -> bool:

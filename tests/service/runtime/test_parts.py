@@ -1,4 +1,4 @@
-"""The small parts: mailboxes, workers, problems, figures, profiles, settings, and what imports what."""
+"""The small parts: mailboxes, turns, problems, figures, profiles, settings, and what imports what."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def packet(number: int) -> Packet:
     return Packet("key", b"", number, "", 0, 0)
 
 
-# Inbox and workers
+# Mailboxes and turns
 
 
 @settings(deadline=None)
 @given(st.lists(st.integers(0, 2), max_size=60), st.integers(1, 5), st.integers(1, 5))
-def test_an_mailbox_is_bounded_ordered_and_counts(kinds: list[int], frames: int, clouds: int) -> None:
+def test_a_mailbox_is_bounded_ordered_and_counts(kinds: list[int], frames: int, clouds: int) -> None:
     """The newest frames and clouds stay, in order, clouds first; commands are never lost; the rest is counted."""
     mailbox, ran = Mailbox(frames, clouds), []
     for number, kind in enumerate(kinds):
@@ -67,8 +67,8 @@ def test_an_mailbox_is_bounded_ordered_and_counts(kinds: list[int], frames: int,
     assert order == sorted(order, key=lambda kind: kind != "cloud")
 
 
-def test_an_mailbox_sends_one_worker() -> None:
-    """Only the first offer calls for a worker, until that one leaves; a closed mailbox takes nothing."""
+def test_a_mailbox_asks_for_one_turn() -> None:
+    """Only the first offer asks for a turn, until that one ends; a closed mailbox takes nothing."""
     mailbox = Mailbox(4, 4)
     assert [mailbox.offer_frame(packet(0)), mailbox.offer_cloud(packet(1)), mailbox.ring()] == [True, False, False]
     mailbox.take()

@@ -1,0 +1,34 @@
+"""What the parent of worker processes does with one that gives no sign of life."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import optipmb_service.app.supervisor
+import pytest
+from optipmb_service.app.loops import StopRequest
+from optipmb_service.app.supervisor import Supervisor
+from optipmb_service.settings.loading import load
+
+
+@pytest.mark.parametrize(("silent_s", "killed"), [(10.0, False), (2000.0, True)])
+async def test_a_worker_that_hangs_while_it_starts_is_killed(
+    monkeypatch: pytest.MonkeyPatch, silent_s: float, *, killed: bool
+) -> None:
+    """A start may take much longer than `stuck_s`, but not for ever."""
+    monkeypatch.setattr(optipmb_service.app.supervisor, "BEAT_S", 0.0)
+    settings = load(None, {"workers": 2, "store": "none"}).settings
+    supervisor = Supervisor(settings, StopRequest(), Path("unused"))
+    ended: list[bool] = []
+    child: Any = SimpleNamespace(kill=lambda: ended.append(True))
+    supervisor._children[0], supervisor.states[0] = child, "starting"
+    supervisor._heard[0] = time.monotonic() - silent_s
+    watching = asyncio.create_task(supervisor._watch())
+    for _ in range(20):
+        await asyncio.sleep(0)
+    watching.cancel()
+    assert bool(ended) is killed
