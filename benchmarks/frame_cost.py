@@ -122,7 +122,7 @@ class Network:
         """All may be published."""
         return fence == self.fence(stream)
 
-    def claim(self, stream: str) -> Network:
+    def open_publisher(self, stream: str) -> Network:
         """Be the publisher of a stream."""
         del stream
         return self

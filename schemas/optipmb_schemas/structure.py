@@ -1,8 +1,8 @@
 """Checks the structure of a payload before anything is built from it.
 
-A msgpack header of five bytes can claim four thousand million items, and a byte per level can nest lists as deep as the
-payload is long. So the bytes are walked once, without building anything: every claimed item is there, none is too deep,
-and there are not too many. What remains to be built afterwards is bounded by the limits.
+A msgpack header of five bytes can declare four thousand million items, and a byte per level can nest lists as deep as
+the payload is long. So the bytes are walked once, without building anything: every declared item is there, none is too
+deep, and there are not too many. What remains to be built afterwards is bounded by the limits.
 """
 
 from typing import Final
@@ -45,7 +45,7 @@ def check_msgpack(payload: bytes, limits: Limits) -> list[Span]:
     size, position = len(payload), 0
     large: list[Span] = []
     around: list[int] = []  # items to come in each list or map around the current one
-    items = values = 1  # items to come in the current one; values claimed so far in all
+    items = values = 1  # items to come in the current one; values declared so far in all
     while items or around:
         if not items:
             items = around.pop()
@@ -66,7 +66,7 @@ def check_msgpack(payload: bytes, limits: Limits) -> list[Span]:
             around.append(items)
             items = length if kind == _LIST else 2 * length
             values += items
-            _check_claim(values, len(around), limits)
+            _check_declared(values, len(around), limits)
         else:
             if kind == _BAD or (kind == _TEXT and length > limits.max_text):
                 raise _refused(kind, length, start, limits)
@@ -84,7 +84,7 @@ def _check_end(position: int, size: int) -> None:
         raise MessageError("malformed", "", "one msgpack value", f"{size - position} bytes after its end")
 
 
-def _check_claim(values: int, depth: int, limits: Limits) -> None:
+def _check_declared(values: int, depth: int, limits: Limits) -> None:
     if values > limits.max_values:
         raise MessageError("too_large", "", f"at most {limits.max_values} values", f"at least {values}")
     if depth > limits.max_depth:

@@ -208,7 +208,7 @@ def test_a_node_asks_about_its_own_streams_alone(node: Party, service: ServicePr
     assert node.ask(KEYS.all_status(), timeout=1.0) == []
 
 
-def test_a_node_cannot_claim_a_stream(node: Party, viewer: Party, service: ServiceProcess) -> None:
+def test_a_node_cannot_pose_as_the_owner_of_a_stream(node: Party, viewer: Party, service: ServiceProcess) -> None:
     """A node cannot say that it tracks a stream, which would keep the services from doing so, nor pose as a service."""
     node.token(KEYS.owner(LIDAR, "forged"))
     node.token(KEYS.alive("forged"))

@@ -62,7 +62,7 @@ def test_a_message_of_100_mb_is_refused(gateway: GatewayProcess, stream: str) ->
     served(gateway, stream)
 
 
-def test_many_small_claims_take_little_memory(gateway: GatewayProcess, stream: str) -> None:
+def test_many_small_lists_take_little_memory(gateway: GatewayProcess, stream: str) -> None:
     """Labels, shapes and numbers by the million are refused, and the memory comes back."""
     stub = gateway.stub()
     served(gateway, stream)

@@ -193,7 +193,7 @@ BOMBS = {
 
 
 @pytest.mark.parametrize("payload", BOMBS.values(), ids=BOMBS.keys())
-def test_claims_take_no_memory(payload: bytes) -> None:
+def test_declared_lengths_take_no_memory(payload: bytes) -> None:
     """Crafted payloads are refused, and take a few times their own size in memory at most."""
     assert attempt(payload, Detections) is not None
     assert peak(payload, Detections) < MEGABYTE + 6 * len(payload)

@@ -23,7 +23,7 @@ from optipmb_schemas.structure import check_msgpack
 __all__ = ["EncodedTracks", "transcode"]
 
 UNCHECKED: Final = 2**18
-"""Bytes of a payload of which msgpack may build what it claims without a walk before: at most some 16 MB."""
+"""Bytes of a payload of which msgpack may build what it declares without a walk before: at most some 16 MB."""
 
 MOST_ITEMS: Final = 256
 """Items of one list or map in a payload that was not walked over."""

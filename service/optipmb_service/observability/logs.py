@@ -64,7 +64,7 @@ EVENTS: Final = {
     "stream_back": "Frames arrive again.",
     "problem": "`count` messages were refused or lost since the last line: see the table of problems.",
     "ros2_mismatch": "An endpoint has another type, definition or quality of service; `message` says which.",
-    "claim_failed": "The tracks of a stream cannot be published; the network is closing.",
+    "publisher_failed": "The tracks of a stream cannot be published; the network is closing.",
     "publish_failed": "Tracks cannot be passed to Zenoh; the network is closing.",
     "reply_failed": "The client of a query had left before the reply.",
     "query": "A query was answered (level debug).",

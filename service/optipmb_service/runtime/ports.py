@@ -78,7 +78,7 @@ class Publisher(Protocol):
 class MessageSink(Protocol):
     """Where results go."""
 
-    def claim(self, stream: str) -> Publisher:
+    def open_publisher(self, stream: str) -> Publisher:
         """Open the publisher of a stream that this instance owns."""
 
     def publish_problem(self, problem: schemas.Problem) -> None:

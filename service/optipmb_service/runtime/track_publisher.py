@@ -69,7 +69,7 @@ class TrackPublisher:
         self._meter = meter
         self._metrics = metrics
         self._member = member
-        self._claim: Publisher | None = None
+        self._publisher: Publisher | None = None
         self._waiting: list[tuple[bytes, Arrival, int, int]] = []
         self._ids = b""
         self._fence: int | None = None
@@ -78,17 +78,17 @@ class TrackPublisher:
         """Open the publisher, for what is made under a fence."""
         self._fence = fence
         try:
-            self._claim = self._sink.claim(self._stream)
+            self._publisher = self._sink.open_publisher(self._stream)
         except TransportError as error:
-            log.warning("claim_failed", stream=self._stream, error=str(error))
+            log.warning("publisher_failed", stream=self._stream, error=str(error))
 
     def close(self) -> None:
         """Withdraw the publisher; what waits is dropped: another owner publishes it."""
         self._waiting.clear()
         self._count_tracks(b"")
-        if self._claim is not None:
-            self._claim.release()
-            self._claim = None
+        if self._publisher is not None:
+            self._publisher.release()
+            self._publisher = None
 
     def send(self, tracked: Tracked) -> None:
         """Publish the tracks of a frame, now or when the write lease holds again."""
@@ -117,8 +117,8 @@ class TrackPublisher:
         waiting, self._waiting = self._waiting, []
         for payload, ticket, waited_ns, step_ns in waiting:
             try:
-                if self._claim is not None:
-                    self._claim.publish(payload)
+                if self._publisher is not None:
+                    self._publisher.publish(payload)
             except TransportError as error:
                 log.warning("publish_failed", stream=self._stream, error=str(error))
             else:

@@ -75,7 +75,7 @@ class Transport:
         self._discover: Callable[[zenoh.Sample], None] = lambda _: None
         self._all = False
         self._announcements = Announcements(self._session, self._keys, self._instance)
-        self._claims: set[Publisher] = set()
+        self._publishers: set[Publisher] = set()
         self._lock = threading.Lock()
         self._alive: Undeclared | None = None
 
@@ -308,7 +308,7 @@ class Transport:
         """Say that this instance is alive; to be called when it is ready."""
         self._alive = self._session.liveliness().declare_token(self._keys.alive(self._instance))
 
-    def claim(self, stream: str) -> Publisher:
+    def open_publisher(self, stream: str) -> Publisher:
         """Open the publisher of a stream's tracks and say that this instance tracks it.
 
         Raises:
@@ -323,10 +323,10 @@ class Transport:
             token = self._session.liveliness().declare_token(self._keys.owner(stream, self._instance))
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
-        claim = Publisher(publisher, token, self._forget)
+        with_token = Publisher(publisher, token, self._forget)
         with self._lock:
-            self._claims.add(claim)
-        return claim
+            self._publishers.add(with_token)
+        return with_token
 
     def publish_problem(self, problem: schemas.Problem) -> None:
         """Send a problem on its stream's key; one without a stream has no key and is not sent."""
@@ -374,14 +374,14 @@ class Transport:
         """Withdraw everything and close the session."""
         self.stop(timeout=0.2)
         with self._lock:
-            claims = tuple(self._claims)
-        for claim in claims:
-            claim.release()
+            publishers = tuple(self._publishers)
+        for publisher in publishers:
+            publisher.release()
         close(self._session)
 
-    def _forget(self, claim: Publisher) -> None:
+    def _forget(self, publisher: Publisher) -> None:
         with self._lock:
-            self._claims.discard(claim)
+            self._publishers.discard(publisher)
 
 
 def _name(stream: str, *, cached: bool) -> str:

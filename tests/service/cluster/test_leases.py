@@ -105,7 +105,7 @@ def even(*members: HandMember) -> None:
     assert max(len(one.held) for one in members) - min(len(one.held) for one in members) <= 1
 
 
-def test_of_claims_at_once_one_wins(make: Make) -> None:
+def test_of_writes_at_once_one_wins(make: Make) -> None:
     """Fault 17: thirty times, thirty write over one record at the same time: one is accepted and read."""
     stores = [make() for _ in range(30)]
     for number in range(30):
@@ -113,11 +113,11 @@ def test_of_claims_at_once_one_wins(make: Make) -> None:
         together = threading.Barrier(len(stores))
         revisions: dict[int, int | None] = {}
 
-        def claim(index: int, write: Write = write, together: threading.Barrier = together) -> None:
+        def put(index: int, write: Write = write, together: threading.Barrier = together) -> None:
             together.wait()
             revisions[index] = stores[index].put(write._replace(value=str(index)))  # noqa: B023 - joined below
 
-        threads = [threading.Thread(target=claim, args=(index,)) for index in range(len(stores))]
+        threads = [threading.Thread(target=put, args=(index,)) for index in range(len(stores))]
         for thread in threads:
             thread.start()
         for thread in threads:

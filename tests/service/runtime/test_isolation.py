@@ -350,7 +350,7 @@ def test_a_stream_that_opens_keeps_no_other_waiting(
         assert [one.seq for one in node.tracks(CARELESS.stream, 3)] == [0, 1, 2]
 
 
-def test_many_small_values_are_refused_by_their_claim() -> None:
+def test_many_small_values_are_refused_by_their_number() -> None:
     """Half a megabyte of nils is refused where the list begins, not where it ends."""
     payload = b"\x81\xa6labels\xdd" + (500_000).to_bytes(4, "big") + 500_000 * b"\xc0"
     with pytest.raises(MessageError, match="at most 131072 values") as refused:

@@ -76,7 +76,7 @@ class Around(NoPersistence):
         """All may be published."""
         return True
 
-    def claim(self, _: str) -> Around:
+    def open_publisher(self, _: str) -> Around:
         """Be the publisher of a stream."""
         return self
 

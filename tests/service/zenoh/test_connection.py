@@ -40,7 +40,7 @@ def connected(endpoint: str, file: Path | None = None) -> zenoh.Session:
     return opened(load(None, given | ({} if file is None else {"zenoh_config": str(file)})).settings)
 
 
-def claimed(member: zenoh.Session, stream: str) -> Publisher:
+def opened_publisher(member: zenoh.Session, stream: str) -> Publisher:
     """The publisher of a stream's tracks."""
     return Publisher(cached_publisher(member, KEYS.tracks(stream), Tracks, 8, detected=False))
 
@@ -64,15 +64,15 @@ def test_a_router_knows_one_interest_however_many_streams_there_are(endpoint: st
     file = tmp_path / "zenoh.json5"
     file.write_text(json.dumps({"aggregation": {"publishers": ["others/**"]}}))
     with connected(endpoint, file) as member, open_client(endpoint) as asker:
-        claims = [claimed(member, f"site/node/lidar{number}") for number in range(5)]
+        publishers = [opened_publisher(member, f"site/node/lidar{number}") for number in range(5)]
         others = [member.declare_publisher(f"others/{number}") for number in range(2)]
         assert interests(member, asker) == {KEYS.all("tracks"), "others/**"}
         for one in others:
             one.undeclare()
-        for claim in claims[1:]:
-            claim.release()
+        for publisher in publishers[1:]:
+            publisher.release()
         assert interests(member, asker) == {KEYS.all("tracks")}
-        claims[0].release()
+        publishers[0].release()
         assert interests(member, asker) == set()
 
 
@@ -82,23 +82,23 @@ def test_tracks_come_whichever_publisher_was_declared_first(endpoint: str) -> No
     Who subscribes late gets what the cache holds, too.
     """
     with connected(endpoint) as member, open_client(endpoint) as viewer:
-        claims = [claimed(member, f"site/node/lidar{number}") for number in range(3)]
+        publishers = [opened_publisher(member, f"site/node/lidar{number}") for number in range(3)]
 
         def heard(number: int, payload: bytes) -> None:
             """A new subscriber of a stream gets a message, sent before it came, and one that is sent after."""
             got: list[bytes] = []
-            claims[number].publish(payload)
+            publishers[number].publish(payload)
             key = KEYS.tracks(f"site/node/lidar{number}")
             subscription = Subscription(viewer, key, lambda sample: got.append(sample.payload.to_bytes()))
             until(lambda: payload in got, "a message of the cache")
-            claims[number].publish(payload + b" and on")
+            publishers[number].publish(payload + b" and on")
             until(lambda: payload + b" and on" in got, "a message")
             subscription.close()
 
         heard(0, b"of the first")
-        claims[0].release()
+        publishers[0].release()
         heard(1, b"of the second")
-        claims[1].release()
-        claims[2].release()
-        claims[1] = claimed(member, "site/node/lidar1")
+        publishers[1].release()
+        publishers[2].release()
+        publishers[1] = opened_publisher(member, "site/node/lidar1")
         heard(1, b"of the first again")

@@ -1,6 +1,6 @@
 """What the caches, tokens and publishers of a session's own bring: Zenoh calls back on the thread that asks for it.
 
-Each claim is tried on a thread of its own, for one that does not hold would wait for ever.
+Each of these is tried on a thread of its own, for a test that fails would wait for ever.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def test_as_many_tokens_may_be_there_as_there_are(monkeypatch: pytest.MonkeyPatc
     endpoint = free_endpoint()
     transport = Transport(load(None, {"listen": [endpoint], "instance": "one", "store": "none"}).settings)
     owners: set[str] = set()
-    claims = [transport.claim(f"site/node/{one}") for one in range(10)]
+    publishers = [transport.open_publisher(f"site/node/{one}") for one in range(10)]
     ends(lambda: transport.watch_owners(lambda stream, _instance, _present: owners.add(stream)))
-    until(lambda: len(owners) == len(claims), "all owners")
+    until(lambda: len(owners) == len(publishers), "all owners")
     ends(transport.watch)
     ends(transport.close)
 
