@@ -108,4 +108,4 @@ class Admission:
         if victim != evicted or until_ns < now_ns:
             self._evicted = victim, now_ns + EVICT_EVERY_NS
             self._evict(victim)
-        return "a moment: another session is being closed"
+        return "room for another session: one is being closed"

@@ -1,7 +1,7 @@
 """Checkpoints on their way to the store, off the path of the frames: one thread encodes and writes them all.
 
 The tracking thread gives references to values that never change, which costs it microseconds. The checkpoint writer
-waits a moment before it writes: what a checkpoint contains must have left this process as tracks, or a kill between the
+waits before it writes: what a checkpoint contains must have left this process as tracks, or a kill between the
 two would swallow them (what is tracked again after a restore is published again, what the checkpoint holds is not).
 Then it writes all sessions that changed in one transaction.
 

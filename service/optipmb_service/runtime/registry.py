@@ -178,15 +178,15 @@ class Registry:
         if actor is not None and actor.mailbox.offer_command(lambda: actor.on_caches_answered(stream), urgent=False):
             self._scheduler.submit(actor)
 
-    def _hand(self, stream: str, packet: Packet, *, frame: bool) -> None:
+    def _hand(self, session: str, packet: Packet, *, frame: bool) -> None:
         offered = Mailbox.offer_frame if frame else Mailbox.offer_cloud
-        if not self._actors.offer(stream, lambda actor: offered(actor.mailbox, packet)):
-            self.untracked.put_off(stream, packet, frame=frame)
+        if not self._actors.offer(session, lambda actor: offered(actor.mailbox, packet)):
+            self.untracked.put_off(session, packet, frame=frame)
 
-    def _keep(self, stream: str, packet: Packet, frame: bool) -> None:  # noqa: FBT001 - as a field of the context
-        """Keep a packet that was received to be tracked here until its stream is, here or by who asks for it."""
-        if not self.untracked.keep(stream, packet, frame=frame, own=True):
-            self._hand(stream, packet, frame=frame)
+    def _keep(self, session: str, packet: Packet, frame: bool) -> None:  # noqa: FBT001 - as a field of the context
+        """Keep a packet that was received to be tracked here until its session is, here or by who asks for it."""
+        if not self.untracked.keep(session, packet, frame=frame, own=True):
+            self._hand(session, packet, frame=frame)
 
     def command(self, stream: str, command: Callable[[StreamActor], None], *, urgent: bool) -> bool:
         """Have the actor of a stream run a command; False when the service takes no more streams."""

@@ -44,18 +44,18 @@ class SessionOpening:
         self._stream = stream
         self._context = context
         self._fused = fused
-        self._seeking = False
+        self._restore_only = False
         self.lineage: Lineage | None = None
         """What an earlier session of the stream left behind, while one is being opened; else None."""
 
-    def start(self, *, seeking: bool) -> bool:
+    def start(self, *, restore_only: bool) -> bool:
         """Begin to open a session, which is to be loaded then; False when there is no room.
 
         Args:
-            seeking: whether one is wanted only if it was kept, and not closed.
+            restore_only: whether one is wanted only if it was kept, and not closed.
         """
         self.lineage = self._context.admit(self._stream)
-        self._seeking = seeking and self.lineage is not None
+        self._restore_only = restore_only and self.lineage is not None
         return self.lineage is not None
 
     def load(
@@ -94,7 +94,7 @@ class SessionOpening:
     def is_wanted(self, restored: Session | None) -> bool:
         """Whether a session is to begin, now that it is known which one was kept."""
         is_closed = restored is None or not restored.counters.frames
-        return self._context.member.holds(self._stream) and not (is_closed and self._seeking)
+        return self._context.member.holds(self._stream) and not (is_closed and self._restore_only)
 
     def release(self) -> None:
         """Give the room back: no session begins."""
@@ -104,7 +104,7 @@ class SessionOpening:
 
     def end(self) -> None:
         """End the opening: a session has begun, or none does."""
-        self.lineage, self._seeking = None, False
+        self.lineage, self._restore_only = None, False
 
     def begin(self, restored: Session | None, lineage: Lineage, fence: int | None) -> Session:
         """Return the session to go on with: the one that was restored, else a new one.

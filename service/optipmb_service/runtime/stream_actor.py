@@ -185,7 +185,7 @@ class StreamActor:
         streams of which all that the publisher's cache holds is among them.
         """
         if not self.occupied and self._context.member.holds(self.stream) and not self._context.room(self.stream):
-            self._open(seeking=True)
+            self._open(restore_only=True)
         self._receive_all(packets)
         if answered:
             self.on_caches_answered(*answered)
@@ -193,7 +193,7 @@ class StreamActor:
     def on_caches_answered(self, *streams: str) -> None:
         """Go on behind gaps: all that the caches of these streams held has come. Of several sensors all must have."""
         self._caches.answered(*streams)
-        self.ask(StreamActor._recovered, seek=False)
+        self.ask(StreamActor._recovered, create=False)
 
     def _recovered(self) -> None:
         session = self.session
@@ -236,15 +236,15 @@ class StreamActor:
         if dropped := self._accounts.drop(self._waiting.add(packet, frame=frame, own=True)):
             self._out.report("shed", "", "room for what waits", f"{dropped} more; dropped", count=dropped)
 
-    def ask(self, command: Callable[[StreamActor], None], *, seek: bool) -> None:
+    def ask(self, command: Callable[[StreamActor], None], *, create: bool) -> None:
         """Call `command`, as soon as no session is about to begin or end, or has to be told what it missed.
 
-        With `seek`, one begins if there is none.
+        With `create`, one begins if there is none.
         """
-        if seek and self.session is None and not self._closing and self._context.member.holds(self.stream):
+        if create and self.session is None and not self._closing and self._context.member.holds(self.stream):
             _ = self._opening.lineage or self._open()
         if self._opening.lineage or self._closing or self._missed.buffers:
-            self._asking.append((command, seek))
+            self._asking.append((command, create))
         else:
             self._guard(command, self)
 
@@ -252,8 +252,8 @@ class StreamActor:
         """Go on with what came while a session was about to begin or end."""
         self._receive_all(self._waiting.take())
         asking, self._asking = self._asking, []
-        for command, seek in asking:
-            self.ask(command, seek=seek)
+        for command, create in asking:
+            self.ask(command, create=create)
 
     def on_lost(self) -> None:
         """Another instance has the stream: what is here is no longer the newest state."""
@@ -270,9 +270,9 @@ class StreamActor:
 
     # Sessions; to be called by the tracking thread alone
 
-    def _open(self, *, seeking: bool = False) -> bool:
+    def _open(self, *, restore_only: bool = False) -> bool:
         """Begin to open a session, while packets wait; False when there is no room."""
-        if has_room := self._opening.start(seeking=seeking):
+        if has_room := self._opening.start(restore_only=restore_only):
             self._load()
         return has_room
 

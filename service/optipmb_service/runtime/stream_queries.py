@@ -106,8 +106,8 @@ class StreamQueries:
                 self._digests.submit(guarded, request, lambda: self._tell(request, state, request.key))
 
         # A stream can be set up ahead of its first frame, by a valid request.
-        seeks = name == "parameters" and self._sets(request)
-        taken = self._registry.command(stream, lambda actor: actor.ask(answer, seek=seeks), urgent=urgent)
+        creates = name == "parameters" and self._sets(request)
+        taken = self._registry.command(stream, lambda actor: actor.ask(answer, create=creates), urgent=urgent)
         if not taken:
             full = schemas.MessageError("too_large", "key", "fewer new streams at once", "another one")
             guarded(request, lambda: request.refuse(self._problem(stream, full)))

@@ -1,4 +1,4 @@
-"""The window of a session that can be gone back over: a moment, the frames since, and the state after each of them.
+"""The window of a session that can be processed again: a state, the frames since, and the state after each of them.
 
 A frame that comes late is put between those that it belongs between, and those behind it are gone through once more,
 as is done for a cloud that comes late. What then stands at the end is what would stand there had everything come in
