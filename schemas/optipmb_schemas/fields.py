@@ -95,7 +95,6 @@ def check_horizons(horizons: Reals) -> Reals:
 Flag = Annotated[bool, Field(strict=True)]
 Count = Annotated[int, Field(strict=True, ge=0, le=_INT64)]
 Stamp = Annotated[int, Field(strict=True, ge=0, le=_INT64)]
-Real = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0)]
 Text = Annotated[str, Field(strict=True, max_length=MAX_TEXT)]
 Word = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_NAME)]

@@ -203,14 +203,14 @@ class _Work:
             ours.append(
                 (
                     self._one(graph.SUBSCRIPTION, stream.detections, stream.type, SENSOR),
-                    lambda one, name=name: bridge.take(name, "detections", one),  # type: ignore[misc]
+                    lambda one, name=name: bridge.take(name, "detections", one),  # type: ignore[misc]  # no type for a default
                 )
             )
             if stream.points:
                 ours.append(
                     (
                         self._one(graph.SUBSCRIPTION, stream.points, CLOUD, SENSOR),
-                        lambda one, name=name: bridge.take(name, "points", one),  # type: ignore[misc]
+                        lambda one, name=name: bridge.take(name, "points", one),  # type: ignore[misc]  # no type for a default
                     )
                 )
             base = stream.tracks_topic

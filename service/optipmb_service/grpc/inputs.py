@@ -149,7 +149,7 @@ class Incoming:
             return self._options
         kind: Any = schemas.Detections if name == "detections" else schemas.Points
         try:
-            return convert.from_proto(message, kind, self._call.gateway.limits)  # type: ignore[no-any-return]
+            return convert.from_proto(message, kind, self._call.gateway.limits)  # type: ignore[no-any-return]  # `kind` is Any
         except schemas.MessageError as error:
             return self._problem(message, error)
 
