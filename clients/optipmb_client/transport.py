@@ -219,13 +219,16 @@ class Subscription:
             else:
                 errors.append(answer.err)
 
-        self._session.get(
-            selector,
-            zenoh.handlers.Callback(take, lambda: end(not errors)),
-            accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=ANSWER_S,
-        )
+        try:
+            self._session.get(
+                selector,
+                zenoh.handlers.Callback(take, lambda: end(not errors)),
+                accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=ANSWER_S,
+            )
+        except zenoh.ZError:  # the session is closed
+            end(False)
 
     @property
     def alive(self) -> bool:
@@ -236,7 +239,7 @@ class Subscription:
         """End the subscription; what is in the inbox stays readable."""
         with contextlib.suppress(zenoh.ZError):
             self._subscriber.undeclare()
-        if self._thread is not threading.current_thread():  # which closes what a program forgot, when it ends it all
+        if self._thread is not threading.current_thread():  # which ends what a program forgot to close
             self._thread.join(timeout=5.0)
         self._queries.close()
         self._late_join.close()

@@ -74,11 +74,11 @@ class _Gap(Generic[_S]):
 class CacheQueries(Generic[_S]):
     """Sends the queries of a subscription on a thread of its own, which begins with the first.
 
-    A cache of the same session answers on the thread that asks, and calls back with its lock held. Who asked in such a
-    callback would ask with that lock held, and wait for ever where a message is being added to the cache.
+    A cache of the same session answers on the thread that asks, and calls back with its lock held. A query that is sent
+    by such a callback waits for that lock, for ever where another thread waits to add a message to the cache.
 
     Args:
-        query: sends one, with what `LateJoin` gives its `ask`; when it raises, as in a closed session, that is its end.
+        query: sends one, with what `LateJoin` gives its `ask`. It must not raise.
     """
 
     def __init__(self, query: Callable[[str, Callable[[_S], None], Callable[[bool], None]], object]) -> None:
@@ -107,10 +107,7 @@ class CacheQueries(Generic[_S]):
 
     def _send(self) -> None:
         while (query := self._waiting.get()) is not None and not self._closed:
-            try:
-                self._query(*query)
-            except Exception:  # noqa: BLE001 - an error of Zenoh, which is not imported here
-                query[2](False)
+            self._query(*query)
 
 
 class LateJoin(Generic[_S]):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import re
+from functools import cache
 from pathlib import Path
 
 import optipmb_service
@@ -10,6 +12,8 @@ import pytest
 
 ROOT = Path(optipmb_service.__file__).parent
 SOURCES = sorted(ROOT.rglob("*.py"))
+MODULES = {".".join(("optipmb_service", *source.relative_to(ROOT).with_suffix("").parts)): source for source in SOURCES}
+PAGE = (Path(__file__).parents[2] / "docs/architecture.md").read_text()
 
 ARROWS = {
     "session": set(),
@@ -86,3 +90,31 @@ def test_the_session_is_pure(source: Path) -> None:
 def test_every_folder_is_listed() -> None:
     """The arrows name each folder and each module beside the folders."""
     assert {place_of(source) for source in SOURCES} == set(ARROWS)
+
+
+def test_the_page_has_the_arrows() -> None:
+    """The table of folders in docs/architecture.md says what each may import, and no more."""
+    rows = re.findall(r"^\| `(\w+)/` \|.*\| ([^|]*) \|$", PAGE, re.MULTILINE)
+    page = {folder: set(re.findall(r"`(\w+)`", imports)) for folder, imports in rows if folder in ARROWS}
+    arrows = {place: names - {"__version__"} for place, names in ARROWS.items() if not place.startswith("__")}
+    assert page == arrows | {"app": set()}
+    assert ("app", "all") in rows
+    assert arrows["app"] == set(arrows) - {"app"}
+
+
+@cache
+def floors(module: str) -> int:
+    """Modules in the longest chain of imports that begins with one, of those that run when it is imported."""
+    names = set()
+    for statement in ast.parse(MODULES[module].read_text()).body:
+        if isinstance(statement, ast.ImportFrom):
+            names |= {f"{statement.module}.{alias.name}" for alias in statement.names} | {str(statement.module)}
+    return 1 + max((floors(name) for name in names & set(MODULES)), default=0)
+
+
+def test_the_page_has_the_number_of_modules_and_the_longest_chain() -> None:
+    """Both are counted; a file that only makes a folder a package is none."""
+    counted = [module for module in MODULES if not module.endswith("__init__")]
+    said = re.search(r"They have (\d+) modules, (\d+) in the longest chain", PAGE)
+    assert said is not None
+    assert [int(number) for number in said.groups()] == [len(counted), max(map(floors, counted))]

@@ -93,6 +93,7 @@ class AggregateView:
         self._began_ns = self._beat_ns = time.monotonic_ns()
         self._ending = False
         self._asking = ThreadPoolExecutor(workers.count, "asking")
+        self._draining = ThreadPoolExecutor(workers.count, "draining")  # takes long, and keeps no status waiting
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
 
@@ -117,7 +118,8 @@ class AggregateView:
     def ends(self) -> None:
         """Report the end from now on."""
         self._ending = True
-        self._asking.shutdown(wait=False, cancel_futures=True)
+        for threads in (self._asking, self._draining):
+            threads.shutdown(wait=False, cancel_futures=True)
 
     def ready(self) -> bool:
         """Tell whether streams are tracked, be it not all of them."""
@@ -224,7 +226,7 @@ class AggregateView:
             raise schemas.MessageError("invalid_value", "drain", "another member that takes the streams", "none")
         keys = [self._keys.drain(name) for name in sorted(own)]
         payload, encoding = schemas.encode(asked), schemas.encoding_of(schemas.DrainRequest)
-        answers = list(self._asking.map(lambda key: self._network.ask(key, MOVE_S, payload, encoding), keys))
+        answers = list(self._draining.map(lambda key: self._network.ask(key, MOVE_S, payload, encoding), keys))
         if None in answers:
             raise schemas.MessageError("invalid_value", "drain", "members that take the streams", UNDRAINED)
         request.answer(request.key, asked)

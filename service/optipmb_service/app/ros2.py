@@ -10,6 +10,7 @@ import collections
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
@@ -203,14 +204,14 @@ class _Work:
             ours.append(
                 (
                     self._one(graph.SUBSCRIPTION, stream.detections, stream.type, SENSOR),
-                    lambda one, name=name: bridge.take(name, "detections", one),  # type: ignore[misc]  # no type for a default
+                    partial(bridge.take, name, "detections"),
                 )
             )
             if stream.points:
                 ours.append(
                     (
                         self._one(graph.SUBSCRIPTION, stream.points, CLOUD, SENSOR),
-                        lambda one, name=name: bridge.take(name, "points", one),  # type: ignore[misc]  # no type for a default
+                        partial(bridge.take, name, "points"),
                     )
                 )
             base = stream.tracks_topic

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import sys
 import time
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -125,8 +126,8 @@ class Supervisor:
                 continue
             for index, child in enumerate(self._children):
                 silent_s = now - self._heard[index]
-                state = self.states[index]
-                if child is not None and silent_s > (self._settings.stuck_s if state == "ready" else START_S):
+                most_s = {"ready": self._settings.stuck_s, "starting": START_S}.get(self.states[index], math.inf)
+                if child is not None and silent_s > most_s:
                     log.error("worker_stuck", worker=index, silent_s=round(silent_s, 3))
                     self._set(index, "down")
                     child.kill()
@@ -155,7 +156,7 @@ class Supervisor:
             if self._asked.is_set():
                 return
             if never_ready and not self.began:
-                self.failed = status or 1
+                self.failed = max(status or 0, 1)  # one that was killed has a negative status
                 self._changed.set()
                 return
             pause_s = 0.0 if lived_s > STEADY_S else min(LONGEST_PAUSE_S, max(FIRST_PAUSE_S, 2 * pause_s))

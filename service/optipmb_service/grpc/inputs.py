@@ -147,9 +147,10 @@ class Incoming:
             raise schemas.MessageError("invalid_value", f"{name}.stream", self.stream, ascii(message.stream)[:80])
         if name == "options":
             return self._options
-        kind: Any = schemas.Detections if name == "detections" else schemas.Points
         try:
-            return convert.from_proto(message, kind, self._call.gateway.limits)  # type: ignore[no-any-return]  # `kind` is Any
+            if name == "detections":
+                return convert.from_proto(message, schemas.Detections, self._call.gateway.limits)
+            return convert.from_proto(message, schemas.Points, self._call.gateway.limits)
         except schemas.MessageError as error:
             return self._problem(message, error)
 

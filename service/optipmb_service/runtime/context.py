@@ -43,6 +43,13 @@ class Actor(Protocol):
         """Take some of what waits; True: come again."""
 
 
+class Keep(Protocol):
+    """Takes a packet of a session that another instance is to track."""
+
+    def __call__(self, session: str, packet: Packet, *, frame: bool) -> None:
+        """Take it, with whether it is a frame."""
+
+
 @dataclass(frozen=True)
 class ActorContext:
     """What all actors share.
@@ -65,7 +72,7 @@ class ActorContext:
         persistence: where checkpoints go and come from.
         missed: what is known of the frames that a session has missed.
         buffer: makes buffers for packets that wait for their session.
-        keep: takes a packet of a stream that another instance is to track.
+        keep: takes a packet of a session that another instance is to track.
         dump: saves what is needed to see an error of a session again; returns the file.
         caches: returns what is known of the publishers' caches.
         room: why a further stream has no room; empty when it has.
@@ -95,7 +102,7 @@ class ActorContext:
     persistence: Persistence
     missed: MissedFrames
     buffer: Callable[[], TakeoverBuffer]
-    keep: Callable[[str, Packet, bool], None]
+    keep: Keep
     dump: Callable[[str, bytes], str]
     caches: Callable[[], Caches]
     room: Callable[[str], str]

@@ -333,12 +333,10 @@ class CheckpointWriter:
                 if (fence := mine[stream][1]) is not None
             }
             lost = self._store.save(fenced) if fenced else ()
-        except StoreError as error:
+        except Exception as error:
+            if not isinstance(error, StoreError):
+                log.exception("internal_error", thread="checkpoints")
             self._failed(error)
-            with self._lock:
-                self._pending = mine | self._pending
-        except Exception:
-            log.exception("internal_error", thread="checkpoints")
             with self._lock:
                 self._pending = mine | self._pending
         else:
@@ -390,7 +388,7 @@ class CheckpointWriter:
         self._failed_streams[stream] = time.monotonic_ns(), why
         self._report(stream, why)
 
-    def _failed(self, error: StoreError) -> None:
+    def _failed(self, error: Exception) -> None:
         if not self._store_failure:
             log.error("store_failed", error=str(error))
         self._store_failure = str(error)

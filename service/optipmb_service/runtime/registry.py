@@ -164,7 +164,7 @@ class Registry:
         else:
             self._metrics.received("detections" if frame else "points", packet.size)
             if not self._over_quota(stream, packet, frame=frame):
-                self._keep(session, packet, frame)
+                self._keep(session, packet, frame=frame)
 
     def caches_answered(self, key: str) -> None:
         """Tell a session that all has come which the cache of its publisher held."""
@@ -183,7 +183,7 @@ class Registry:
         if not self._actors.offer(session, lambda actor: offered(actor.mailbox, packet)):
             self.untracked.put_off(session, packet, frame=frame)
 
-    def _keep(self, session: str, packet: Packet, frame: bool) -> None:  # noqa: FBT001 - as a field of the context
+    def _keep(self, session: str, packet: Packet, *, frame: bool) -> None:
         """Keep a packet that was received to be tracked here until its session is, here or by who asks for it."""
         if not self.untracked.keep(session, packet, frame=frame, own=True):
             self._hand(session, packet, frame=frame)

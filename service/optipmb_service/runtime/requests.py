@@ -12,6 +12,7 @@ from optipmb_service.session.problems import problem_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from concurrent.futures import Future
 
     import optipmb_schemas as schemas
 
@@ -20,15 +21,21 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 
-def guarded(request: Request, answer: Callable[[], None]) -> None:
-    """Answer, and finish the request whatever happens: an asker must not wait for its timeout."""
-    began_ns = time.monotonic_ns()
+def guarded(request: Request, answer: Callable[[], Future[None] | None]) -> None:
+    """Answer, and finish the request whatever happens: an asker must not wait for its timeout.
+
+    Args:
+        request: what is asked.
+        answer: answers it, or returns what will do so, and finish it, on another thread.
+    """
+    began_ns, later = time.monotonic_ns(), None
     try:
-        answer()
+        later = answer()
     except TransportError as error:
         log.warning("reply_failed", key=request.key, error=str(error))
     finally:
-        request.finish()
+        if later is None:
+            request.finish()
         log.debug("query", key=request.key, took_ms=(time.monotonic_ns() - began_ns) / 1e6)
 
 

@@ -140,4 +140,4 @@ class SessionOpening:
             payload, key = schemas.encode(message), (keys.detections if frame else keys.points)(message.stream)
             came = (ticket.wall_ns, ticket.now_ns) if isinstance(ticket, Arrival) else (wall_ns, now_ns)
             packet = Packet(key, payload, len(payload), schemas.encoding_of(message), *came)
-            self._context.keep(self._stream, packet, frame)
+            self._context.keep(self._stream, packet, frame=frame)

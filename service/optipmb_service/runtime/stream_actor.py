@@ -1,4 +1,4 @@
-"""A session's turns on the tracking thread: takes up, leaves and keeps the session of a stream, hands it what waits.
+"""A session's turns on the tracking thread: it is taken up, left and kept there, and given what waits for it.
 
 All is on that one thread, so nothing is locked. Where several streams share a session, the actor has its name.
 
@@ -103,7 +103,7 @@ class StreamActor:
                 break
         paused = self._paused  # asked after `take`: a call of `ring` before that may have told that the pause has ended
         if not paused:
-            self._out.tracks.flush()
+            self._guard(self._out.tracks.flush)
             self._guard(self._settle)
         turn = self.mailbox.leave(close=not self.occupied, urgent=paused)
         if turn is None:
@@ -222,7 +222,7 @@ class StreamActor:
         """Keep a packet until a session takes it, and begin one if the packet is valid and the stream is to be here."""
         if not (self._opening.lineage or self._closing or self._missed.buffers):
             if not self._context.member.holds(self.stream):
-                self._context.keep(self.stream, packet, frame)
+                self._context.keep(self.stream, packet, frame=frame)
                 return
             if self._tracking.read(packet, None, frame=frame) is None:
                 return

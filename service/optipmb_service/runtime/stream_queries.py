@@ -24,6 +24,7 @@ from optipmb_service.session.values import RefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from concurrent.futures import Future
 
     from optipmb_service.runtime.ports import Request
     from optipmb_service.runtime.registry import Registry
@@ -42,6 +43,8 @@ NO_SESSION = "0" * 32
 _T = TypeVar("_T", bound=schemas.Message)
 _State: TypeAlias = "tuple[schemas.SessionState, Checkpoint | None]"
 """The state of a session, and what its digest is made of."""
+_Command: TypeAlias = "Callable[[StreamActor, Request], _State | None]"
+"""Answers a request, or returns the state that is to be answered."""
 
 
 class StreamQueries:
@@ -83,7 +86,7 @@ class StreamQueries:
         if name == "tracks":
             self._tracks.answer(request, stream)
             return
-        commands: dict[str, tuple[Callable[[StreamActor, Request], _State | None], bool]] = {
+        commands: dict[str, tuple[_Command, bool]] = {
             "state": (lambda actor, _: self._state(actor), True),
             "density": (self._density, True),
             "reset": (self._reset, False),
@@ -98,17 +101,11 @@ class StreamQueries:
         command, urgent = commands[name]
 
         def answer(actor: StreamActor) -> None:
-            # Where several instances run, the one that tracks the stream answers.
-            state = None if actor.elsewhere else self._run(request, lambda: command(actor, request))
-            if state is None:
-                request.finish()
-            else:
-                self._digests.submit(guarded, request, lambda: self._tell(request, state, request.key))
+            guarded(request, lambda: self._run(command, actor, request))
 
         # A stream can be set up ahead of its first frame, by a valid request.
         creates = name == "parameters" and self._sets(request)
-        taken = self._registry.command(stream, lambda actor: actor.ask(answer, create=creates), urgent=urgent)
-        if not taken:
+        if not self._registry.command(stream, lambda actor: actor.ask(answer, create=creates), urgent=urgent):
             full = schemas.MessageError("too_large", "key", "fewer new streams at once", "another one")
             guarded(request, lambda: request.refuse(self._problem(stream, full)))
 
@@ -182,18 +179,13 @@ class StreamQueries:
 
     # Run by the tracking thread
 
-    @staticmethod
-    def _run(request: Request, command: Callable[[], _State | None]) -> _State | None:
-        """Return the state that is to be answered with its digest; None when all is answered, or cannot be."""
-        state = None
-        try:
-            state = command()
-        except TransportError as error:
-            log.warning("reply_failed", key=request.key, error=str(error))
-        except Exception:
-            request.finish()  # nobody is to wait for the timeout
-            raise
-        return state
+    def _run(self, command: _Command, actor: StreamActor, request: Request) -> Future[None] | None:
+        """Carry out a command; a state is answered by another thread, which makes its digest first."""
+        # Where several instances run, the one that tracks the stream answers.
+        state = None if actor.elsewhere else command(actor, request)
+        if state is None:
+            return None
+        return self._digests.submit(guarded, request, lambda: self._tell(request, state, request.key))
 
     def _state(self, actor: StreamActor) -> _State:
         state = actor.state()

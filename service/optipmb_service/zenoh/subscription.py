@@ -82,7 +82,7 @@ def ask_cache(
 ) -> None:
     """Ask publishers' caches for what they hold: `reply` is called with each message, and `end` when no more comes.
 
-    `end` is told whether all have answered, within `ANSWER_S`.
+    `end` is told whether all have answered, within `ANSWER_S`. In a closed session nobody does.
     """
     errors = []
 
@@ -92,11 +92,14 @@ def ask_cache(
         else:
             errors.append(answer.err)
 
-    session.get(
-        selector,
-        zenoh.handlers.Callback(take, lambda: end(not errors)),
-        target=zenoh.QueryTarget.ALL,
-        accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
-        consolidation=zenoh.ConsolidationMode.NONE,
-        timeout=ANSWER_S,
-    )
+    try:
+        session.get(
+            selector,
+            zenoh.handlers.Callback(take, lambda: end(not errors)),
+            target=zenoh.QueryTarget.ALL,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,  # a cache answers with the keys that it caches
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=ANSWER_S,
+        )
+    except zenoh.ZError:
+        end(False)

@@ -15,6 +15,25 @@ from optipmb_service.app.supervisor import Supervisor
 from optipmb_service.settings.loading import load
 
 
+@pytest.mark.parametrize(("status", "failed"), [(-9, 1), (0, 1), (3, 3)])
+async def test_a_worker_that_ends_in_its_first_start_ends_the_command(
+    monkeypatch: pytest.MonkeyPatch, status: int, failed: int
+) -> None:
+    """The exit status is the worker's, and 1 for one that was killed, or ended without a reason."""
+
+    class Ending:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        async def run(self, *_: object) -> int:
+            return status
+
+    monkeypatch.setattr(optipmb_service.app.supervisor, "WorkerProcess", Ending)
+    supervisor = Supervisor(load(None, {"workers": 2, "store": "none"}).settings, StopRequest(), Path("unused"))
+    await supervisor._kept(0)
+    assert supervisor.failed == failed
+
+
 @pytest.mark.parametrize(("silent_s", "killed"), [(10.0, False), (2000.0, True)])
 async def test_a_worker_that_hangs_while_it_starts_is_killed(
     monkeypatch: pytest.MonkeyPatch, silent_s: float, *, killed: bool

@@ -16,7 +16,7 @@ from optipmb_service.runtime.actor_table import ActorTable
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.intake import ALL, NEW_STREAMS, Intake
-from optipmb_service.runtime.ports import Packet
+from optipmb_service.runtime.ports import Packet, TransportError
 from optipmb_service.runtime.registry import Registry
 from optipmb_service.runtime.sweep import Sweep
 from optipmb_service.runtime.takeover_buffer import UNASKED_NS, TakeoverBuffer
@@ -162,6 +162,32 @@ def run(network: Network, intake: Intake, done: Callable[[], bool]) -> None:
             time.sleep(0.01)
     finally:
         intake.close(WAIT_S)
+
+
+def test_an_error_of_the_network_does_not_end_the_intake() -> None:
+    """A subscription that fails is tried again in the next step."""
+
+    class Failing(Network):
+        fails = True
+
+        def subscribe(self, kind: str, stream: str, *, cached: bool) -> None:
+            if stream and self.fails:
+                self.fails = False
+                raise TransportError("no")
+            super().subscribe(kind, stream, cached=cached)
+
+    network, held = Failing(announced=STREAMS[:1]), set[int]()
+    intake, _ = member_of(network, held)
+
+    def subscribed() -> bool:
+        if not held:  # in the first call, when the intake has started
+            held.update(range(1, PARTITIONS))
+            for partition in tuple(held):
+                intake.changed(partition, Change.HELD)
+        return any(stream == STREAMS[0] for _, stream, _ in network.subscribed)
+
+    run(network, intake, subscribed)
+    assert not network.fails
 
 
 def test_new_streams_are_asked_for_a_few_at_a_time() -> None:
@@ -419,12 +445,12 @@ def test_what_is_put_off_is_within_the_quota() -> None:
 
 @pytest.mark.parametrize("asked", [True, False])
 def test_what_a_session_passes_on_is_kept_until_it_is_asked_for(*, asked: bool) -> None:
-    """Frames of a session that leaves are kept also where `standby_s` is 0, and count as refused if nobody asks."""
+    """Frames of a session that leaves are kept also where `standby_s` is 0, and count as shed if nobody asks."""
     kept = Kept(keep_ns=0)
     kept.holds = False
     registry, passed = kept.registry, [detections(0), detections(1)]
     for packet in passed:
-        registry._keep(STREAMS[0], packet, True)
+        registry._keep(STREAMS[0], packet, frame=True)
     registry.frame(detections(2))
     assert registry.untracked.of_partitions(range(PARTITIONS)) == {STREAMS[0]}
     if asked:

@@ -123,7 +123,27 @@ def test_workers_take_turns() -> None:
     assert scheduler.close(5)
 
 
-def test_a_stuck_worker_does_not_keep_the_scheduler() -> None:
+def test_an_error_does_not_end_the_tracking_thread() -> None:
+    """What raises is not called again for what it had; others have their turns."""
+    gate = threading.Event()
+
+    class Broken:
+        def work(self) -> bool:
+            raise RuntimeError
+
+    class Sound:
+        def work(self) -> bool:
+            gate.set()
+            return False
+
+    scheduler = Scheduler()
+    scheduler.submit(Broken())
+    scheduler.submit(Sound())
+    assert gate.wait(60)
+    assert scheduler.close(5)
+
+
+def test_a_step_that_does_not_end_does_not_keep_the_scheduler() -> None:
     """Closing gives up on a step that does not end, and says so."""
     entered, gate = threading.Event(), threading.Event()
 

@@ -78,6 +78,31 @@ def test_the_newest_state_is_found_while_it_cannot_be_written() -> None:
     store.close()
 
 
+def test_no_error_of_the_writer_loses_a_state() -> None:
+    """What the writer took is written in the next round, and until then the store is said to fail."""
+
+    class Broken(SqliteStore):
+        broken = True
+
+        def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
+            if self.broken:
+                raise RuntimeError("a bug")
+            return super().save(checkpoints)
+
+    store = Broken(None)
+    leases = Alone(store)
+    writer = CheckpointWriter(store, 0.05, leases)
+    writer.start(lambda: None)
+    writer.put(snapshot(FIRST), leases.fence(FIRST.stream))
+    until(lambda: writer.failure, "it fails")
+    assert writer.failure == "a bug"
+    store.broken = False
+    until(lambda: store.streams() == (FIRST.stream,), "the state is written")
+    until(lambda: not writer.failure, "it is well")
+    writer.close(5)
+    store.close()
+
+
 def test_who_is_waited_for_keeps_no_other_waiting() -> None:
     """Sessions close one after the other, each while the one before is written: all others are written, too."""
     store, ended = SqliteStore(None), threading.Event()

@@ -5,21 +5,22 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from functools import partial
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_service.zenoh.inputs
 import pytest
+import zenoh
 from optipmb_schemas import Detections, Keys
 from optipmb_service.runtime.intake import ALL
 from optipmb_service.zenoh.handles import cached_publisher
 from optipmb_service.zenoh.inputs import Topic
+from optipmb_service.zenoh.subscription import ask_cache
 from router import Collected
 from routers import free_endpoint, open_router
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    import zenoh
 
 KEYS: Final = Keys()
 STREAM: Final = "site/node/lidar"
@@ -121,10 +122,11 @@ def test_messages_on_their_way_when_their_stream_is_left_do_not_hide_what_follow
 def test_an_error_while_a_cache_is_asked_ends_nothing(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
     """When a cache cannot be asked, what waited for it is handed over, and messages of others are as before."""
 
-    def fail(_session: zenoh.Session, *_: object) -> None:
-        raise RuntimeError
+    def fail(*_: object, **_named: object) -> None:
+        raise zenoh.ZError("closed")
 
-    monkeypatch.setattr(optipmb_service.zenoh.inputs, "ask_cache", fail)
+    closed: Any = SimpleNamespace(get=fail)
+    monkeypatch.setattr(optipmb_service.zenoh.inputs, "ask_cache", lambda _session, *query: ask_cache(closed, *query))
     network.topic.subscribe(ALL, KEYS.all("detections"))
     network.publish(b"2")
     network.session.put(KEYS.detections("site/node/camera"), b"other")

@@ -10,6 +10,7 @@ import optipmb_service.zenoh.queries
 import pytest
 from optipmb_schemas import Keys, Problem, SessionState, decode
 from optipmb_service.runtime import stream_queries
+from optipmb_service.runtime.stream_queries import StreamQueries
 from router import Node, Sensor, until
 
 if TYPE_CHECKING:
@@ -20,6 +21,23 @@ SENSOR: Final = Sensor()
 ASK_S: Final = 60.0
 MOST: Final = 4
 ASKED: Final = 10
+
+
+def test_a_query_about_many_streams_whose_state_fails_gives_its_room_back(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of more queries than may be open ends without an answer, and the next one is answered."""
+    _, endpoint = start()
+    key = f"{KEYS.prefix}/*/*/*/q/state"
+    with Node(endpoint) as node:
+        node.send(SENSOR.detections(0))
+        node.tracks(SENSOR.stream, 1)
+        with monkeypatch.context() as broken:
+            broken.setattr(StreamQueries, "_state", lambda *_: 1 / 0)
+            assert [node.query(key, None, ASK_S) for _ in range(2 * stream_queries.MOST_WILDCARDS)] == [
+                []
+            ] * 2 * stream_queries.MOST_WILDCARDS
+        assert [ok for ok, _, _ in node.query(key, None, ASK_S)] == [True]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from optipmb_service.zenoh.handles import Channel, cached_publisher
 from optipmb_service.zenoh.inputs import Topic
 from optipmb_service.zenoh.transport import Transport
 from router import until
-from routers import free_endpoint, open_router
+from routers import free_endpoint, open_client, open_router
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -59,14 +59,15 @@ def test_a_question_has_as_many_answers_as_there_are(session: zenoh.Session) -> 
 
 def test_as_many_tokens_may_be_there_as_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is watched may be more than waits for a thread: owners, and the links of a router."""
-    monkeypatch.setattr(optipmb_service.zenoh.transport, "CHANNEL", 4)
+    monkeypatch.setattr(optipmb_service.zenoh.transport, "CHANNEL", 16)  # of links one
     endpoint = free_endpoint()
     transport = Transport(load(None, {"listen": [endpoint], "instance": "one", "store": "none"}).settings)
     owners: set[str] = set()
-    publishers = [transport.open_publisher(f"site/node/{one}") for one in range(10)]
+    publishers = [transport.open_publisher(f"site/node/{one}") for one in range(20)]
     ends(lambda: transport.watch_owners(lambda stream, _instance, _present: owners.add(stream)))
     until(lambda: len(owners) == len(publishers), "all owners")
-    ends(transport.watch)
+    with open_client(endpoint), open_client(endpoint), open_client(endpoint):
+        ends(transport.watch)
     ends(transport.close)
 
 

@@ -1,0 +1,57 @@
+"""What the parent of worker processes answers for them."""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+from optipmb_schemas import DrainRequest, Keys, encode, encoding_of
+from optipmb_service.app.aggregate import AggregateView
+from optipmb_service.settings.loading import load
+
+KEYS = Keys()
+HANGS_S = 60.0
+
+
+class Network:
+    """Workers that answer nothing: a question about their status at once, one to leave streams after a while."""
+
+    def __init__(self) -> None:
+        self.asked, self.gate = threading.Event(), threading.Event()
+
+    def ask(self, key: str, timeout: float, payload: bytes = b"", encoding: str = "") -> None:
+        """Return no answer."""
+        del timeout, payload, encoding
+        if key.endswith("/drain"):
+            self.asked.set()
+            assert self.gate.wait(HANGS_S)
+
+
+def test_a_drain_keeps_no_status_waiting() -> None:
+    """While the workers are asked to leave their streams, status and metrics are answered."""
+    network: Any = Network()
+    workers: Any = SimpleNamespace(count=2, states=["ready", "ready"], began=True, restarts=[0, 0])
+    view = AggregateView(load(None, {"instance": "yard", "store": "none"}).settings, workers, network)
+    refused: list[object] = []
+    asked = DrainRequest(drain=False)
+    request: Any = SimpleNamespace(
+        key=KEYS.drain("yard"),
+        payload=encode(asked),
+        encoding=encoding_of(asked),
+        refuse=refused.append,
+        finish=lambda: None,
+    )
+    draining = threading.Thread(target=view.answer, args=(request,), daemon=True)
+    draining.start()
+    assert network.asked.wait(HANGS_S)
+    found: list[object] = []
+    asking = threading.Thread(target=lambda: found.extend((view.status().instance, view.text())), daemon=True)
+    asking.start()
+    asking.join(HANGS_S / 2)
+    assert found[:1] == ["yard"]
+    assert len(found) == 2
+    network.gate.set()
+    draining.join(HANGS_S)
+    assert len(refused) == 1
+    view.ends()
