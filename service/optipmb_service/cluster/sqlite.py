@@ -49,6 +49,9 @@ SLICE: Final = 64
 SLICE_BYTES: Final = 4 * 2**20
 """Bytes of checkpoints of one transaction; one checkpoint may have more."""
 
+PAGE_BYTES: Final = 32768
+"""Pages of the file of the checkpoints, each of which has tens of thousands of bytes."""
+
 _RECORDS: Final = """
 CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, value TEXT NOT NULL, revision INTEGER NOT NULL) WITHOUT ROWID;
 """
@@ -90,7 +93,7 @@ class SqliteStore:
     def __init__(self, path: Path | None, clock: Callable[[], float] = time.time) -> None:
         self._locks = MemberLocks(None if path is None else path.with_name(MEMBERS))
         self._clock = clock
-        self._checkpoints = Database(path, _CHECKPOINTS, "NORMAL")
+        self._checkpoints = Database(path, _CHECKPOINTS, "NORMAL", PAGE_BYTES)
         try:
             self._leases = Database(None, _RECORDS, "OFF") if path is None else _leases_beside(path)
         except StoreError:

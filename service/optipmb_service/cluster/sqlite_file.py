@@ -27,12 +27,13 @@ class Database:
         path: the file; made when it is not there. None: in memory.
         schema: of its tables.
         synchronous: SQLite's setting.
+        page_bytes: size of the pages of a new file; each is read and written by a call of the system.
 
     Raises:
         StoreError: it cannot be opened or written, or is no such file.
     """
 
-    def __init__(self, path: Path | None, schema: str, synchronous: str) -> None:
+    def __init__(self, path: Path | None, schema: str, synchronous: str, page_bytes: int = 4096) -> None:
         self._path = path
         self._lock = threading.Lock()
         self.connection: sqlite3.Connection | None = None
@@ -40,6 +41,7 @@ class Database:
             self.connection = sqlite3.connect(
                 path or ":memory:", timeout=BUSY_S, isolation_level=None, check_same_thread=False
             )
+            self.connection.execute(f"PRAGMA page_size = {page_bytes}")
             self._begin_log(self.connection)
             self.connection.execute(f"PRAGMA synchronous = {synchronous}")
             self.connection.execute(f"PRAGMA journal_size_limit = {64 * 2**20}")

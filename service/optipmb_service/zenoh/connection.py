@@ -38,8 +38,12 @@ router that does not answer at all is left when its lease ends.
 RETRY_MS: Final = {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 2}
 
 RUNTIME_VARIABLE: Final = "ZENOH_RUNTIME"
-RUNTIME: Final = "(rx: (worker_threads: 1))"
-"""A client has one link, which one thread reads. Of two, Zenoh's default, each message wakes the other as well."""
+RUNTIME: Final = "(rx: (handover: app))"
+"""A client has one link, and one thread that waits for its socket and reads it.
+
+By default one thread waits and wakes one of two others to read: two more threads are woken for each message. What is
+sent has a thread of its own, so a callback that waits for the lock of the interpreter keeps nothing from leaving.
+"""
 
 MESSAGE_HEADROOM: Final = 4
 """A message up to this many times the limit is received and answered by a problem; a larger one is dropped by Zenoh."""

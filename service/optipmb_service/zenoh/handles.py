@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import queue
 import threading
 import time
@@ -36,6 +37,9 @@ again. For that they are not often: thousands of silent publishers cost little.
 log = structlog.get_logger("optipmb_service")
 
 _T = TypeVar("_T")
+
+_thread = threading.local()
+"""Lives as long as the state of the thread does."""
 
 
 # What is used of Zenoh's objects, typed: its own stubs leave parts untyped.
@@ -128,7 +132,24 @@ def directly(take: Callable[[Any], None]) -> tuple[Any, None]:
     A pair with something that could be read: with a callback alone Zenoh lets a subscription run in the background, and
     what it has declared for recovery beside it is not withdrawn with it.
     """
-    return zenoh.handlers.Callback(take, indirect=False), None
+
+    def called(item: Any) -> None:
+        if not getattr(_thread, "attached", False):
+            _stay_attached()
+        take(item)
+
+    return zenoh.handlers.Callback(called, indirect=False), None
+
+
+def _stay_attached() -> None:
+    """Have the calling thread, one of Zenoh's, keep its thread state of the interpreter until it ends.
+
+    The interpreter makes one whenever a foreign thread calls into it, and drops it on the way back unless an earlier
+    call has not returned. Per message that is memory mapped and unmapped, and every processor of the process is
+    interrupted to forget it. This is such a call; the lock is given back with the callback, as ever.
+    """
+    ctypes.pythonapi.PyGILState_Ensure()
+    _thread.attached = True
 
 
 class Readers:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 from typing import TYPE_CHECKING
@@ -11,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 from lease_log import Alone
 from optipmb_service.cluster.member_locks import MEMBERS
-from optipmb_service.cluster.sqlite import ASIDE, ENDED_KEPT, LEASES, SLICE, SLICE_BYTES, SqliteStore
+from optipmb_service.cluster.sqlite import ASIDE, ENDED_KEPT, LEASES, PAGE_BYTES, SLICE, SLICE_BYTES, SqliteStore
 from optipmb_service.cluster.store import ENDED, StoreError, Write, load_newest
 
 if TYPE_CHECKING:
@@ -76,6 +78,21 @@ def test_what_is_kept_is_bounded(store: SqliteStore) -> None:
     assert found == [b"4", b"3"]
 
 
+def test_a_checkpoint_takes_few_pages(tmp_path: Path) -> None:
+    """A new file has pages for the size of checkpoints; one that an earlier version made keeps its own, and goes on."""
+    for name, page_bytes in (("new.db", PAGE_BYTES), ("old.db", 4096)):
+        with contextlib.closing(sqlite3.connect(tmp_path / name)) as before:
+            if name == "old.db":
+                before.execute("PRAGMA journal_mode = WAL")
+                before.execute("CREATE TABLE earlier (x)")
+        store = SqliteStore(tmp_path / name)
+        Alone(store).save({"a/b/c": bytes(90_000)})
+        assert store.load("a/b/c") == bytes(90_000)
+        store.close()
+        with contextlib.closing(sqlite3.connect(tmp_path / name)) as after:
+            assert after.execute("PRAGMA page_size").fetchone() == (page_bytes,)
+
+
 def test_a_closed_store_says_so(tmp_path: Path) -> None:
     """After `close`, which may come twice, the one error is raised."""
     store = SqliteStore(tmp_path / "s")
@@ -99,7 +116,7 @@ def test_a_full_disk_is_an_error_and_loses_nothing(tmp_path: Path) -> None:
     store = SqliteStore(tmp_path / "s")
     leases = Alone(store)
     leases.save({"a": b"1", "b": b"1"})
-    store._checkpoints.connection.execute("PRAGMA max_page_count = 40")  # type: ignore[union-attr]  # it is open
+    store._checkpoints.connection.execute("PRAGMA max_page_count = 12")  # type: ignore[union-attr]  # it is open
     with pytest.raises(StoreError, match="full"):
         leases.save({"a": b"2", "b": bytes(10**6)})
     assert (store.load("a"), store.load("b")) == (b"1", b"1")

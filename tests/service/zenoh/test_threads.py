@@ -1,0 +1,63 @@
+"""The threads of Zenoh: how many a message wakes, and what the interpreter knows of those that call into it."""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from optipmb_service.zenoh.handles import directly
+from routers import free_endpoint, open_client, open_router
+from service_process import ServiceProcess
+
+if TYPE_CHECKING:
+    import zenoh
+
+MESSAGES = 50
+
+
+def test_a_thread_of_the_network_keeps_its_state() -> None:
+    """All messages are handed over under one thread state for each thread: none is made and dropped with a message."""
+    states: set[tuple[int, int]] = set()
+    count = 0
+    enough = threading.Event()
+
+    def take(sample: zenoh.Sample) -> None:
+        nonlocal count
+        del sample
+        states.add((threading.get_native_id(), _state()))
+        count += 1
+        if count == MESSAGES:
+            enough.set()
+
+    endpoint = free_endpoint()
+    with open_router(endpoint), open_client(endpoint) as receiver, open_client(endpoint) as sender:
+        subscriber = receiver.declare_subscriber("some/*/messages", directly(take))
+        publisher = sender.declare_publisher("some/other/messages")
+        while not enough.wait(0.01):  # one after the other: those that came together would share a state anyway
+            publisher.put(b"message")
+        del subscriber
+    assert len(states) == len({thread for thread, _ in states})
+
+
+def _state() -> int:
+    """The number of the thread state of the calling thread, which the interpreter gives to no other one."""
+    api = ctypes.pythonapi
+    api.PyThreadState_Get.restype = ctypes.c_void_p
+    api.PyThreadState_GetID.argtypes = (ctypes.c_void_p,)
+    api.PyThreadState_GetID.restype = ctypes.c_uint64
+    number: int = api.PyThreadState_GetID(api.PyThreadState_Get())
+    return number
+
+
+def test_one_thread_waits_for_the_router_and_reads() -> None:
+    """A service that is a client reads what comes on the thread that waits for it, and wakes no other one for it."""
+    with ServiceProcess("router", "--instance", "router") as router:
+        router.wait_ready()
+        options = ("--connect", router.endpoint, "--instance", "client")
+        with ServiceProcess(*options, listen=False, fresh=True) as service:
+            service.wait_ready()
+            threads = [task.read_text().strip() for task in Path(f"/proc/{service.process.pid}/task").glob("*/comm")]
+    assert "app-0" in threads
+    assert [name for name in threads if name.startswith("rx-")] == []
