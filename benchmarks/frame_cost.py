@@ -1,12 +1,11 @@
 """What a frame costs the service, part by part, beside another version of the code, in one run.
 
-python benchmarks/frame_cost.py [--beside DIR] [--objects N] [--points N] [--rounds N] [--live SECONDS]
+python benchmarks/frame_cost.py [--beside DIR] [--objects N] [--points N] [--rounds N]
 
 A frame goes its way through one process, with everything real but the network and the store: a packet is handed over,
 decoded, tracked and published, and every tenth frame a checkpoint is encoded. What counts is the processor time of the
 thread. `--beside` names a checkout of another version: rounds of the two follow each other, each in a process of its
-own, and the medians of the rounds are compared. With `--live`, 40 streams at 10 Hz come from this process through a
-router in another one, and the system says what processor time the service takes, with Zenoh's threads and checkpoints.
+own, and the medians of the rounds are compared. `service_cost.py` measures running services.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from importlib import import_module
 from pathlib import Path
@@ -25,8 +23,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
-from optipmb_client import Connection
-from optipmb_client.load import Load, generated, run_load
+from optipmb_client.load import generated
 from optipmb_client.load.material import FIRST, head, message
 from optipmb_service.app.kernels import warm_up
 from optipmb_service.observability import logs
@@ -41,10 +38,6 @@ from optipmb_service.runtime.track_publisher import TrackPublisher
 from optipmb_service.session import convert
 from optipmb_service.session.session import Session
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
-
-from service_process import ServiceProcess
-
 import optipmb
 
 if TYPE_CHECKING:
@@ -55,7 +48,6 @@ STREAM = "site-of-load/node/lidar1"
 WARM = 100
 FRAMES = 400
 RATE_HZ = 10.0
-STREAMS = 40
 CHECKPOINT_EVERY = 10
 
 
@@ -224,36 +216,13 @@ def measured(objects: int, points: int) -> dict[str, float]:
     return medians | {"checkpoint": median(checkpoints), "sum": sum(medians.values()) + median(checkpoints)}
 
 
-def live(tree: Path, objects: int, points: int, seconds: float) -> dict[str, float]:
-    """Return microseconds of processor time per frame of a service in a process of its own, and its latencies."""
-    with tempfile.TemporaryDirectory() as folder, ServiceProcess("--instance", "router") as router:
-        router.wait_ready()
-        environment = {"PYTHONPATH": roots(tree), "PYTHONSAFEPATH": "1", "OPTIPMB_STORE": folder}
-        options = ("--connect", router.endpoint, "--instance", "cost", "--log-level", "warning")
-        with ServiceProcess(*options, environment=environment, listen=False) as service:
-            service.wait_ready()
-            frames = generated(objects, points, RATE_HZ)
-            with Connection(router.endpoint) as connection:
-                run_load(connection, Load(STREAMS, RATE_HZ, 2.0), frames)
-                before_s = processor_s(service.process.pid)
-                run = run_load(connection, Load(STREAMS, RATE_HZ, seconds), frames)
-                spent_s = processor_s(service.process.pid) - before_s
-    return {"service": spent_s / run.received * 1e6, "p50_ms": run.p50_ms, "p99_ms": run.p99_ms}
-
-
-def processor_s(pid: int) -> float:
-    """Processor time of a process so far."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
 def roots(tree: Path) -> str:
     """Return the search path on which the packages of a checkout come first."""
     return os.pathsep.join(str(tree / part) for part in ("", "schemas", "service", "clients"))
 
 
 def rounds(trees: Sequence[Path], options: argparse.Namespace) -> list[dict[str, float]]:
-    """Measure the checkouts side by side, then each as a service; return the medians of the rounds."""
+    """Measure the checkouts side by side; return the medians of the rounds."""
     seen: list[list[dict[str, float]]] = [[] for _ in trees]
     command = [sys.executable, __file__, "--one", "--objects", str(options.objects), "--points", str(options.points)]
     for _ in range(options.rounds):
@@ -264,9 +233,8 @@ def rounds(trees: Sequence[Path], options: argparse.Namespace) -> list[dict[str,
             for tree in trees
         ]
         answers = [process.communicate()[0] for process in started]
-        for tree, rows, answer in zip(trees, seen, answers, strict=True):
-            service = live(tree, options.objects, options.points, options.live) if options.live else {}
-            rows.append(json.loads(answer) | service)
+        for rows, answer in zip(seen, answers, strict=True):
+            rows.append(json.loads(answer))
     return [{part: median(row[part] for row in rows) for part in rows[0]} for rows in seen]
 
 
@@ -277,7 +245,6 @@ def main() -> None:
     parser.add_argument("--objects", type=int, default=40)
     parser.add_argument("--points", type=int, default=0)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--live", type=float, default=0.0, help="seconds of load on a running service; 0: none")
     parser.add_argument("--one", action="store_true", help="one round of the packages on the search path, as JSON")
     options = parser.parse_args()
     if options.one:
