@@ -73,7 +73,10 @@ class StreamCounters:
 
     def shed(self) -> int:
         """Count what the mailbox shed since the last time; returns how many frames."""
-        shed, _, clouds = self._mailbox.counts()
+        mailbox = self._mailbox
+        if mailbox.shed_frames == self._shed_told and mailbox.shed_clouds == self._clouds_shed_told:
+            return 0
+        shed, _, clouds = mailbox.counts()
         fresh, self._shed_told = shed - self._shed_told, shed
         traffic = self._accounts.traffic
         traffic.clouds_shed += clouds - self._clouds_shed_told

@@ -91,6 +91,8 @@ class Refusals:
         self, frame_id: FrameId, found: dict[str, int], parameters: optipmb.Parameters
     ) -> list[schemas.Problem]:
         """Classes that the profile lacks, with the number of objects of each."""
+        if not found:
+            return []
         expected = f"one of {', '.join(parameters.classes)} (profile {parameters.name})"
         return [
             self._problem("unknown_class", frame_id, "labels", expected, repr(label)).model_copy(
