@@ -64,7 +64,7 @@ def calibrate_rows(
         yaw: (K,) headings.
         classes: (C,) parameters: the knots of f, along and across, and w.
         existence: (K,) in: r, out: f(e_k).
-        score: (K,) in: x_s, out: the score that is told.
+        score: (K,) in: x_s, out: the published score.
         covariance: (K, 6, 6) in: P, out: with the lasting error.
     """
     for row in range(existence.shape[0]):

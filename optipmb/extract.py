@@ -242,7 +242,7 @@ def confirm(rows: Index, label: Index, existence: Array, classes: Sequence[Class
     Args:
         rows: (K,) objects.
         label: (K,) their classes.
-        existence: (K,) of the tracks, as they are told.
+        existence: (K,) of the tracks, as published.
         classes: (C,) parameters: `confirm_from` and `confirm_until`.
         confirmed: (N,) whether they were; is written.
 

@@ -10,7 +10,7 @@ The moments of the velocity v e^{i phi} are exact (`optipmb.motion.polar_moments
 A heading that is measured modulo pi has a posterior with several modes, one for each of the three nearest headings
 z_phi + j pi that the prior allows. The velocity decides between them, if the object moves. Each mode is updated by
 itself, has the likelihood of the measurement as its weight, and is described with the heading nearer to that of the
-heaviest, as x or as T x (`optipmb.heading`); one Gaussian of the same mean and covariance replaces them. It is told
+heaviest, as x or as T x (`optipmb.heading`); one Gaussian of the same mean and covariance replaces them. It is given
 with the heading nearer to that of the prior: its sign is a state of its own.
 """
 

@@ -175,7 +175,7 @@ def _confusion(classes: Any, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _values(p: ClassParameters) -> dict[str, Any]:
     """Return the row of a class but for what depends on the other classes of its group."""
-    q, noise, birth, sign, told = p.process_noise, p.measurement_noise, p.birth, p.heading_sign, p.calibration
+    q, noise, birth, sign, calibration = p.process_noise, p.measurement_noise, p.birth, p.heading_sign, p.calibration
     values = {name: getattr(p, name) for name in ClassRow.__annotations__ if hasattr(p, name)}
     values |= {
         "clutter_intensity": p.clutter_rate / p.area,
@@ -196,11 +196,15 @@ def _values(p: ClassParameters) -> dict[str, Any]:
     if sign is not None:
         values |= {"sign_known": True, "sign_memory": sign.memory, "sign_detection": sign.detection}
         values |= {"sign_motion": sign.motion, "sign_speed": sign.speed}
-    if told is not None:
-        values |= {"memory": told.memory, "missed_evidence": told.missed, "knots": len(told.evidence)}
-        values["score_of_evidence"] = told.score_of_evidence
+    if calibration is not None:
+        values |= {
+            "memory": calibration.memory,
+            "missed_evidence": calibration.missed,
+            "knots": len(calibration.evidence),
+        }
+        values["score_of_evidence"] = calibration.score_of_evidence
         for name in ("evidence", "existence", "along", "across"):
-            curve = getattr(told, name)
+            curve = getattr(calibration, name)
             values[f"knot_{name}"] = (*curve, *(0.0,) * (MAX_KNOTS - len(curve)))
     return values
 

@@ -316,8 +316,8 @@ class Tracker:
             born,
             repaired + repaired_now,
         )
-        told = None if pi is None else pi[np.searchsorted(objects.id, tracks.id)]
-        return StepResult(posterior, tracks, diagnostics, paths, told)
+        pi = None if pi is None else pi[np.searchsorted(objects.id, tracks.id)]
+        return StepResult(posterior, tracks, diagnostics, paths, pi)
 
     def _check(self, density: Density, frame: Frame) -> None:
         """Refuse other classes, which kernels would read out of bounds for, and frames of the past."""

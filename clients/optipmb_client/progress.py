@@ -86,7 +86,7 @@ class FrameProgress:
 
 
 class StatusLine:
-    """One line about work that has no known end; on a terminal it is written over, elsewhere told every ten seconds."""
+    """One line about work that has no known end; on a terminal it is overwritten, elsewhere added every ten seconds."""
 
     def __init__(self, *, terminal: bool | None = None) -> None:
         self._shown = time.monotonic()

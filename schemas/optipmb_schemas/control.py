@@ -77,7 +77,7 @@ class MoveRequest(Message):
 class DrainRequest(Message):
     """Query `service/<instance>/q/drain`: give all streams to other members. The reply repeats it when that is done.
 
-    With workers, all of them do so. A member that drains takes no streams until it ends or is told otherwise.
+    With workers, all of them do so. A member that drains takes no streams until it ends or another order comes.
     """
 
     drain: Flag = Field(default=True, description="False: take a share of the streams again.")

@@ -117,7 +117,8 @@ class LateJoin(Generic[_S]):
         receive: takes a sample; never called by two threads at once, nor after `close`. It must not raise.
         ask: queries a selector; calls its second argument with each reply, and its third when no more will come, with
             whether all that were asked have answered, on any thread but the one that asks (`CacheQueries`).
-        answered: told the key of a publisher when all has been handed over that its cache held. It must not raise.
+        answered: called with the key of a publisher when all has been handed over that its cache held. It must not
+            raise.
     """
 
     def __init__(
@@ -128,7 +129,7 @@ class LateJoin(Generic[_S]):
     ) -> None:
         self._receive = receive
         self._ask = ask
-        self._told = answered
+        self._on_answered = answered
         self._sources: dict[_Source, list[_S] | None] = {}  # what waits for the answer of a cache; None: nothing does
         self._due: dict[_Source, int] = {}  # the number after the highest that was handed over
         self._keys: dict[_Source, str] = {}
@@ -235,7 +236,7 @@ class LateJoin(Generic[_S]):
                 further = self._follow(source, waiting[1:])
             # Else a later gap is still asked for, or the cache may hold what has not come.
             if complete and further is None and (waits is gap.behind or waits is None):
-                self._told(key)
+                self._on_answered(key)
         self._ask_for(source, key, further)
 
     def _taken(self, source: _Source) -> list[_S]:

@@ -224,7 +224,7 @@ def test_the_command_tells_a_bag_from_other_files(
         assert text in told
 
 
-def test_an_unfinished_file_is_told(bag: Path, tmp_path: Path) -> None:
+def test_an_unfinished_file_is_reported(bag: Path, tmp_path: Path) -> None:
     """A file whose recorder was killed is refused with what to do about it."""
     path = tmp_path / "torn.mcap"
     path.write_bytes(bag.read_bytes()[:-100])

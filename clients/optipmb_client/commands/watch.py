@@ -94,7 +94,7 @@ def watch(  # noqa: PLR0913  these are the command's options
         if file is None
         else _recorded(file, streams, pace, points=points)
     )
-    first = next(messages, None)  # what is wrong with the source is told before a viewer opens
+    first = next(messages, None)  # what is wrong with the source is reported before a viewer opens
     ends = None if seconds is None else time.monotonic() + seconds
     shown = _until(itertools.chain([first], messages), ends)
     if foxglove:

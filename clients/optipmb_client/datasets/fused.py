@@ -126,7 +126,7 @@ class FusedSequence:
         return np.arange(max((len(frame) for _, _, frame in self._merged()), default=0), dtype=np.int64)
 
     def truth(self) -> Truth | None:
-        """Return None: truth is told for each sensor."""
+        """Return None: truth is given for each sensor."""
         return None
 
 

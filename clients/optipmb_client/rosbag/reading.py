@@ -98,7 +98,7 @@ class Bag:
             second, rest, length = struct.unpack_from(order + "iII", raw.data, _CDR)
             start = _CDR + 12
             if second < 0 or rest >= 10**9 or not 0 < length <= len(raw.data) - start:
-                raise ValueError  # noqa: TRY301  told below
+                raise ValueError  # noqa: TRY301 - reported below
             frame = raw.data[start : start + length - 1].decode()
         except (struct.error, ValueError) as error:
             raise DatasetError(f"{self.path} {raw.topic}", "a header", f"{len(raw.data)} bytes without one") from error

@@ -1,6 +1,6 @@
 """Tracks from msgpack to protobuf without a model between them: a service has checked what it has published.
 
-What is checked is what can be told without looking at the values: the structure, the types, and that each column has
+What is checked is what can be known without looking at the values: the structure, the types, and that each column has
 the rows of the others and the bytes of its shape. A receiver that wants more has `from_proto`. Tracks in any form but
 the service's own (JSON, other number types) are decoded as everywhere.
 """

@@ -262,7 +262,7 @@ class LeaseTable:
         return known is not None and known.alive and instance in {None, instance_of(holder)}
 
     def due(self, now_ns: int, occupied: Callable[[], Container[int]], gone: Callable[[str], bool]) -> list[Write]:
-        """Return what is to be written now; `written` is to be told of each.
+        """Return what is to be written now; `written` is to be called with each.
 
         Args:
             now_ns: monotonic time.

@@ -92,7 +92,7 @@ class Member:
         self._value = ALIVE
         self._said = ALIVE
         self._shown: tuple[list[str], int] = ([], 0)
-        self._told: dict[int, int] = {}
+        self._reported: dict[int, int] = {}
         self._recalled: set[int] = set()
         self._came = threading.Condition()
         self._changed: Callable[[int, Change], None] = lambda *_: None
@@ -329,13 +329,13 @@ class Member:
     def _settle(self) -> None:
         """Tell what has changed."""
         held, leaving = dict(self._table.held), set(self._table.leaving)
-        lost = {partition for partition, fence in self._told.items() if held.get(partition) != fence}
-        told, self._told = self._told, held
+        lost = {partition for partition, fence in self._reported.items() if held.get(partition) != fence}
+        reported, self._reported = self._reported, held
         for partition in lost:
             self._recalled.discard(partition)
             self._changed(partition, Change.LOST)
         for partition in held:
-            if partition not in told or partition in lost:
+            if partition not in reported or partition in lost:
                 self._changed(partition, Change.HELD)
         for partition in leaving - self._recalled:
             self._recalled.add(partition)

@@ -100,7 +100,7 @@ def load_newest(
         stream: whose.
         read: makes the checkpoint of the bytes.
         torn: what `read` raises.
-        on_torn: told why, each time.
+        on_torn: called with the reason, each time.
 
     Raises:
         StoreError: the store cannot be read.

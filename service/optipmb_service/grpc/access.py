@@ -105,8 +105,8 @@ class Access:
             name = next(iter(context.auth_context().get("x509_common_name", ())), b"").decode(errors="replace")
         if self._tokens is not None:
             metadata = {key: value for key, value in context.invocation_metadata() or () if isinstance(value, str)}
-            told = self._tokens(metadata, name)
-            token = await told if inspect.isawaitable(told) else told
+            found = self._tokens(metadata, name)
+            token = await found if inspect.isawaitable(found) else found
             if not token:
                 raise EndCall(grpc.StatusCode.UNAUTHENTICATED, "the token is missing or not valid")
             name = token

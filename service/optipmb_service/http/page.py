@@ -2,7 +2,7 @@
 
 Nothing here costs anything until somebody looks. Whoever looks at a stream has a tap on its keys for as long as the
 connection lasts, and gets the newest frame at most ten times a second; what a slow viewer cannot take is never made.
-Files and data come from here alone, and the browser is told to accept nothing else.
+Files and data come from here alone, and a header has the browser accept nothing else.
 """
 
 from __future__ import annotations
@@ -160,5 +160,5 @@ def _undo(tapped: asyncio.Future[Callable[[], None] | None]) -> None:
     """Release a tap that nobody waits for any more."""
     if tapped.cancelled() or tapped.exception() is not None or (release := tapped.result()) is None:
         return
-    with contextlib.suppress(RuntimeError):  # the server ends, and its threads have been told
+    with contextlib.suppress(RuntimeError):  # the server ends, and so do its threads
         tapped.get_loop().run_in_executor(None, release)

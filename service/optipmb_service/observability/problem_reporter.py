@@ -37,7 +37,7 @@ LOGGED_PER_SECOND: Final = 20
 
 @dataclass(slots=True)
 class _Kind:
-    """What is known of one kind: when it was last told, and what has gathered since."""
+    """What is known of one kind: when it was last reported, and what has gathered since."""
 
     published_ns: int
     logged_ns: int
@@ -97,8 +97,8 @@ class ProblemReporter:
         self._counts: Counter[str] = Counter()
 
     def report(self, problem: schemas.Problem, now_ns: int) -> None:
-        """Tell of a problem now or, when its kind was told of just before, in the next summary."""
-        # Elements of an array are one kind. Classes are few and each is told of once, so each is a kind of its own.
+        """Report a problem now or, when its kind was reported just before, in the next summary."""
+        # Elements of an array are one kind. Classes are few and each is reported once, so each is a kind of its own.
         detail = problem.received if problem.code == "unknown_class" else re.sub(r"\[\d+\]", "[]", problem.path)
         key = (problem.stream, problem.code, detail)
         with self._lock:
@@ -112,8 +112,8 @@ class ProblemReporter:
             kind.gathered += problem.count
             kind.unlogged += problem.count
             kind.last = problem
-            told = self._tell(kind, now_ns)
-        self._send(told)
+            summary = self._due(kind, now_ns)
+        self._send(summary)
 
     def flush(self, now_ns: int) -> None:
         """Send the summaries that are due; to be called about once a second."""
@@ -121,11 +121,11 @@ class ProblemReporter:
         with self._lock:
             for key, kind in list(self._kinds.items()):
                 if kind.gathered or kind.unlogged:
-                    due.append(self._tell(kind, now_ns))
+                    due.append(self._due(kind, now_ns))
                 elif now_ns - kind.logged_ns >= LOG_EVERY_NS:
                     del self._kinds[key]
-        for told in due:
-            self._send(told)
+        for summary in due:
+            self._send(summary)
 
     def newest(self) -> tuple[schemas.Problem, ...]:
         """Return the newest problems, the oldest first."""
@@ -137,8 +137,8 @@ class ProblemReporter:
         with self._lock:
             return dict(self._counts)
 
-    def _tell(self, kind: _Kind, now_ns: int) -> _Summary | None:
-        """Take what may be told of a kind now; called with the lock."""
+    def _due(self, kind: _Kind, now_ns: int) -> _Summary | None:
+        """Take what may be reported of a kind now; called with the lock."""
         problem = kind.last
         publish = bool(kind.gathered) and now_ns - kind.published_ns >= PUBLISH_EVERY_NS
         log = bool(kind.unlogged) and now_ns - kind.logged_ns >= LOG_EVERY_NS
@@ -147,22 +147,22 @@ class ProblemReporter:
         if problem is None or not (publish or log):
             return None
         problem = problem.model_copy(update={"reported_ns": self._wall()})
-        told = _Summary(problem, published=kind.gathered if publish else 0, logged=kind.unlogged if log else 0)
+        summary = _Summary(problem, published=kind.gathered if publish else 0, logged=kind.unlogged if log else 0)
         if publish:
             kind.gathered, kind.published_ns = 0, now_ns
-            self._newest.append(told.problem.model_copy(update={"count": told.published}))
+            self._newest.append(summary.problem.model_copy(update={"count": summary.published}))
         if log:
             kind.unlogged, kind.logged_ns = 0, now_ns
-        return told
+        return summary
 
-    def _send(self, told: _Summary | None) -> None:
+    def _send(self, summary: _Summary | None) -> None:
         """Publish and log outside the lock: both may take a while."""
-        if told is None:
+        if summary is None:
             return
-        if told.published:
-            self._publish(told.problem.model_copy(update={"count": told.published}))
-        if told.logged:
-            self._log(told.problem, told.logged)
+        if summary.published:
+            self._publish(summary.problem.model_copy(update={"count": summary.published}))
+        if summary.logged:
+            self._log(summary.problem, summary.logged)
 
 
 def log_problem(problem: schemas.Problem, count: int) -> None:

@@ -1,7 +1,7 @@
 """Endpoints of others that do not fit ours: what is wrong, in words that say what to do.
 
 rmw_zenoh delivers whatever the quality of service, and drops nothing aloud: a type with another definition has another
-key, and its messages just do not arrive. So what DDS would refuse is told here.
+key, and its messages just do not arrive. So what DDS would refuse is reported here.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ class Inputs(Others, Protocol):
     ) -> None:
         """Tell of the tokens of publishers, and of streams that are announced, by whom; each True: it is there."""
 
-    def watch_owners(self, told: Callable[[str, str, bool], None] | None) -> None:
+    def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
         """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more."""
 
     def discover(self, streams: set[str]) -> None:
@@ -340,8 +340,7 @@ class Intake:
 
     def _watch_owners(self, *, discovering: bool) -> None:
         if discovering is not self._watching:
-            told = self._registry.told_owners()
-            self._inputs.watch_owners(told if discovering else None)
+            self._inputs.watch_owners(self._registry.on_owner() if discovering else None)
             self._watching = discovering
 
     def _later(

@@ -236,10 +236,10 @@ class Registry:
         """Whether a session is there, here or elsewhere: something valid has come of it."""
         return self.actor(session) is not None or self._rivals.tracks(session)
 
-    def told_owners(self) -> Callable[[str, str, bool], None]:
+    def on_owner(self) -> Callable[[str, str, bool], None]:
         """Forget who tracks what; return what takes in, from now on, that an instance does so, or no longer."""
         self._rivals = Rivals(round(RIVAL_LEASES * self._settings.lease_s * SECOND))
-        return self._rivals.told
+        return self._rivals.on_owner
 
     def elsewhere(self, stream: str) -> bool:
         """Whether another instance tracks a stream, and answers for it."""
@@ -268,11 +268,11 @@ class Registry:
         """Have actors run what a change of their partition asks for; those that came here are to be taken up."""
         if change is Change.HELD:
             return
-        told = StreamActor.on_recalled if change is Change.RECALLED else StreamActor.on_lost
+        command = StreamActor.on_recalled if change is Change.RECALLED else StreamActor.on_lost
         for actor in [actor for actor in self._actors.every() if partition_of(actor.stream) == partition]:
             if actor.session is not None:  # before it ends: what comes from then on is kept for who asks
                 self.untracked.leave(actor.stream, asked_for=change is Change.RECALLED)
-            actor.tell(told)
+            actor.tell(command)
 
     def resume(self) -> None:
         """Schedule all actors: they paused, and need not any longer."""

@@ -27,7 +27,7 @@ class Rivals:
         """Streams with several owners."""
         self._since_ns: dict[str, int] = {}
 
-    def told(self, stream: str, instance: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
+    def on_owner(self, stream: str, instance: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
         """Take in that an instance tracks a stream, or does so no longer."""
         with self._lock:
             owners = self._owners.setdefault(stream, set())

@@ -101,7 +101,7 @@ class StreamActor:
             self._guard(self._handle, *taken)
             if self.mailbox.is_empty or time.monotonic_ns() >= ends_ns:
                 break
-        paused = self._paused  # asked after `take`: a call of `ring` before that may have told that the pause has ended
+        paused = self._paused  # asked after `take`: a call of `ring` before that may mean that the pause has ended
         if not paused:
             self._guard(self._out.tracks.flush)
             self._guard(self._settle)
@@ -237,7 +237,7 @@ class StreamActor:
             self._out.report("shed", "", "room for what waits", f"{dropped} more; dropped", count=dropped)
 
     def ask(self, command: Callable[[StreamActor], None], *, create: bool) -> None:
-        """Call `command`, as soon as no session is about to begin or end, or has to be told what it missed.
+        """Call `command`, as soon as no session is about to begin or end, or has to take what it missed.
 
         With `create`, one begins if there is none.
         """
@@ -258,7 +258,7 @@ class StreamActor:
     def on_lost(self) -> None:
         """Another instance has the stream: what is here is no longer the newest state."""
         if self._fence == self._context.member.fence(self.stream):
-            return  # lost and taken again before this was told
+            return  # lost and taken again before this was called
         self._context.persistence.forget(self.stream)
         if self.session is not None:
             self._out.report("superseded", "", "an instance that is neither frozen nor cut off", "another one goes on")

@@ -28,7 +28,7 @@ class StreamOutputs:
     Args:
         stream: the name of the session.
         context: what all actors share.
-        meter: the figures of the session, told of every publication.
+        meter: the figures of the session, which count every publication.
     """
 
     def __init__(self, stream: str, context: ActorContext, meter: StreamMeter) -> None:

@@ -49,8 +49,8 @@ class TrackPublisher:
         stream: `site/node/sensor`.
         instance: name of the service.
         sink: the network.
-        meter: the figures of the stream, told of every publication.
-        metrics: the figures of the process, told too.
+        meter: the figures of the stream, which count every publication.
+        metrics: the figures of the process, which do so too.
         member: says whether the write lease holds; tracks wait while it does not.
     """
 

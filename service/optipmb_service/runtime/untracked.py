@@ -34,7 +34,7 @@ class UntrackedMessages:
     Args:
         holds: whether a session is to be tracked here.
         buffer: makes what keeps the messages of one session.
-        lost: told of a session whose messages were dropped, those received to be tracked here; each True: a frame.
+        lost: called with a session whose messages were dropped, those received to be tracked here; each True: a frame.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class UntrackedMessages:
     def keep(self, session: str, packet: Packet, *, frame: bool, own: bool = False) -> bool:
         """Keep a packet of a session that is not tracked here; False where it is to be tracked here at once.
 
-        Those that were received to be tracked here (`own`) are kept until somebody asks for them, and are told of when
+        Those that were received to be tracked here (`own`) are kept until somebody asks for them, and are reported when
         they are dropped.
         """
         if self._holds(session) and session not in self._buffers:

@@ -238,7 +238,7 @@ def _counted(  # noqa: PLR0913 - all keywords, each a count
 ) -> FrameCounts:
     """Return the counts with one more frame."""
     before, frame_id = state.counts, entry.frame_id
-    # In a session of several sensors each has its epochs; how one follows another is told by the frames before.
+    # In a session of several sensors each has its epochs; how one follows another follows from the frames before.
     succeeds = bool(frame_id.sensor) and state.sensor(frame_id.sensor).cursor.epoch not in {None, frame_id.epoch}
     return FrameCounts(
         frames=before.frames + tracked,

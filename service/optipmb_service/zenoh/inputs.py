@@ -1,6 +1,6 @@
 """What a member receives: subscriptions that come and go, of single streams or of all, by topic.
 
-A subscription is told by its topic and its key. However many there are, the samples of a topic are handed over one
+A subscription is known by its topic and its key. However many there are, the samples of a topic are handed over one
 after the other, in their order, on the thread of the network that brings them: a queue and a thread in between would
 cost each message two more changes of the thread. When the subscription of a stream takes over from that of all
 streams, or the other way round, nothing is missing in between, and what comes twice is the newest message at most: that
@@ -53,7 +53,7 @@ class Topic:
         name: of the topic, for the log.
         session: to subscribe on.
         receive: called for each sample, one after the other; the thread of the network is not to be kept waiting.
-        answered: told the key of a publisher when all has been handed over that its cache held.
+        answered: called with the key of a publisher when all has been handed over that its cache held.
     """
 
     def __init__(

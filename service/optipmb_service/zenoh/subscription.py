@@ -82,7 +82,7 @@ def ask_cache(
 ) -> None:
     """Ask publishers' caches for what they hold: `reply` is called with each message, and `end` when no more comes.
 
-    `end` is told whether all have answered, within `ANSWER_S`. In a closed session nobody does.
+    `end` is called with whether all have answered, within `ANSWER_S`. In a closed session nobody does.
     """
     errors = []
 

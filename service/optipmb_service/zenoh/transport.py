@@ -94,10 +94,10 @@ class Transport:
         Args:
             on_frame: takes detections.
             on_cloud: takes clouds.
-            noticed: told of detections that come by a subscription to all, by key and whether they can be recovered;
+            noticed: called for detections that come by a subscription to all, by key and whether they can be recovered;
                 where that is `discovery`, those alone are handed over for which it returns True.
-            passed_by: told the keys and sizes of the others.
-            answered: told a key when all detections have been handed over that a publisher's cache held.
+            passed_by: called with the keys and sizes of the others.
+            answered: called with a key when all detections have been handed over that a publisher's cache held.
         """
 
         def discover(sample: zenoh.Sample) -> None:
@@ -332,28 +332,30 @@ class Transport:
         """Send a problem on its stream's key; one without a stream has no key and is not sent."""
         publish_problem(self._session, self._keys, problem)
 
-    def watch_owners(self, told: Callable[[str, str, bool], None] | None) -> None:
+    def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
         """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more.
 
         Raises:
             TransportError: the session is closed.
         """
         self._readers.end("owners")
-        if told is not None:
+        if on_owner is not None:
             self._watch(
                 "owners",
                 self._keys.all_owners(),
-                lambda key, present: told(self._keys.stream_of(key), self._keys.instance_of(key), present),
+                lambda key, present: on_owner(self._keys.stream_of(key), self._keys.instance_of(key), present),
             )
 
-    def _watch(self, name: str, pattern: str, told: Callable[[str, bool], None]) -> None:
+    def _watch(self, name: str, pattern: str, on_token: Callable[[str, bool], None]) -> None:
         """Tell of the tokens of a pattern, those that are there and those that come and go."""
         channel: Channel[zenoh.Sample] = Channel(CHANNEL)
         try:
             tokens = self._session.liveliness().declare_subscriber(pattern, channel.handler, history=True)
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
-        self._readers.add(name, tokens, channel, lambda one: told(str(one.key_expr), one.kind == zenoh.SampleKind.PUT))
+        self._readers.add(
+            name, tokens, channel, lambda one: on_token(str(one.key_expr), one.kind == zenoh.SampleKind.PUT)
+        )
 
     # The end
 

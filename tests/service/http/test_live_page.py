@@ -270,7 +270,7 @@ def test_viewers_that_come_together_are_counted_one_by_one(watched: Watched, add
     watched.wait_taps(0)
 
 
-def test_wrong_streams_and_a_service_that_starts_are_told(watched: Watched, address: str) -> None:
+def test_wrong_streams_and_a_service_that_starts_are_shown(watched: Watched, address: str) -> None:
     """No stream name: 400; not ready: the state alone."""
     for stream in ("", "a/b", "a/b/*", "a/b/c/d", "../../x"):
         assert get(address, f"/live?stream={stream}")[0] == http.client.BAD_REQUEST

@@ -118,7 +118,7 @@ class Holding:
 def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
     """Return the intake of a member that holds some partitions and tracks nothing yet."""
     registry = SimpleNamespace(
-        told_owners=lambda: None,
+        on_owner=lambda: None,
         instance="m",
         keys=KEYS,
         fusion=Fusion(),

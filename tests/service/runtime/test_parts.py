@@ -180,7 +180,7 @@ def problem(stream: str = "a/b/c", code: str = "late", count: int = 1) -> Proble
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, SECOND)), max_size=80))
-def test_no_problem_is_lost_and_few_are_told(steps: list[tuple[int, int]]) -> None:
+def test_no_problem_is_lost_and_few_are_published(steps: list[tuple[int, int]]) -> None:
     """Counts on the key and in the log add up to what was reported, each kind at most once a second, once in ten."""
     one, published, logged = reporter()
     now, last = 0, dict[str, int]()

@@ -64,7 +64,7 @@ def test_nothing_in_the_output_is_ever_nan(seed: int, weight: float, scale: floa
         assert np.isfinite(column).all(), name
 
 
-def test_a_covariance_that_no_message_can_carry_is_not_told() -> None:
+def test_a_covariance_that_no_message_can_carry_is_not_published() -> None:
     """Standard deviations of a million in all that moves a car grow beyond any bound: quarantine, which says why."""
     one = Session(SENSOR.stream, NUSCENES)
     feed(one, range(4), SENSOR, score=np.array([0.9, 0.2, 0.05]))
@@ -121,7 +121,7 @@ def test_a_message_that_is_made_without_its_checks_would_pass_them(data: st.Data
 
 @pytest.mark.parametrize("value", [1e12, 1.1e12, 1e31, 1e39, np.inf, np.nan])
 @pytest.mark.parametrize("entry", ["position", "yaw", "covariance"])
-def test_paths_that_no_message_can_carry_are_not_told(entry: str, value: float) -> None:
+def test_paths_that_no_message_can_carry_are_not_published(entry: str, value: float) -> None:
     """Whatever numbers predicted paths hold: the message is valid, or it is not made and the error names the field."""
     found = tracks_after(4)
     count = len(found.id)

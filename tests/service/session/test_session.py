@@ -102,7 +102,7 @@ def test_duplicates_change_nothing() -> None:
     assert other.counters.duplicates == 4
 
 
-def test_gaps_are_counted_and_told() -> None:
+def test_gaps_are_counted_and_published() -> None:
     """The tracks after lost frames say how many are missing."""
     one = session()
     assert [message.gap for message in tracks(feed(one, [3, 4, 8, 9, 11]))] == [0, 0, 3, 0, 1]
@@ -444,7 +444,7 @@ def test_a_stamp_ahead_ends_no_track() -> None:
     assert (one.counters.refused, one.counters.new_epochs) == (2, 0)
 
 
-def test_a_jump_that_frames_agree_on_is_told() -> None:
+def test_a_jump_that_frames_agree_on_is_reported() -> None:
     """Three frames in a row an hour ahead begin a new session, which is a problem of its own kind."""
     one = session()
     feed(one, range(5))
