@@ -1,10 +1,13 @@
 """Zenoh, and nothing else: the one module of the client that imports it.
 
-Conventions: payloads are bytes, keys are text, times are `time.monotonic_ns()`. Three rules avoid Zenoh's known traps:
+Conventions: payloads are bytes, keys are text, times are `time.monotonic_ns()`. Four rules avoid Zenoh's known traps:
 
-- No callback of ours ever runs on a Zenoh thread. A subscription is a FIFO channel that one daemon thread always drains
-  into an `Inbox`, which drops its oldest entry when its reader is too slow. So a slow program delays nobody, closing
-  never waits for a full channel, and a program that forgets to close still ends.
+- No callback of ours ever runs on a thread of the network. Each subscription has a daemon thread that always drains its
+  channel into an `Inbox`, which drops its oldest entry when its reader is too slow. So a slow program delays nobody,
+  closing never waits for a full channel, and a program that forgets to close still ends.
+- Publishers of the same connection answer on the very thread that subscribes or asks, before the call returns, and with
+  the lock of a cache held. So what they answer must find room: a subscription is drained from before it is declared,
+  and the channel of a query has no bound.
 - Closing goes from the outside in: subscriptions, publishers, session. After that nothing is delivered any more.
 - Implicit shared memory is off: it loses messages without a word when a receiver stalls.
 """
@@ -16,10 +19,11 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self, TypeVar, cast
+from typing import Protocol, Self, TypeAlias, TypeVar, cast
 
 import zenoh
 import zenoh.ext
@@ -31,8 +35,10 @@ from optipmb_client.errors import ConnectionFailed
 __all__ = ["DEFAULT_ENDPOINT", "Answer", "Arrival", "Connection", "Inbox", "Sender", "Subscription"]
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-CHANNEL = 1024  # samples between Zenoh and the draining thread; larger than any publisher's history
+NO_BOUND = 2**31 - 1  # of the replies to a query, in effect: they are all kept anyhow, and its timeout ends them
+CLOSE_S = 5.0  # how long closing waits for what has come to be moved
 _Message = TypeVar("_Message", bound=Message)
+_Result = TypeVar("_Result")
 
 HEARTBEAT_S = 1.0  # how long the loss of a newest message may stay unnoticed, when no other one follows
 WAIT_BEFORE_DROP_US = 50_000  # with the defaults (1 ms) large messages are lost whenever the machine is busy
@@ -56,10 +62,10 @@ class _ZenohMatching(Protocol):
 
 
 class _ZenohSubscriber(Protocol):
-    @property
-    def key_expr(self) -> zenoh.KeyExpr: ...
     def undeclare(self) -> object: ...
-    def __iter__(self) -> Iterator[zenoh.Sample]: ...
+
+
+_Handler: TypeAlias = "tuple[zenoh.handlers.Callback[zenoh.Sample], None]"  # the class cannot be subscripted
 
 
 class _ZenohSession(Protocol):
@@ -182,28 +188,34 @@ class Sender:
 
 
 class Subscription:
-    """A key expression whose samples a thread of its own moves into an inbox.
+    """Samples that a thread moves into an inbox.
 
     Args:
-        subscriber: Where samples come from.
-        inbox: Where they go.
+        declare: Declares the subscriber with the handler that it is given.
+        inbox: Where samples go.
         session: For the caches of publishers that were there before the subscription.
     """
 
-    def __init__(self, subscriber: _ZenohSubscriber, inbox: Inbox, session: zenoh.Session) -> None:
-        self._subscriber = subscriber
+    def __init__(self, declare: Callable[[_Handler], _ZenohSubscriber], inbox: Inbox, session: zenoh.Session) -> None:
         self._inbox = inbox
         self._session = session
         self._queries: CacheQueries[zenoh.Sample] = CacheQueries(self._ask)
         self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._receive, self._queries.ask)
-        self._thread = threading.Thread(target=self._drain, name=f"drain {subscriber.key_expr}", daemon=True)
-        self._thread.start()
+        self._draining: threading.Thread | None = None
+        self._drained = threading.Event()
+        # Zenoh calls back on a Python thread that it starts for the handler, before it declares anything. It is a pair:
+        # with a callback alone the subscription would go on until the session is closed.
+        handler = zenoh.handlers.Callback(self._take, self._end), None
+        self._subscriber = _on_a_daemon_thread(lambda: declare(handler))
 
-    def _drain(self) -> None:
-        with contextlib.suppress(zenoh.ZError):  # the channel ends with an error when its session goes first
-            for sample in self._subscriber:
-                if sample.kind == zenoh.SampleKind.PUT:
-                    self._late_join.take(sample)
+    def _take(self, sample: zenoh.Sample) -> None:
+        self._draining = threading.current_thread()
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._late_join.take(sample)
+
+    def _end(self) -> None:
+        self._draining = threading.current_thread()
+        self._drained.set()
 
     def _receive(self, sample: zenoh.Sample) -> None:
         arrived = time.monotonic_ns()
@@ -233,16 +245,32 @@ class Subscription:
     @property
     def alive(self) -> bool:
         """Whether something may still come into the inbox."""
-        return self._thread.is_alive()
+        return not self._drained.is_set()
 
     def close(self) -> None:
         """End the subscription; what is in the inbox stays readable."""
         with contextlib.suppress(zenoh.ZError):
             self._subscriber.undeclare()
-        if self._thread is not threading.current_thread():  # which ends what a program forgot to close
-            self._thread.join(timeout=5.0)
+        if self._draining is not threading.current_thread():  # which ends what a program forgot to close
+            self._drained.wait(CLOSE_S)
+            if (draining := self._draining) is not None:
+                draining.join(CLOSE_S)
         self._queries.close()
         self._late_join.close()
+
+
+def _on_a_daemon_thread(work: Callable[[], _Result]) -> _Result:
+    """Do something on a daemon thread: threads that it starts are daemons, too, and keep no program from ending."""
+    done: Future[_Result] = Future()
+
+    def do() -> None:
+        try:
+            done.set_result(work())
+        except BaseException as error:  # noqa: BLE001  raised where the result is waited for
+            done.set_exception(error)
+
+    threading.Thread(target=do, name="declare", daemon=True).start()
+    return done.result()
 
 
 class Subscriptions:
@@ -361,15 +389,18 @@ class Connection:
         What those caches hold from before the subscription comes first. (Recovery would bring it anyhow, at the first
         heartbeat of a publisher: for it a late subscriber is one that has lost everything so far.)
         """
-        with _usable():
-            subscriber = zenoh.ext.declare_advanced_subscriber(
+
+        def declare(handler: _Handler) -> _ZenohSubscriber:
+            return zenoh.ext.declare_advanced_subscriber(
                 self._session,
                 pattern,
-                zenoh.handlers.FifoChannel(CHANNEL),
+                handler,
                 history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
                 recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
             )
-        return self._keep(Subscription(subscriber, inbox, self._session))
+
+        with _usable():
+            return self._keep(Subscription(declare, inbox, self._session))
 
     def senders(self, stream: str, *, prefix: str, cache: int, cache_clouds: int) -> tuple[Sender, Sender]:
         """Open what sends the detections and the clouds of a stream, each keeping the newest for recovery."""
@@ -390,6 +421,7 @@ class Connection:
         with _usable():
             replies = self._session.get(
                 key,
+                zenoh.handlers.FifoChannel(NO_BOUND),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,  # the default keeps one reply per key: of two services one
                 timeout=timeout,
@@ -407,7 +439,7 @@ class Connection:
     def alive(self, pattern: str, *, timeout: float = 2.0) -> tuple[str, ...]:
         """Keys of the liveliness tokens under `pattern`, sorted."""
         with _usable():
-            replies = self._session.liveliness().get(pattern, timeout=timeout)
+            replies = self._session.liveliness().get(pattern, zenoh.handlers.FifoChannel(NO_BOUND), timeout=timeout)
             return tuple(sorted({str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None}))
 
     def _keep(self, opened: _Opened) -> _Opened:

@@ -96,8 +96,10 @@ def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(endpoint
         small = sender.cached_sender("a/small", "zenoh/bytes", cache=1000)
         for number in range(5):
             small.put(b"%d" % number)
-        plain = receiver._session.declare_subscriber("a/*", zenoh.handlers.FifoChannel(1000))  # asks no cache itself
-        subscription = Subscription(plain, inbox, receiver._session)
+        session = receiver._session
+        subscription = Subscription(  # a plain one, which asks no cache itself
+            lambda handler: session.declare_subscriber("a/*", handler), inbox, session
+        )
         sent, deadline = 5, time.monotonic() + 60.0
         while not inbox.pending and time.monotonic() < deadline:
             small.put(b"%d" % sent)
