@@ -12,7 +12,8 @@ HANGS_S = 60.0
 
 SETTING = """
 import sys
-from optipmb_client.transport import Connection, Inbox
+from optipmb_client.incoming import Inbox
+from optipmb_client.zenoh import Connection
 connection, inbox = Connection(sys.argv[1]), Inbox(10_000)
 """
 
