@@ -9,7 +9,7 @@ from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused,
 from optipmb_client.history import kept_tracks
 from optipmb_client.publisher import Publisher
 from optipmb_client.subscriber import Received, Statistics, Subscriber
-from optipmb_client.transport import DEFAULT_ENDPOINT, Connection
+from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 
 __all__ = [
     "DEFAULT_ENDPOINT",

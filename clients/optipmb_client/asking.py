@@ -8,7 +8,8 @@ from typing import Final, Self
 from optipmb_schemas import PREFIX, Keys
 
 from optipmb_client.errors import ConnectionFailed
-from optipmb_client.transport import Arrival, Connection, Inbox
+from optipmb_client.incoming import Arrival, Inbox
+from optipmb_client.zenoh import Connection
 
 __all__ = ["DensityAsker"]
 

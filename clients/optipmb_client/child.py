@@ -20,7 +20,7 @@ from typing import Self
 
 from optipmb_client.errors import ConnectionFailed, ServiceUnavailable
 from optipmb_client.sessions import find_services
-from optipmb_client.transport import Connection
+from optipmb_client.zenoh import Connection
 
 __all__ = ["ServiceProcess"]
 

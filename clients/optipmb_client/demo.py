@@ -11,7 +11,7 @@ from optipmb_client.errors import ClientError
 from optipmb_client.evaluation import ClearResult, combine, default_rules, evaluate_files
 from optipmb_client.recording import Preloaded
 from optipmb_client.replay import Pace, ReplayedSequence, replay
-from optipmb_client.transport import Connection
+from optipmb_client.zenoh import Connection
 
 __all__ = ["Demonstration", "demonstrate"]
 

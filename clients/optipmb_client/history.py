@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from optipmb_schemas import PREFIX, Keys, Problem, Tracks, TracksRequest, decode, encode, encoding_of
 
 from optipmb_client.errors import ServiceRefused, ServiceUnavailable
-from optipmb_client.transport import Connection
+from optipmb_client.zenoh import Connection
 
 __all__ = ["kept_tracks"]
 

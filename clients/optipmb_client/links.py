@@ -7,7 +7,8 @@ from typing import Protocol
 from optipmb_schemas import Message
 
 from optipmb_client.errors import ClientError, ConnectionFailed
-from optipmb_client.transport import Answer, Connection, Inbox
+from optipmb_client.incoming import Answer, Inbox
+from optipmb_client.zenoh import Connection
 
 __all__ = ["GRPC", "Link", "SendsMessages", "Subscribed", "linked"]
 

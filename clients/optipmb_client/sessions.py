@@ -20,8 +20,9 @@ from optipmb_schemas import (
 )
 
 from optipmb_client.errors import ServiceRefused, ServiceUnavailable, UsageError
+from optipmb_client.incoming import Answer
 from optipmb_client.links import Link
-from optipmb_client.transport import Answer, Connection
+from optipmb_client.zenoh import Connection
 
 __all__ = [
     "close_session",

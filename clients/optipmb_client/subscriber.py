@@ -12,9 +12,9 @@ from typing import Self
 
 from optipmb_schemas import PREFIX, Keys, MessageError, Problem, Tracks
 
+from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.links import Link, linked
 from optipmb_client.merging import Merging, Novelty
-from optipmb_client.transport import Arrival, Inbox
 
 __all__ = ["Received", "Statistics", "Subscriber"]
 

@@ -14,7 +14,7 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_client import Connection, ConnectionFailed, Publisher, Subscriber
-from optipmb_client.transport import Inbox
+from optipmb_client.incoming import Inbox
 from optipmb_schemas import Detections, Message, MessageError, Points, Problem, Tracks, decode, encode, encoding_of
 from routers import free_endpoint, open_client
 from without_numpy import command, publish_everything

@@ -38,9 +38,10 @@ def test_the_tracker_is_imported_for_offline_tracking_alone() -> None:
     assert offline == {"dumps.py", "offline.py", "smoothing.py", "tracking.py"}
 
 
-def test_zenoh_is_imported_in_one_module() -> None:
-    """Only transport.py imports zenoh."""
-    assert importers("zenoh") == {"transport.py"}
+def test_zenoh_is_imported_in_one_folder() -> None:
+    """Only modules of the folder zenoh/ import zenoh."""
+    modules = {f"zenoh/{name}.py" for name in ("configuration", "connection", "sender", "subscription")}
+    assert importers("zenoh") == modules
 
 
 def test_the_node_distribution_has_what_it_imports() -> None:

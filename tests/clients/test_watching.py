@@ -15,8 +15,8 @@ from commands import start
 from optipmb_client.asking import DensityAsker
 from optipmb_client.cli import run
 from optipmb_client.colours import COLOURS, colour_of, rgb_of
+from optipmb_client.incoming import Answer, Inbox
 from optipmb_client.mcap_files.writing import RecordingWriter
-from optipmb_client.transport import Answer, Inbox
 from optipmb_client.watching import LEGEND, View
 from optipmb_schemas import Density, Detections, Keys, Points, Pose, Tracks, encode, encoding_of
 from routers import free_endpoint

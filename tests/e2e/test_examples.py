@@ -11,7 +11,7 @@ from typing import IO
 import pytest
 from optipmb_client import Publisher
 from optipmb_client.child import ServiceProcess
-from optipmb_client.transport import DEFAULT_ENDPOINT
+from optipmb_client.zenoh import DEFAULT_ENDPOINT
 from real_data import REPOSITORY
 from without_numpy import command
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 from fleet import Fleet
 from optipmb_client import Connection
-from optipmb_client.transport import Inbox
+from optipmb_client.incoming import Inbox
 from real_data import kitti_root
 from recorded import KEYS, Replay, kitti, undisturbed
 

@@ -21,7 +21,7 @@ import optipmb
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from optipmb_client.transport import Connection
+    from optipmb_client.zenoh import Connection
 
 KEYS = Keys()
 WINDOW = 8

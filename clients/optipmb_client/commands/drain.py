@@ -7,7 +7,7 @@ from optipmb_schemas import PREFIX
 
 from optipmb_client.commands.options import AsJson, Config, Connect, Prefix, print_json, say
 from optipmb_client.sessions import drain_service, only_service
-from optipmb_client.transport import Connection
+from optipmb_client.zenoh import Connection
 
 
 def drain(

@@ -25,7 +25,7 @@ from optipmb_client.commands.options import (
 from optipmb_client.errors import UsageError
 from optipmb_client.load import Frames, Load, Run, draw_runs, find_limit, generated, recorded, run_load, table_of
 from optipmb_client.progress import FrameProgress
-from optipmb_client.transport import Connection
+from optipmb_client.zenoh import Connection
 
 
 def load(  # noqa: PLR0913  these are the command's options

@@ -18,7 +18,7 @@ from optipmb_client.bulk import Executor, executor_for
 from optipmb_client.columns import parts
 from optipmb_client.datasets import DATASETS, DataSequence, Dataset, DatasetArguments, dataset_at
 from optipmb_client.errors import ClientError, UsageError
-from optipmb_client.transport import DEFAULT_ENDPOINT
+from optipmb_client.zenoh import DEFAULT_ENDPOINT
 
 __all__ = [
     "MANY",

@@ -28,7 +28,7 @@ from optipmb_client.datasets import open_dataset
 from optipmb_client.progress import FrameProgress
 from optipmb_client.recording import Results
 from optipmb_client.replay import Pace
-from optipmb_client.transport import Connection
+from optipmb_client.zenoh import Connection
 
 if TYPE_CHECKING:
     from optipmb_client.mcap_files.play import PlayedStream

@@ -14,7 +14,7 @@ from optipmb_schemas import PREFIX
 from optipmb_client.commands.options import AsJson, Config, Connect, Prefix, mcap_needed, print_json, say
 from optipmb_client.errors import UsageError
 from optipmb_client.progress import StatusLine
-from optipmb_client.transport import Connection
+from optipmb_client.zenoh import Connection
 
 if TYPE_CHECKING:
     from optipmb_client.mcap_files.record import Recording

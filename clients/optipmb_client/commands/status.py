@@ -15,7 +15,7 @@ from optipmb_client.commands.options import AsJson, Config, Connect, Prefix, pri
 from optipmb_client.errors import ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
 from optipmb_client.sessions import find_services
 from optipmb_client.status import render
-from optipmb_client.transport import Connection
+from optipmb_client.zenoh import Connection
 
 
 def status(

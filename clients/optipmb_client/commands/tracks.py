@@ -14,7 +14,7 @@ from optipmb_client.history import kept_tracks
 from optipmb_client.results.table import TrackColumns
 from optipmb_client.sessions import session_state
 from optipmb_client.table_files import is_table, write_table
-from optipmb_client.transport import Connection
+from optipmb_client.zenoh import Connection
 
 SECOND = 1_000_000_000
 

@@ -28,7 +28,8 @@ from optipmb_client.commands.options import Config, Connect, Prefix, mcap_needed
 from optipmb_client.commands.replay import speed_of
 from optipmb_client.errors import UsageError
 from optipmb_client.extras import needed
-from optipmb_client.transport import Connection, Inbox
+from optipmb_client.incoming import Inbox
+from optipmb_client.zenoh import Connection
 
 if TYPE_CHECKING:
     from rerun import RecordingStream

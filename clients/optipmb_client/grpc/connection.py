@@ -24,7 +24,7 @@ from optipmb_client.errors import ClientError
 from optipmb_client.grpc.channels import Channels, from_gateway, lasting
 from optipmb_client.grpc.publishing import GrpcSender, Publishing
 from optipmb_client.grpc.subscribing import GrpcSubscription
-from optipmb_client.transport import Answer, Inbox
+from optipmb_client.incoming import Answer, Inbox
 
 __all__ = ["GrpcConnection"]
 

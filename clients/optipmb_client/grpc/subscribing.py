@@ -12,7 +12,7 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_client.errors import ClientError, ConnectionFailed
 from optipmb_client.grpc.channels import FIRST_PAUSE_S, LONGEST_PAUSE_S, Channels, lasting, refused
-from optipmb_client.transport import Arrival, Inbox
+from optipmb_client.incoming import Arrival, Inbox
 
 __all__ = ["GrpcSubscription"]
 

@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from optipmb_schemas import PREFIX, Detections, Keys, Points, SessionParameters, encoding_of
 
 from optipmb_client.errors import ServiceRefused, ServiceUnavailable
+from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.load.material import FIRST, Frames, chain, head, message
 from optipmb_client.sessions import close_session, set_parameters
-from optipmb_client.transport import Arrival, Connection, Inbox, Sender
+from optipmb_client.zenoh import Connection
+from optipmb_client.zenoh.sender import Sender
 
 __all__ = ["STAGES", "Load", "Run", "run_load"]
 

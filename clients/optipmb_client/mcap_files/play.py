@@ -21,7 +21,8 @@ from optipmb_client.recording import Latency, latency
 from optipmb_client.replay import CLOUD_WAIT_S, KEPT_PROBLEMS, POINTS_WANTED_S, STRAGGLERS_S, TICK_S, Pace
 from optipmb_client.sessions import close_session, session_state, set_parameters
 from optipmb_client.subscriber import Subscriber
-from optipmb_client.transport import Connection, Sender
+from optipmb_client.zenoh import Connection
+from optipmb_client.zenoh.sender import Sender
 
 __all__ = ["PlayedStream", "choose", "play"]
 

@@ -15,9 +15,10 @@ from pathlib import Path
 from optipmb_schemas import PREFIX, Keys, MessageError, SessionParameters, Topic, Tracks, encode, encoding_of
 
 from optipmb_client.errors import ClientError
+from optipmb_client.incoming import Inbox
 from optipmb_client.mcap_files.writing import RecordingWriter
 from optipmb_client.sessions import set_parameters
-from optipmb_client.transport import Connection, Inbox
+from optipmb_client.zenoh import Connection
 
 __all__ = ["Recording", "record"]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import zenoh
 import zenoh.ext
-from optipmb_client.transport import Sender
+from optipmb_client.zenoh.sender import Sender
 from optipmb_schemas import Detections
 from optipmb_service.zenoh.handles import Publisher, cached_publisher, directly
 

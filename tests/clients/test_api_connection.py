@@ -1,4 +1,4 @@
-"""The transport against a real router in the same process."""
+"""Connections and what is opened on them, against a real router in the same process."""
 
 import re
 import subprocess
@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterable
 
 import pytest
 import zenoh
-from optipmb_client import transport
 from optipmb_client.errors import ConnectionFailed
-from optipmb_client.transport import DEFAULT_ENDPOINT, Arrival, Connection, Inbox, Subscription
+from optipmb_client.incoming import Arrival, Inbox
+from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection, configuration
+from optipmb_client.zenoh.subscription import Subscription
 from routers import free_endpoint, open_client, open_router
 
 
@@ -54,8 +55,8 @@ def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:
 def test_what_is_sent_just_before_closing_arrives(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Closing a connection flushes: the last small and the last large message are both received."""
     # A large message that finds no room within half a second is dropped, whether or not the connection closes.
-    monkeypatch.setattr(transport, "WAIT_BEFORE_DROP_US", 30_000_000)
-    monkeypatch.setattr(transport, "WAIT_BEFORE_DROP_FRAGMENTS_US", 30_000_000)
+    monkeypatch.setattr(configuration, "WAIT_BEFORE_DROP_US", 30_000_000)
+    monkeypatch.setattr(configuration, "WAIT_BEFORE_DROP_FRAGMENTS_US", 30_000_000)
     inbox = Inbox(10)
     with Connection(endpoint) as receiver:
         receiver.subscribe("a/*", inbox)
@@ -96,8 +97,10 @@ def test_what_a_publisher_sent_before_its_first_sample_came_is_not_lost(endpoint
         small = sender.cached_sender("a/small", "zenoh/bytes", cache=1000)
         for number in range(5):
             small.put(b"%d" % number)
-        plain = receiver._session.declare_subscriber("a/*", zenoh.handlers.FifoChannel(1000))  # asks no cache itself
-        subscription = Subscription(plain, inbox, receiver._session)
+        session = receiver._session
+        subscription = Subscription(  # a plain one, which asks no cache itself
+            lambda handler: session.declare_subscriber("a/*", handler), inbox, session
+        )
         sent, deadline = 5, time.monotonic() + 60.0
         while not inbox.pending and time.monotonic() < deadline:
             small.put(b"%d" % sent)
@@ -234,7 +237,8 @@ def answer_with(questions: Iterable[zenoh.Query], text: bytes) -> None:
 
 FORGETFUL = """
 import sys
-from optipmb_client.transport import Connection, Inbox
+from optipmb_client.incoming import Inbox
+from optipmb_client.zenoh import Connection
 connection = Connection(sys.argv[1])
 connection.subscribe("a/*", Inbox(10))
 connection.cached_sender("a/b", "zenoh/bytes", cache=10).put(b"last words")

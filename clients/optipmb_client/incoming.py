@@ -1,0 +1,89 @@
+"""What comes in over a connection, by Zenoh or gRPC: messages, the queue that a program reads them from, and answers.
+
+Payloads are bytes, keys are text, times are `time.monotonic_ns()`.
+"""
+
+import collections
+import threading
+from dataclasses import dataclass
+from typing import TypeVar
+
+from optipmb_schemas import Message, decode
+
+__all__ = ["Answer", "Arrival", "Inbox"]
+
+_Message = TypeVar("_Message", bound=Message)
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A message as it came in: key, payload, Zenoh encoding, and the monotonic time of its arrival in nanoseconds."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    monotonic_ns: int
+
+    def read(self, kind: type[_Message]) -> _Message:
+        """Return the message, checked.
+
+        Raises:
+            MessageError: it is not valid.
+        """
+        return decode(self.payload, kind, encoding=self.encoding)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A reply to a query; `ok` is False for an error reply, whose payload then says why."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    ok: bool
+
+
+class Inbox:
+    """A bounded queue from the draining thread to one reader; when it is full the oldest entry goes, and is counted."""
+
+    def __init__(self, capacity: int) -> None:
+        self._entries: collections.deque[Arrival] = collections.deque()
+        self._capacity = capacity
+        self._changed = threading.Condition()
+        self._closed = False
+        self.dropped = 0
+
+    @property
+    def pending(self) -> int:
+        """Entries waiting to be read."""
+        return len(self._entries)
+
+    def put(self, arrival: Arrival) -> None:
+        """Append an entry; never waits. After `close` it does nothing."""
+        with self._changed:
+            if self._closed:
+                return
+            if len(self._entries) >= self._capacity:
+                self._entries.popleft()
+                self.dropped += 1
+            self._entries.append(arrival)
+            self._changed.notify()
+
+    def get(self, timeout: float | None = None) -> Arrival | None:
+        """Take the oldest entry, waiting up to `timeout` seconds (None: for ever); None when there is none."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._entries or self._closed, timeout)
+            if not self._entries:
+                return None
+            return self._entries.popleft()
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing will come any more (what is there can still be read)."""
+        return self._closed
+
+    def close(self) -> None:
+        """Wake the reader for good."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()

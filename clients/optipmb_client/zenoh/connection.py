@@ -1,0 +1,164 @@
+"""A Zenoh session: what is opened on it, what is asked over it, and how all of it is closed."""
+
+import contextlib
+import weakref
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self, TypeVar
+
+import zenoh
+from optipmb_schemas import Detections, Keys, Points, Topic, encoding_of
+
+from optipmb_client.errors import ConnectionFailed
+from optipmb_client.incoming import Answer, Inbox
+from optipmb_client.zenoh.configuration import DEFAULT_ENDPOINT, configuration
+from optipmb_client.zenoh.sender import Sender, cached_sender, plain_sender
+from optipmb_client.zenoh.subscription import Subscription, Subscriptions, subscribe
+
+__all__ = ["Connection"]
+
+NO_BOUND = 2**31 - 1  # of the replies to a query, in effect: they are all kept anyhow, and its timeout ends them
+
+_Opened = TypeVar("_Opened", Sender, Subscription)
+
+
+class _ZenohSession(Protocol):
+    def close(self) -> object: ...
+
+
+class Connection:
+    """A Zenoh session. Publishers and subscribers may share one; whoever opens it closes it.
+
+    Args:
+        connect: Endpoint or endpoints of routers (or of a service with its own router), such as ``tcp/10.0.0.1:7447``;
+            the session is then a client of them. Default: ``tcp/127.0.0.1:7447``, unless `config` is given.
+        config: A Zenoh configuration file (JSON5), for TLS, user names and everything else; its endpoints hold unless
+            `connect` is given too.
+        timeout: Seconds to wait for a router.
+
+    Raises:
+        ConnectionFailed: Within `timeout`, when no router is reachable or an endpoint or the file is unusable.
+    """
+
+    def __init__(
+        self,
+        connect: str | Sequence[str] | None = None,
+        *,
+        config: str | Path | None = None,
+        timeout: float = 5.0,
+    ) -> None:
+        endpoints = (connect,) if isinstance(connect, str) else tuple(connect or ())
+        if not endpoints and config is None:
+            endpoints = (DEFAULT_ENDPOINT,)
+        self.where = ", ".join(endpoints) or str(config)  # for people
+        settings = configuration(endpoints, config, timeout)
+        try:
+            self._session = zenoh.open(settings)
+        except zenoh.ZError as error:
+            raise ConnectionFailed(
+                f"nothing answers at {self.where} (waited {timeout:g} s); is optipmb-service running there?",
+                endpoints=endpoints,
+                timeout=timeout,
+            ) from error
+        self._opened: weakref.WeakSet[Sender | Subscription] = weakref.WeakSet()
+        # For programs that forget to close: messages that still stand in a batch would be lost at their end, and a
+        # draining thread that wakes after the interpreter has ended would abort the process.
+        self._finalizer = weakref.finalize(self, _close_all, self._opened, self._session)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close everything opened on this connection, then the session. May be called twice."""
+        self._finalizer()
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` has been called."""
+        return self._session.is_closed()
+
+    def cached_sender(self, key: str, encoding: str, *, cache: int) -> Sender:
+        """Open a publisher for small messages that must not get lost: it keeps the newest `cache` for recovery."""
+        with _usable():
+            return self._keep(cached_sender(self._session, key, encoding, cache))
+
+    def plain_sender(self, key: str, encoding: str, *, cache: int = 0) -> Sender:
+        """Open a publisher for large messages: lower priority than the small ones; with `cache` it keeps the newest."""
+        with _usable():
+            return self._keep(plain_sender(self._session, key, encoding, cache))
+
+    def subscribe(self, pattern: str, inbox: Inbox) -> Subscription:
+        """Move all that is published under `pattern` into `inbox`; losses are recovered from the publishers' caches.
+
+        What those caches hold from before the subscription comes first. (Recovery would bring it anyhow, at the first
+        heartbeat of a publisher: for it a late subscriber is one that has lost everything so far.)
+        """
+        with _usable():
+            return self._keep(subscribe(self._session, pattern, inbox))
+
+    def senders(self, stream: str, *, prefix: str, cache: int, cache_clouds: int) -> tuple[Sender, Sender]:
+        """Open what sends the detections and the clouds of a stream, each keeping the newest for recovery."""
+        keys = Keys(prefix)
+        return (
+            self.cached_sender(keys.detections(stream), encoding_of(Detections), cache=cache),
+            self.plain_sender(keys.points(stream), encoding_of(Points), cache=cache_clouds),
+        )
+
+    def subscribe_tracks(self, pattern: str, inbox: Inbox, *, prefix: str, problems: bool) -> Subscriptions:
+        """Move the tracks of a pattern into an inbox, its problems too where that is asked for."""
+        topics: tuple[Topic, ...] = ("tracks", "problems") if problems else ("tracks",)
+        return Subscriptions([self.subscribe(Keys(prefix).matching(pattern, topic), inbox) for topic in topics])
+
+    def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:
+        """Ask everybody who answers at `key`; an empty result means that nobody did within `timeout` seconds."""
+        answers = []
+        with _usable():
+            replies = self._session.get(
+                key,
+                zenoh.handlers.FifoChannel(NO_BOUND),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,  # the default keeps one reply per key: of two services one
+                timeout=timeout,
+                payload=payload or None,
+                encoding=encoding or None,
+            )
+            for reply in replies:
+                if (sample := reply.ok) is not None:
+                    text = str(sample.encoding)
+                    answers.append(Answer(str(sample.key_expr), sample.payload.to_bytes(), text, ok=True))
+                elif (error := reply.err) is not None and (said := error.payload.to_bytes()) != b"Timeout":
+                    answers.append(Answer(key, said, str(error.encoding), ok=False))
+        return tuple(answers)
+
+    def alive(self, pattern: str, *, timeout: float = 2.0) -> tuple[str, ...]:
+        """Keys of the liveliness tokens under `pattern`, sorted."""
+        with _usable():
+            replies = self._session.liveliness().get(pattern, zenoh.handlers.FifoChannel(NO_BOUND), timeout=timeout)
+            return tuple(sorted({str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None}))
+
+    def _keep(self, opened: _Opened) -> _Opened:
+        self._opened.add(opened)
+        return opened
+
+
+@contextlib.contextmanager
+def _usable() -> Iterator[None]:
+    """Turn Zenoh's error for whatever cannot be done on a session into ours."""
+    try:
+        yield
+    except zenoh.ZError as error:
+        reason = str(error).partition(" at /")[0]  # what follows is a place in Zenoh's own source
+        raise ConnectionFailed(f"the connection cannot be used: {reason}") from error
+
+
+def _close_all(opened: weakref.WeakSet[Sender | Subscription], session: _ZenohSession) -> None:
+    for one in tuple(opened):
+        one.close()
+    with contextlib.suppress(zenoh.ZError):
+        session.close()
