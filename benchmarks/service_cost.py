@@ -23,9 +23,9 @@ from statistics import median
 from typing import TYPE_CHECKING, Final
 
 from optipmb_client import Connection
+from optipmb_client.incoming import Inbox
 from optipmb_client.load import generated
 from optipmb_client.load.material import FIRST, chain, head, message
-from optipmb_client.transport import Inbox
 from optipmb_schemas import Detections, Keys, Points, encoding_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
@@ -33,8 +33,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"
 from service_process import ServiceProcess
 
 if TYPE_CHECKING:
+    from optipmb_client.incoming import Arrival
     from optipmb_client.load.material import Frames
-    from optipmb_client.transport import Arrival
 
 HERE: Final = Path(__file__).resolve().parents[1]
 STREAMS: Final = 40
