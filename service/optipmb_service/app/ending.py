@@ -6,6 +6,8 @@ nothing that kills it. So a bound runs from the moment when the end begins, besi
 - A thread waits for most of it, logs where every thread is, and ends the process with status 1.
 - What hangs with the interpreter's lock held lets no other Python run. For that case a thread of `faulthandler`,
   which needs no lock, does the same at the end of the bound, with tracebacks in place of the log line.
+
+A step that may hang before the last checkpoints are written is done on a thread of its own (`Steps`), and left there.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import FrameType
 
 HANDOVER_S: Final = 4.0
@@ -35,6 +38,9 @@ SPARE_S: Final = 1.0
 
 LAST_S: Final = 0.5
 """Of the bound, what is kept for saying what hung."""
+
+STEP_S: Final = 1.0
+"""How long the other steps of an end wait for one that may hang."""
 
 HUNG: Final = 1
 """Exit status of a process in which a step of the end hung."""
@@ -104,6 +110,37 @@ class EndBound:
         saying.start()
         saying.join(0.8 * LAST_S)
         os._exit(HUNG)
+
+
+class Steps:
+    """Steps of an end that may hang, and behind which others must be done."""
+
+    def __init__(self) -> None:
+        self._threads: list[threading.Thread] = []
+
+    def do(self, name: str, step: Callable[[], object]) -> None:
+        """Do a step; one that hangs, or raises, keeps the next ones waiting for `STEP_S` at most."""
+
+        def work() -> None:
+            try:
+                step()
+            except Exception:
+                log.exception("internal_error", step=name)
+
+        thread = threading.Thread(target=work, name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+        thread.join(STEP_S)
+
+    def hang(self, seconds: float) -> bool:
+        """Whether one has not ended after so long, which is logged."""
+        deadline = Deadline(seconds)
+        for thread in self._threads:
+            thread.join(deadline.left())
+        names = [thread.name for thread in self._threads if thread.is_alive()]
+        if names:
+            log.error("step_hangs", steps=names)
+        return bool(names)
 
 
 def leave(status: int) -> None:

@@ -19,7 +19,7 @@ import structlog
 import optipmb
 from optipmb_service import __version__
 from optipmb_service.app.clustering import open_log, open_store
-from optipmb_service.app.ending import CLOSE_S, HANDOVER_S, LAST_S, Deadline
+from optipmb_service.app.ending import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
 from optipmb_service.cluster.member import Member
 from optipmb_service.observability import collectors
 from optipmb_service.observability.metrics import Metrics
@@ -168,13 +168,14 @@ class Service:
         self._state = "stopping"
         grace_s = self._settings.grace_s
         ends = Deadline(min(HANDOVER_S + grace_s + CLOSE_S, seconds - LAST_S))
-        self._transport.leave()
+        steps = Steps()
+        steps.do("leaving", self._transport.leave)
         self._member.drain()
         self._member.drained(max(0.0, ends.left() - grace_s - CLOSE_S))
         self._intake.handed_over(JOIN_S)
         grace = Deadline(grace_s)
         self._intake.close(JOIN_S)
-        self._transport.stop(JOIN_S)
+        steps.do("receiving", partial(self._transport.stop, JOIN_S))
         if not self._persistence.durable:
             self._registry.finish()  # else what waits for its cloud comes again from the publishers' caches
         while self._registry.busy and grace.left():
@@ -186,8 +187,9 @@ class Service:
         self._member.close(ends.left())
         self._missed.close(JOIN_S)
         self._reporter.flush(time.monotonic_ns())
+        hangs = steps.hang(ends.left())
         self._transport.close()
-        return ended
+        return ended and not hangs
 
     @property
     def stuck(self) -> bool:

@@ -79,6 +79,7 @@ EVENTS: Final = {
     "stop_asked": "SIGINT or SIGTERM, or the parent ends its worker; it stops within 8 s + `grace_s`, a parent of"
     " workers within 10 s + `grace_s`.",
     "stop_asked_again": "Another signal, which has no effect.",
+    "step_hangs": "`steps` of the end hang, as in Zenoh; what was to be kept is kept. The exit status is 1.",
     "end_hangs": "The end took too long, and the process was ended with status 1. `threads` is where each thread was,"
     " the innermost call first.",
     "stopped": "The service has stopped; `drained` is false when a step was abandoned.",

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from optipmb_schemas import Keys, SessionState
 from optipmb_service.app.ending import LAST_S, longest_end_s
 from optipmb_service.app.supervisor import WORKERS_S
 from processes import descendants, wait_until_ended
+from router import Node, Sensor
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
 
 HANGING = Path(__file__).parents[2] / "support" / "hanging"
+SENSOR = Sensor()
 GRACE_S = 0.5
 BOUND_S = longest_end_s(GRACE_S)
 BUSY_S = 30.0
@@ -91,3 +95,23 @@ def test_the_lock_of_the_interpreter_keeps_no_process() -> None:
     assert status == 1
     assert seconds < BOUND_S + BUSY_S
     assert "in hang_with_the_lock" in router.errors
+
+
+def test_a_step_that_hangs_before_the_last_checkpoint_does_not_prevent_it(tmp_path: Path) -> None:
+    """A member whose end hangs in its first step keeps the newest state all the same: the next one continues it."""
+    settings = {"STORE": tmp_path, "CHECKPOINT_S": 3600}
+    with ServiceProcess(environment=environment("leave", **settings), fresh=True) as service:
+        service.wait_ready()
+        with Node(service.endpoint) as node:
+            node.send(*(SENSOR.detections(seq) for seq in range(5)))
+            session = node.tracks(SENSOR.stream, 5)[-1].session
+        status, _ = service.end()
+        assert status == 1
+        service.wait_log("step_hangs")
+    with ServiceProcess(environment=environment(**settings, RECOVERY_WAIT_S=0)) as service:
+        service.wait_ready()
+        with Node(service.endpoint) as node:
+            node.send(SENSOR.detections(5))
+            assert node.tracks(SENSOR.stream, 1)[0].session == session
+            assert node.ask(Keys().query(SENSOR.stream, "state"), SessionState).frames == 6
+        assert service.end(signal.SIGTERM)[0] == 0
