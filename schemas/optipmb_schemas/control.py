@@ -115,7 +115,7 @@ class SessionState(Message):
     clouds_used: Count = Field(default=0, description="Frames tracked with their cloud.")
     clouds_missed: Count = Field(default=0, description="Frames that waited for a cloud in vain.")
     repaired: Count = Field(default=0, description="Covariances repaired after a loss of rank by rounding.")
-    clouds_refused: Count = Field(default=0, description="Points messages that were not valid.")
+    clouds_refused: Count = Field(default=0, description="Points messages not valid, or that could not be taken.")
     tracks: Count = Field(default=0, description="Tracks extracted at the newest frame.")
     bernoullis: Count = Field(default=0, description="Bernoulli components now.")
     poissons: Count = Field(default=0, description="Poisson components now.")
@@ -223,7 +223,7 @@ class ServiceStatus(Message):
     late: Count = Field(default=0, description="Frames that came too late.")
     refused: Count = Field(default=0, description="Detections messages not valid, or that could not be tracked.")
     shed: Count = Field(default=0, description="Frames dropped because the queue was full.")
-    clouds_refused: Count = Field(default=0, description="Points messages that were not valid.")
+    clouds_refused: Count = Field(default=0, description="Points messages not valid, or that could not be taken.")
     problems: tuple[Problem, ...] = Field(
         default=(), max_length=100, fail_fast=True, description="The newest problems, the oldest first."
     )

@@ -1,7 +1,7 @@
 """The command `optipmb-service`: run the service (the default), ask how it is, or print the settings in force.
 
-Exit status: 0 after SIGINT or SIGTERM, 1 when the network cannot be used, 2 for a wrong option, path or setting; an
-error is one clear line on stderr.
+Exit status: 0 after SIGINT or SIGTERM, 1 when the network cannot be used or the end hung, 2 for a wrong option, path or
+setting; an error is one clear line on stderr.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typer.main import get_command
 from optipmb_service import __version__
 from optipmb_service.app import health_command, nats, router
 from optipmb_service.app.collector import collector_paused
-from optipmb_service.app.loops import leave
+from optipmb_service.app.ending import leave
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import logs
 from optipmb_service.settings.forms import DEFAULT_GRPC, DEFAULT_LISTEN, DEFAULT_NATS, address

@@ -140,4 +140,4 @@ async def _serve(
             service.housekeeping()
             parent.beat()
         health.ends()
-    return await asyncio.to_thread(service.stop)
+    return await asyncio.to_thread(service.stop, asked.bound.left())

@@ -1,16 +1,13 @@
-"""What the control loops of a worker and of its parent share: waiting for the end, blocking work, leaving."""
+"""What the control loops of all processes share: waiting for the end, blocking work, signs of life."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import gc
-import math
-import os
 import signal
 import sys
 import threading
-import time
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 import structlog
@@ -20,40 +17,25 @@ from optipmb_service.observability.health import BEAT_S
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from optipmb_service.app.ending import EndBound
 
 SWITCH_S: Final = 0.0005
 """By default it is ten times as long, and a frame that meets two other threads waits 10 ms."""
-
-HANDOVER_S: Final = 4.0
-"""At the end, how long other members may take to have the streams; it takes a second."""
-
-CLOSE_S: Final = 3.0
-"""At the end, how long a process may take to close, beyond handover and grace."""
 
 log = structlog.get_logger("optipmb_service")
 
 _T = TypeVar("_T")
 
 
-class Deadline:
-    """A time by which several stages end, each of which may take what those before it have left.
+class StopRequest:
+    """Whether somebody wants the end: SIGINT, SIGTERM, or whoever calls it; to be made inside the loop.
 
     Args:
-        seconds: from now on.
+        bound: on the end, from when it is asked for.
     """
 
-    def __init__(self, seconds: float) -> None:
-        self._ends = time.monotonic() + seconds
-
-    def left(self, most: float = math.inf) -> float:
-        """Return the seconds that are left, at most so many."""
-        return max(0.0, min(most, self._ends - time.monotonic()))
-
-
-class StopRequest:
-    """Whether somebody wants the end: SIGINT, SIGTERM, or whoever calls it; to be made inside the loop."""
-
-    def __init__(self) -> None:
+    def __init__(self, bound: EndBound) -> None:
+        self.bound = bound
         self._loop = asyncio.get_running_loop()
         self._event = asyncio.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -61,11 +43,13 @@ class StopRequest:
 
     def ask(self, reason: str) -> None:
         """Ask for the end."""
+        self.bound.begin()  # before anything that may block, as a log that nobody reads
         log.info("stop_asked" if not self.is_set() else "stop_asked_again", signal=reason)
         self._event.set()
 
     def ask_threadsafe(self, reason: str) -> None:
         """Ask for the end, from any thread."""
+        self.bound.begin()  # here: the loop may hang
         with contextlib.suppress(RuntimeError):  # the loop has ended already
             self._loop.call_soon_threadsafe(self.ask, reason)
 
@@ -89,15 +73,6 @@ class Heartbeat(Protocol):
 def say_ready(what: str, name: str, endpoints: Iterable[str]) -> None:
     """Print the line that starters wait for, the only one on stdout: what is ready, and the endpoints it uses."""
     print(f"ready {what}={name} endpoints={','.join(endpoints)}", flush=True)  # noqa: T201 - it is the interface
-
-
-def leave(status: int) -> None:
-    """End the process; at once where a thread is stuck in machine code, which would crash an orderly end."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    if any(thread.daemon and thread.is_alive() for thread in threading.enumerate()):
-        os._exit(status)
-    sys.exit(status)
 
 
 def settle() -> None:

@@ -10,6 +10,7 @@ import structlog
 
 from optipmb_service import __version__
 from optipmb_service.app.edges import monitoring
+from optipmb_service.app.ending import HUNG, EndBound, longest_end_s
 from optipmb_service.app.loops import StopRequest, beat, unless
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability.health import ProcessHealth
@@ -35,9 +36,9 @@ async def run(
         about: more for the first line of the log.
 
     Returns:
-        The exit status: 0, or 1 when the network, an address or the store cannot be used.
+        The exit status: 0, or 1 when the network, an address or the store cannot be used, or a step of the end hung.
     """
-    asked = StopRequest()
+    asked = StopRequest(EndBound(longest_end_s(settings.grace_s)))
     log.info("starting", instance=settings.instance, version=__version__, **about)
     health = ProcessHealth(settings.instance)
     beating = asyncio.create_task(beat(health))
@@ -48,10 +49,11 @@ async def run(
         print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
         return 1
     finally:
+        asked.bound.begin()  # also where nobody asked
         beating.cancel()
     if ended is not None:
         log.info("stopped", drained=ended)
-    return 0
+    return HUNG if ended is False else 0
 
 
 async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHealth, Client], Awaitable[None]]) -> int:
@@ -65,6 +67,7 @@ async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHe
         try:
             await serve(asked, health, client)
         finally:
+            asked.bound.begin()
             await asyncio.to_thread(client.close)
         return True
 

@@ -319,6 +319,7 @@ async def run(settings: Settings) -> int:
                 await asyncio.to_thread(work.work, BEAT_S)
             health.ends()
         finally:
+            asked.bound.begin()
             await asyncio.to_thread(work.close)
         return True
 

@@ -6,6 +6,7 @@ the Zenoh configuration file. Health and readiness are those of the service.
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -45,7 +46,7 @@ async def run(settings: Settings) -> int:
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
         await asked.wait()
         health.ends()
-        router.close()
+        await asyncio.to_thread(router.close)
         return True
 
     return await process.run(settings, serve)

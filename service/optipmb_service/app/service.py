@@ -8,6 +8,7 @@ streams over, stop receiving, track what was received as long as the grace lasts
 
 from __future__ import annotations
 
+import math
 import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -18,7 +19,7 @@ import structlog
 import optipmb
 from optipmb_service import __version__
 from optipmb_service.app.clustering import open_log, open_store
-from optipmb_service.app.loops import CLOSE_S, HANDOVER_S, Deadline
+from optipmb_service.app.ending import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
 from optipmb_service.cluster.member import Member
 from optipmb_service.observability import collectors
 from optipmb_service.observability.metrics import Metrics
@@ -155,20 +156,26 @@ class Service:
         self._registry.sweep(now_ns)
         self._reporter.flush(now_ns)
 
-    def stop(self) -> bool:
+    def stop(self, seconds: float = math.inf) -> bool:
         """Let others go on, track what was received, within the grace, and close; False when a step would not end.
 
-        All of it takes a bounded time, so that whoever waits for the end kills nothing that is still being kept.
+        All of it takes a bounded time, so that whoever waits for the end kills nothing that is still being kept; but
+        closing the network, before which all that is to be kept is written.
+
+        Args:
+            seconds: what is left for it.
         """
         self._state = "stopping"
-        ends = Deadline(HANDOVER_S + self._settings.grace_s + CLOSE_S)
-        self._transport.leave()
+        grace_s = self._settings.grace_s
+        ends = Deadline(min(HANDOVER_S + grace_s + CLOSE_S, seconds - LAST_S))
+        steps = Steps()
+        steps.do("leaving", self._transport.leave)
         self._member.drain()
-        self._member.drained(HANDOVER_S)
+        self._member.drained(max(0.0, ends.left() - grace_s - CLOSE_S))
         self._intake.handed_over(JOIN_S)
-        grace = Deadline(self._settings.grace_s)
+        grace = Deadline(grace_s)
         self._intake.close(JOIN_S)
-        self._transport.stop(JOIN_S)
+        steps.do("receiving", partial(self._transport.stop, JOIN_S))
         if not self._persistence.durable:
             self._registry.finish()  # else what waits for its cloud comes again from the publishers' caches
         while self._registry.busy and grace.left():
@@ -180,8 +187,9 @@ class Service:
         self._member.close(ends.left())
         self._missed.close(JOIN_S)
         self._reporter.flush(time.monotonic_ns())
+        hangs = steps.hang(ends.left())
         self._transport.close()
-        return ended
+        return ended and not hangs
 
     @property
     def stuck(self) -> bool:

@@ -22,7 +22,8 @@ import structlog
 from optipmb_service import __version__
 from optipmb_service.app.aggregate import QUERIES, AggregateView
 from optipmb_service.app.edges import grpc_edge, monitoring
-from optipmb_service.app.loops import CLOSE_S, HANDOVER_S, StopRequest, beat, say_ready, unless
+from optipmb_service.app.ending import HUNG, EndBound, longest_end_s
+from optipmb_service.app.loops import StopRequest, beat, say_ready, unless
 from optipmb_service.app.private_folder import private_folder
 from optipmb_service.app.worker_process import WorkerProcess
 from optipmb_service.observability.health import BEAT_S
@@ -47,8 +48,11 @@ START_S: Final = 900.0
 LATE_S: Final = 2.0
 """A control loop that turns so late was frozen, or starved, and knows nothing of its workers."""
 
-END_S: Final = CLOSE_S + 1.0
-"""Beyond grace and handover, how long workers may take to end before they are killed."""
+WORKERS_S: Final = 2.0
+"""How much longer the end of a parent may take than that of its workers."""
+
+OWN_END_S: Final = 0.5
+"""How long a parent may take to end without workers: what is left of them before is killed."""
 
 State = Literal["starting", "ready", "down"]
 
@@ -67,6 +71,7 @@ class Supervisor:
         self.states: list[State] = ["down"] * self.count
         self.restarts = [0] * self.count
         self._was_ready = [False] * self.count
+        self._hung = False
         self.began = False
         """Whether all workers have been ready at once."""
         self.failed: int | None = None
@@ -95,7 +100,7 @@ class Supervisor:
         return self.began
 
     async def stop(self) -> bool:
-        """End the workers; False when one had to be killed."""
+        """End the workers; False when one hung in its end, or had to be killed."""
         if self._watching is not None:
             self._watching.cancel()
         if not self._asked.is_set():
@@ -105,13 +110,13 @@ class Supervisor:
                 child.end()
         if not self._tasks:
             return True
-        _, late = await asyncio.wait(self._tasks, timeout=self._settings.grace_s + HANDOVER_S + END_S)
+        _, late = await asyncio.wait(self._tasks, timeout=max(0.0, self._asked.bound.left() - OWN_END_S))
         for child in self._children:
             if child is not None:
                 child.kill()
         if late:
             await asyncio.wait(late)
-        return not late
+        return not (late or self._hung)
 
     async def _watch(self) -> None:
         """Kill workers that give no sign of life; they are started again."""
@@ -154,6 +159,7 @@ class Supervisor:
             never_ready = not self._was_ready[index]
             self._set(index, "down")
             if self._asked.is_set():
+                self._hung |= status > 0  # below 0: by a signal, as before it could listen to any
                 return
             if never_ready and not self.began:
                 self.failed = max(status or 0, 1)  # one that was killed has a negative status
@@ -181,9 +187,10 @@ async def supervise(settings: Settings) -> int:
     """Run the service as worker processes until SIGINT or SIGTERM.
 
     Returns:
-        The exit status: 0, 1 when the network could not be used, or that of a worker which could not start.
+        The exit status: 0, 1 when the network could not be used or an end hung, or that of a worker which could not
+        start.
     """
-    asked = StopRequest()
+    asked = StopRequest(EndBound(longest_end_s(settings.grace_s) + WORKERS_S))
     log.info("starting", instance=settings.instance, version=__version__, workers=settings.workers)
     with private_folder() as folder:
         socket = f"unixsock-stream/{folder / 'router'}"
@@ -225,11 +232,12 @@ async def _supervised(
             view.ends()
             ended = await supervisor.stop()
     finally:
+        asked.bound.begin()  # also where nobody asked
         beating.cancel()
         with contextlib.suppress(Exception):
             await asyncio.to_thread(transport.close)
     log.info("stopped", drained=ended)
-    return supervisor.failed or 0
+    return supervisor.failed or (0 if ended else HUNG)
 
 
 def divided(settings: Settings, socket: str) -> tuple[Settings, Settings]:

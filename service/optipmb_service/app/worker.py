@@ -10,11 +10,9 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import json
-import os
 import signal
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -22,8 +20,8 @@ import structlog
 
 import optipmb
 from optipmb_service.app.control_loop import run
+from optipmb_service.app.ending import leave
 from optipmb_service.app.kernels import warm_up
-from optipmb_service.app.loops import HANDOVER_S, leave
 from optipmb_service.observability import logs
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.settings.model import Settings
@@ -38,25 +36,20 @@ WRONG_USE: Final = 2
 LOCK: Final = "lock"
 """File that one worker at a time holds while it compiles."""
 
-LAST_S: Final = 5.0
-"""Beyond grace and handover, how long a worker without a parent may take to end."""
-
 
 class SupervisingParent:
     """The parent, as a worker sees it.
 
     Args:
-        settings: what the worker runs with.
         index: which worker.
         private: folder that the workers share.
     """
 
     announces: Final = False  # to the network the workers are one instance, and the parent speaks for it
 
-    def __init__(self, settings: Settings, index: int, private: Path) -> None:
+    def __init__(self, index: int, private: Path) -> None:
         self.index = index
         self.private = private
-        self._settings = settings
         self._service: Service | None = None
         self._writing = threading.Lock()
 
@@ -84,9 +77,6 @@ class SupervisingParent:
         for _ in sys.stdin:
             pass
         asked.ask_threadsafe("parent")
-        # Nobody is left who would kill a worker that hangs.
-        time.sleep(self._settings.grace_s + HANDOVER_S + LAST_S)
-        os._exit(1)
 
     def _say(self, **event: object) -> None:
         try:
@@ -110,7 +100,7 @@ def main() -> int:
     order = json.loads(line)
     settings = Settings(**order["settings"])
     logs.configure(settings.log_format, settings.log_level, order["index"])
-    return _run(settings, SupervisingParent(settings, order["index"], Path(order["private"])))
+    return _run(settings, SupervisingParent(order["index"], Path(order["private"])))
 
 
 def _run(settings: Settings, parent: SupervisingParent | None) -> int:

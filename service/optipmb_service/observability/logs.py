@@ -76,8 +76,12 @@ EVENTS: Final = {
     "worker_killed": "A worker did not end or respond in time and was killed.",
     "metrics_unreadable": "The metrics of a worker cannot be read and are left out.",
     "parent_gone": "The parent has died; its worker ends.",
-    "stop_asked": "SIGINT or SIGTERM, or the parent ends its worker; it stops within 8 s + `grace_s`.",
+    "stop_asked": "SIGINT or SIGTERM, or the parent ends its worker; it stops within 8 s + `grace_s`, a parent of"
+    " workers within 10 s + `grace_s`.",
     "stop_asked_again": "Another signal, which has no effect.",
+    "step_hangs": "`steps` of the end hang, as in Zenoh; what was to be kept is kept. The exit status is 1.",
+    "end_hangs": "The end took too long, and the process was ended with status 1. `threads` is where each thread was,"
+    " the innermost call first.",
     "stopped": "The service has stopped; `drained` is false when a step was abandoned.",
 }
 """Every event that is logged, and what an operator makes of it."""

@@ -63,7 +63,7 @@ SERVICE_METRICS: Final = {
     "publishers_restarted_total": MetricFamily("counter", (), "Restarts of publishers and jumps of their stamps."),
     "clouds_total": MetricFamily("counter", ("result",), "Frames tracked with their cloud, or that waited in vain."),
     "clouds_shed_total": MetricFamily("counter", (), "Clouds dropped from a full queue."),
-    "clouds_refused_total": MetricFamily("counter", (), "Clouds that were not valid."),
+    "clouds_refused_total": MetricFamily("counter", (), "Clouds not valid, or that could not be taken."),
     "repaired_total": MetricFamily("counter", (), "Covariances repaired after a loss of rank by rounding."),
     "sessions": MetricFamily("gauge", ("state",), "Sessions."),
     "streams": MetricFamily(

@@ -6,7 +6,7 @@ Where several streams share a session, what is wrong with a message is said on t
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.stream_outputs import StreamOutputs
     from optipmb_service.runtime.stream_sensors import StreamSensors
     from optipmb_service.session.session import Session
+
+
+CLOUD_REFUSED: Final = {"invalid_value", "refused"}
+"""Problems by which a session says that it does not take a cloud: not valid, or of one sensor too many."""
 
 
 class StreamTracking:
@@ -105,7 +109,7 @@ class StreamTracking:
         ticket = Arrival(packet.wall_ns, packet.now_ns, time.perf_counter_ns() - began_ns)
         if isinstance(message, schemas.Points):
             outputs = session.on_points(message, now_ns, ticket=ticket)
-            if any(getattr(one, "code", "") == "invalid_value" for one in outputs):
+            if any(getattr(one, "code", "") in CLOUD_REFUSED for one in outputs):
                 self._counters.refuse(session, frame=False)
         else:
             outputs = session.on_detections(message, now_ns, arrived_ns=packet.now_ns, ticket=ticket)

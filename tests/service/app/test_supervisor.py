@@ -10,6 +10,7 @@ from typing import Any
 
 import optipmb_service.app.supervisor
 import pytest
+from optipmb_service.app.ending import EndBound
 from optipmb_service.app.loops import StopRequest
 from optipmb_service.app.supervisor import Supervisor
 from optipmb_service.settings.loading import load
@@ -29,7 +30,9 @@ async def test_a_worker_that_ends_in_its_first_start_ends_the_command(
             return status
 
     monkeypatch.setattr(optipmb_service.app.supervisor, "WorkerProcess", Ending)
-    supervisor = Supervisor(load(None, {"workers": 2, "store": "none"}).settings, StopRequest(), Path("unused"))
+    supervisor = Supervisor(
+        load(None, {"workers": 2, "store": "none"}).settings, StopRequest(EndBound(60.0)), Path("unused")
+    )
     await supervisor._kept(0)
     assert supervisor.failed == failed
 
@@ -41,7 +44,7 @@ async def test_a_worker_that_hangs_while_it_starts_is_killed(
     """A start may take much longer than `stuck_s`, but not for ever."""
     monkeypatch.setattr(optipmb_service.app.supervisor, "BEAT_S", 0.0)
     settings = load(None, {"workers": 2, "store": "none"}).settings
-    supervisor = Supervisor(settings, StopRequest(), Path("unused"))
+    supervisor = Supervisor(settings, StopRequest(EndBound(60.0)), Path("unused"))
     ended: list[bool] = []
     child: Any = SimpleNamespace(kill=lambda: ended.append(True))
     supervisor._children[0], supervisor.states[0] = child, "starting"

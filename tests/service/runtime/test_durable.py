@@ -16,8 +16,7 @@ import zenoh.ext
 from lease_log import Alone
 from optipmb_schemas import Keys, ServiceStatus, SessionState, encode
 from optipmb_service.app.clustering import STORE_FILE
-from optipmb_service.app.loops import HANDOVER_S
-from optipmb_service.app.supervisor import END_S
+from optipmb_service.app.ending import longest_end_s
 from optipmb_service.cluster.leases import ALIVE, member_key
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import StoreError, Write
@@ -85,7 +84,7 @@ def test_a_store_that_hangs_keeps_no_end_waiting(start: Callable[..., Any], tmp_
             file._lock.release()
         ending.join()
     assert not hangs
-    assert took_s < HANDOVER_S + service._settings.grace_s + END_S
+    assert took_s < longest_end_s(service._settings.grace_s)
 
 
 def test_a_closed_stream_that_moves_stays_closed(start: Callable[..., Any], tmp_path: Path) -> None:

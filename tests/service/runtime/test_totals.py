@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from optipmb_schemas import Detections, Keys, encode, encoding_of
+from optipmb_schemas import Detections, Keys, Points, encode, encoding_of
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter
 from optipmb_service.runtime import actor_table, stream_actor, stream_counters
@@ -17,7 +17,7 @@ from optipmb_service.runtime.persistence import NoPersistence
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.registry import Registry
-from optipmb_service.session.values import MessageCounters
+from optipmb_service.session.values import MAX_SENSORS, MessageCounters
 from optipmb_service.settings.model import Settings
 from router import Sensor
 from sessions import chained
@@ -89,11 +89,11 @@ class Around(NoPersistence):
         """Tracks go nowhere."""
 
 
-def registry_of(around: Around) -> Registry:
+def registry_of(around: Around, **settings: Any) -> Registry:
     """Return the streams of a process with these around it."""
     parts: Any = around  # in the place of several
     return Registry(
-        Settings(instance="test", store="none", step_limit_s=60),  # kernels may have to be compiled
+        Settings(instance="test", store="none", step_limit_s=60, **settings),  # kernels may have to be compiled
         Profiles.read("nuscenes", {}),
         sink=parts,
         reporter=ProblemReporter(lambda _: None, lambda *_: None),
@@ -109,9 +109,14 @@ def registry_of(around: Around) -> Registry:
 
 def packet(seq: int) -> Packet:
     """Return a frame as it comes."""
-    payload = encode(SENSOR.detections(seq))
-    key = Keys().detections(SENSOR.stream)
-    return Packet(key, payload, len(payload), encoding_of(Detections), time.time_ns(), time.monotonic_ns())
+    return packet_of(SENSOR.detections(seq))
+
+
+def packet_of(message: Detections | Points) -> Packet:
+    """Return a message as it comes."""
+    payload, keys = encode(message), Keys()
+    key = (keys.detections if isinstance(message, Detections) else keys.points)(message.stream)
+    return Packet(key, payload, len(payload), encoding_of(type(message)), time.time_ns(), time.monotonic_ns())
 
 
 def test_totals_never_fall_and_count_nothing_twice() -> None:
@@ -162,3 +167,23 @@ def test_a_message_on_a_key_of_no_stream_is_refused_as_what_it_is() -> None:
     assert registry.totals() == MessageCounters(clouds_refused=1)
     registry.frame(bad)
     assert registry.totals() == MessageCounters(received=1, refused=1, clouds_refused=1)
+
+
+def test_what_one_sensor_too_many_sends_is_counted_as_what_it_is() -> None:
+    """Of a sensor beyond those that a session takes, a frame counts as refused, and a cloud as a refused cloud."""
+    around = Around()
+    registry = registry_of(around, fuse=("site/node/*",), recovery_wait_s=0)
+    for number in range(MAX_SENSORS):
+        registry.frame(packet_of(replace(SENSOR, stream=f"site/node/s{number}").detections(0)))
+    around.run()
+    more = replace(SENSOR, stream="site/node/more")
+    registry.frame(packet_of(more.detections(0)))
+    registry.cloud(packet_of(more.points(0)))
+    around.run()
+    totals = registry.totals()
+    assert (totals.received, totals.frames, totals.refused, totals.clouds_refused) == (
+        MAX_SENSORS + 1,
+        MAX_SENSORS,
+        1,
+        1,
+    )

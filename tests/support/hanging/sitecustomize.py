@@ -1,0 +1,33 @@
+"""What makes the end of a process hang: Python runs it at the start of a process that has this folder on its path.
+
+`HANG` says where: `close`, in closing the Zenoh session; `lock`, there too, with the interpreter's lock held;
+`leave`, in the first step of a member's end. Workers inherit both variables from their parent.
+"""
+
+import ctypes
+import os
+import sys
+import time
+
+from optipmb_service.zenoh import connection, transport
+
+LONG_S = 3600
+
+
+def hang(*_: object) -> None:
+    """Wait, as a library does that has met a bug."""
+    time.sleep(LONG_S)
+
+
+def hang_with_the_lock(*_: object) -> None:
+    """Wait in machine code that lets no other Python run."""
+    ctypes.PyDLL(None).sleep(LONG_S)
+
+
+if os.environ["HANG"] == "leave":
+    transport.Transport.leave = hang  # type: ignore[method-assign]  # it is to hang
+else:
+    real = connection.close
+    for module in [one for name, one in sys.modules.items() if name.startswith("optipmb_service.zenoh")]:
+        if getattr(module, "close", None) is real:
+            module.close = hang if os.environ["HANG"] == "close" else hang_with_the_lock  # type: ignore[attr-defined]  # likewise
