@@ -1,11 +1,12 @@
 """What a frame costs a running service: processor time by thread, beside services of other checkouts, in turns.
 
-python benchmarks/service_cost.py [--beside DIR] [--objects N] [--points N] [--rounds N] [--seconds S]
+python benchmarks/service_cost.py [--beside DIR | --bare] [--objects N] [--points N] [--rounds N] [--seconds S]
 
 The services run beside each other, as clients of one router, which is a router and nothing else. Each has streams of
 its own, and checkpoints every second. One is sent 40 streams at 10 Hz for `--seconds`, then the next one, and so on for
 `--rounds`. What else the machine does changes in seconds by a fifth and more, so figures of services that were measured
-one after the other cannot be compared. The ratio is the median of those of neighbouring turns.
+one after the other cannot be compared. The ratio is the median of those of neighbouring turns. With `--bare` the other
+one is `bare_service.py`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import contextlib
 import os
 import secrets
+import subprocess
 import sys
 import tempfile
 import time
@@ -43,8 +45,10 @@ WARM_S: Final = 7.0
 """Caches and windows are full then, and nothing grows any more."""
 RUN_IN_S: Final = 0.3
 """Of each turn, before it counts."""
-STRAGGLERS_S: Final = 0.05
+SETTLE_S: Final = 0.05
+STRAGGLERS_S: Final = 5.0
 CACHE: Final = 50
+END_S: Final = 20.0
 EPOCH_NS: Final = 1_600_000_000_000_000_000
 
 SHOWN: Final = {
@@ -97,21 +101,18 @@ class Threads:
 
 
 class Loaded:
-    """A service of a checkout and its streams."""
+    """A running service and its streams.
 
-    def __init__(self, tree: Path, number: int, router: str, opened: contextlib.ExitStack, frames: Frames) -> None:
-        prefix = f"cost{number}/v1"
-        environment = {
-            "PYTHONPATH": os.pathsep.join(str(tree / part) for part in ("", "schemas", "service", "clients")),
-            "PYTHONSAFEPATH": "1",
-            "OPTIPMB_STORE": opened.enter_context(tempfile.TemporaryDirectory()),
-            "OPTIPMB_PREFIX": prefix,
-        }
-        options = ("--connect", router, "--instance", f"cost{number}", "--log-level", "warning")
-        self._service = opened.enter_context(
-            ServiceProcess(*options, environment=environment, listen=False, fresh=True)
-        )
-        self._service.wait_ready()
+    Args:
+        pid: its process.
+        prefix: of its keys.
+        router: endpoint of the router.
+        opened: closes what is opened.
+        frames: what is sent.
+    """
+
+    def __init__(self, pid: int, prefix: str, router: str, opened: contextlib.ExitStack, frames: Frames) -> None:
+        self._pid = pid
         connection, keys = opened.enter_context(Connection(router)), Keys(prefix)
         self._frames, self._epoch, self._next = frames, secrets.token_bytes(16), 0
         self._names = [chain(("load", f"{stream:05d}", "x")) for stream in range(STREAMS)]
@@ -144,21 +145,27 @@ class Loaded:
             self._next += 1
         return rounds * STREAMS
 
-    def turn(self, seconds: float) -> None:
-        """Measure one turn.
+    def _answered(self, seconds: float) -> list[int]:
+        """Send frames and wait for all answers; return their latencies.
 
         Raises:
             RuntimeError: not all frames were answered.
         """
-        self.send(RUN_IN_S)
-        time.sleep(STRAGGLERS_S)
-        pid = self._service.process.pid
-        before, self._tracks.latencies_ns = Threads.of(pid), []
+        latencies = self._tracks.latencies_ns = []
         sent = self.send(seconds)
-        time.sleep(STRAGGLERS_S)
-        after, latencies = Threads.of(pid), sorted(self._tracks.latencies_ns)
+        ends = time.monotonic() + STRAGGLERS_S
+        while len(latencies) < sent and time.monotonic() < ends:
+            time.sleep(SETTLE_S)
         if len(latencies) != sent:
             raise RuntimeError(f"{len(latencies)} of {sent} frames were answered")
+        return latencies
+
+    def turn(self, seconds: float) -> None:
+        """Measure one turn."""
+        self._answered(RUN_IN_S)
+        before = Threads.of(self._pid)
+        latencies = sorted(self._answered(seconds))
+        after, sent = Threads.of(self._pid), len(latencies)
         spent = {kind: (after.spent_us[kind] - before.spent_us[kind]) / sent for kind in after.spent_us}
         self.turns.append(
             spent
@@ -172,15 +179,44 @@ class Loaded:
         )
 
 
-def measured(trees: list[Path], options: argparse.Namespace) -> list[Loaded]:
-    """Load services of the checkouts in turns."""
+def started(tree: Path, prefix: str, router: str, opened: contextlib.ExitStack) -> int:
+    """Start a service of a checkout; return its process."""
+    environment = {
+        "PYTHONPATH": os.pathsep.join(str(tree / part) for part in ("", "schemas", "service", "clients")),
+        "PYTHONSAFEPATH": "1",
+        "OPTIPMB_STORE": opened.enter_context(tempfile.TemporaryDirectory()),
+        "OPTIPMB_PREFIX": prefix,
+    }
+    options = ("--connect", router, "--instance", prefix.partition("/")[0], "--log-level", "warning")
+    service = opened.enter_context(ServiceProcess(*options, environment=environment, listen=False, fresh=True))
+    service.wait_ready()
+    return service.process.pid
+
+
+def started_bare(prefix: str, router: str, opened: contextlib.ExitStack) -> int:
+    """Start `bare_service.py`; return its process."""
+    command = [sys.executable, str(HERE / "benchmarks" / "bare_service.py"), router, prefix]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)  # noqa: S603 - its own
+    opened.callback(process.communicate, timeout=END_S)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process.pid
+
+
+def measured(trees: list[Path | None], options: argparse.Namespace) -> list[Loaded]:
+    """Load services of the checkouts in turns; None: the bare one."""
     frames = generated(options.objects, options.points, RATE_HZ)
     with contextlib.ExitStack() as opened:
         router = opened.enter_context(ServiceProcess("router", "--instance", "router", fresh=True))
         router.wait_ready()
-        services = [Loaded(tree, number, router.endpoint, opened, frames) for number, tree in enumerate(trees)]
+        services = []
+        for number, tree in enumerate(trees):
+            prefix, where = f"cost{number}/v1", router.endpoint
+            pid = started(tree, prefix, where, opened) if tree else started_bare(prefix, where, opened)
+            services.append(Loaded(pid, prefix, where, opened, frames))
         for service in services:
             service.send(WARM_S)
+            time.sleep(STRAGGLERS_S)
         for number in range(options.rounds):
             for service in services if number % 2 else services[::-1]:
                 service.turn(options.seconds)
@@ -190,19 +226,24 @@ def measured(trees: list[Path], options: argparse.Namespace) -> list[Loaded]:
 def main() -> None:
     """Measure, and print a table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--beside", type=Path, help="checkout of another version")
+    others = parser.add_mutually_exclusive_group()
+    others.add_argument("--beside", type=Path, help="checkout of another version")
+    others.add_argument("--bare", action="store_true", help="compare with what tracks and does nothing else")
     parser.add_argument("--objects", type=int, default=40)
     parser.add_argument("--points", type=int, default=0)
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=1.5, help="length of a turn")
     options = parser.parse_args()
-    trees = [*([options.beside.resolve()] if options.beside else []), HERE]
+    beside = options.beside is not None or options.bare
+    trees: list[Path | None] = [*([options.beside and options.beside.resolve()] if beside else []), HERE]
     services = measured(trees, options)
-    print("| of a frame | " + " | ".join(["before", "after", "ratio"] if options.beside else ["now"]) + " |")
+    print(
+        "| of a frame | " + " | ".join([*(["other"] if beside else []), "this", *(["ratio"] if beside else [])]) + " |"
+    )
     for name, text in SHOWN.items():
         columns = [[turn[name] for turn in service.turns] for service in services]
         shown = [f"{median(column):.2f}" for column in columns]
-        if options.beside:
+        if beside:
             pairs = [after / before for before, after in zip(*columns, strict=True) if before]
             shown.append(f"{median(pairs):.2f}" if pairs else "")
         print(f"| {text} | " + " | ".join(shown) + " |")

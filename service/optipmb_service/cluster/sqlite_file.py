@@ -19,6 +19,9 @@ BUSY_S: Final = 5.0
 
 BUSY_PAUSE_S: Final = 0.01
 
+LOG_BYTES: Final = 4 * 2**20
+"""Size of the write-ahead log from which its pages go into the file, and it begins anew."""
+
 
 class Database:
     """One file and a connection to it; any thread may use it, one at a time.
@@ -45,6 +48,8 @@ class Database:
             self._begin_log(self.connection)
             self.connection.execute(f"PRAGMA synchronous = {synchronous}")
             self.connection.execute(f"PRAGMA journal_size_limit = {64 * 2**20}")
+            (page_bytes,) = self.connection.execute("PRAGMA page_size").fetchone()  # an older file keeps its own
+            self.connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_BYTES // page_bytes}")
             self.connection.executescript(schema)
             self.connection.execute("PRAGMA user_version = 3")  # fails here already where nothing can be written
         except (sqlite3.Error, OSError) as error:

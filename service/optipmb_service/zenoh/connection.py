@@ -39,7 +39,7 @@ RETRY_MS: Final = {"period_init_ms": 100, "period_max_ms": 2000, "period_increas
 
 RUNTIME_VARIABLE: Final = "ZENOH_RUNTIME"
 RUNTIME: Final = "(rx: (handover: app))"
-"""A client has one link, and one thread that waits for its socket and reads it.
+"""A client has one link, and one thread that waits for its socket and reads it; after that was lost, Zenoh has two.
 
 By default one thread waits and wakes one of two others to read: two more threads are woken for each message. What is
 sent has a thread of its own, so a callback that waits for the lock of the interpreter keeps nothing from leaving.

@@ -133,12 +133,12 @@ def directly(take: Callable[[Any], None]) -> tuple[Any, None]:
     what it has declared for recovery beside it is not withdrawn with it.
     """
 
-    def called(item: Any) -> None:
+    def receive(item: Any) -> None:
         if not getattr(_thread, "attached", False):
             _stay_attached()
         take(item)
 
-    return zenoh.handlers.Callback(called, indirect=False), None
+    return zenoh.handlers.Callback(receive, indirect=False), None
 
 
 def _stay_attached() -> None:
@@ -146,7 +146,8 @@ def _stay_attached() -> None:
 
     The interpreter makes one whenever a foreign thread calls into it, and drops it on the way back unless an earlier
     call has not returned. Per message that is memory mapped and unmapped, and every processor of the process is
-    interrupted to forget it. This is such a call; the lock is given back with the callback, as ever.
+    interrupted to forget it. This is such a call; the lock is given back with the callback, as ever. A thread that ends
+    leaves its state behind; Zenoh's threads live as long as the process, unless a callback blocks in Zenoh.
     """
     ctypes.pythonapi.PyGILState_Ensure()
     _thread.attached = True

@@ -14,6 +14,7 @@ import pytest
 from lease_log import Alone
 from optipmb_service.cluster.member_locks import MEMBERS
 from optipmb_service.cluster.sqlite import ASIDE, ENDED_KEPT, LEASES, PAGE_BYTES, SLICE, SLICE_BYTES, SqliteStore
+from optipmb_service.cluster.sqlite_file import LOG_BYTES
 from optipmb_service.cluster.store import ENDED, StoreError, Write, load_newest
 
 if TYPE_CHECKING:
@@ -91,6 +92,20 @@ def test_a_checkpoint_takes_few_pages(tmp_path: Path) -> None:
         store.close()
         with contextlib.closing(sqlite3.connect(tmp_path / name)) as after:
             assert after.execute("PRAGMA page_size").fetchone() == (page_bytes,)
+
+
+def test_the_log_beside_the_file_stays_small(tmp_path: Path) -> None:
+    """However much is written, and whatever the size of the pages, the write-ahead log goes round within its bound."""
+    for name in ("new.db", "old.db"):
+        if name == "old.db":
+            with contextlib.closing(sqlite3.connect(tmp_path / name)) as before:
+                before.execute("CREATE TABLE earlier (x)")
+        store = SqliteStore(tmp_path / name)
+        leases = Alone(store)
+        for number in range(200):
+            leases.save({"a/b/c": number.to_bytes(2) * 50_000})
+        assert LOG_BYTES / 2 < (tmp_path / f"{name}-wal").stat().st_size < 2 * LOG_BYTES
+        store.close()
 
 
 def test_a_closed_store_says_so(tmp_path: Path) -> None:
