@@ -42,7 +42,7 @@ def demonstrate(
     """Start a service, replay one scene through it, end it, and judge the tracks.
 
     `speed` is a multiple of real time; None: each frame goes out when the tracks of the one before have come back.
-    `on_stage` is told what comes next, `on_frame` that a frame has come back.
+    `on_stage` is called with what comes next, `on_frame` when a frame has come back.
 
     Raises:
         ServiceUnavailable: The service did not start.

@@ -11,7 +11,7 @@ Automatic Control 53(3), 2008), with the motion models of the tracker. From the 
     P^s_k = P_k + G (P^s_{k+1} - P-) G'
 
 m_k and P_k are the state and covariance of every frame in which the filter holds the object; in frames in which it is a
-track, those of its told box (`optipmb.reported`). So frames without detection need no rule of their own. Where the
+track, those of its published box (`optipmb.reported`). So frames without detection need no rule of their own. Where the
 filter predicts by exact moments (`optipmb.motion.predict_moments`), the smoother is the unscented one nevertheless.
 
 An object does not turn by pi from frame to frame, so one sign of the heading holds for the whole track: the one in
@@ -66,14 +66,14 @@ class Smoother:
             start + np.searchsorted(one.id, tracks.id)
             for start, one, (*_, tracks) in zip(starts, objects, self._frames, strict=True)
         ]
-        told, extracted = np.concatenate(rows), _joined([tracks for *_, tracks in self._frames])
-        evidence = np.concatenate([one.evidence for one in objects])[told]
+        shown, extracted = np.concatenate(rows), _joined([tracks for *_, tracks in self._frames])
+        evidence = np.concatenate([one.evidence for one in objects])[shown]
         label = np.concatenate([one.label for one in objects])
         mean = np.concatenate([one.mean for one in objects])
         covariance = np.concatenate([one.covariance for one in objects])
-        mean[told] = _states(extracted)
-        covariance[told] = extracted.covariance - self._lasting(extracted.label, evidence, extracted.yaw)
-        covariance[told, PHI, PHI] -= [doubt(p) for p in extracted.heading_confidence.tolist()]
+        mean[shown] = _states(extracted)
+        covariance[shown] = extracted.covariance - self._lasting(extracted.label, evidence, extracted.yaw)
+        covariance[shown, PHI, PHI] -= [doubt(p) for p in extracted.heading_confidence.tolist()]
         odds = smooth(
             np.concatenate([one.id for one in objects]),
             np.repeat(np.array([density.stamp_ns for _, density, _ in self._frames]), counts),
@@ -83,10 +83,10 @@ class Smoother:
             covariance,
             self._table,
         )
-        confidence = np.array([sign_probability(h) for h in odds[told].tolist()])
+        confidence = np.array([sign_probability(h) for h in odds[shown].tolist()])
         confidence[self._table["sign_memory"][extracted.label] == 0.0] = 1.0
-        covariance[told] += self._lasting(extracted.label, evidence, mean[told, PHI])
-        covariance[told, PHI, PHI] += [doubt(p) for p in confidence.tolist()]
+        covariance[shown] += self._lasting(extracted.label, evidence, mean[shown, PHI])
+        covariance[shown, PHI, PHI] += [doubt(p) for p in confidence.tolist()]
         start = 0
         for (index, _, tracks), chosen in zip(self._frames, rows, strict=True):
             end = start + len(chosen)
@@ -95,8 +95,8 @@ class Smoother:
 
     def _lasting(self, label: Ints, evidence: Floats, yaw: Floats) -> Floats:
         """Return what the calibration adds to the covariances (N, 6, 6) of tracks with these headings (N,)."""
-        lasting, untold = np.zeros((len(label), STATE, STATE)), np.empty((2, len(label)))
-        calibrate_rows(label, evidence, yaw, self._table.classes, untold[0], untold[1], lasting)
+        lasting, unused = np.zeros((len(label), STATE, STATE)), np.empty((2, len(label)))
+        calibrate_rows(label, evidence, yaw, self._table.classes, unused[0], unused[1], lasting)
         return lasting
 
 

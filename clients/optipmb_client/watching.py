@@ -104,8 +104,8 @@ class View:
             points, _ = _to_world(message, message.xyz.astype(np.float64))
             self._recording.log(f"{message.stream}/cloud", rr.Points3D(points, colors=_by_height(points), radii=0.03))
 
-    def _show_tracks(self, told: Tracks) -> None:
-        tracks = _confirmed(told)
+    def _show_tracks(self, all_tracks: Tracks) -> None:
+        tracks = _confirmed(all_tracks)
         name, n = tracks.stream, len(tracks.id)
         if self._followed in {None, name}:
             middle = tracks.center[:, :2].mean(axis=0) if n else np.zeros(2)
@@ -146,7 +146,7 @@ class View:
         strips, ids = self._trail(tracks)
         log(f"{name}/tracks/trails", rr.LineStrips3D(strips, colors=[rgb_of(one) for one in ids], radii=0.7 * LINE))
         log(f"{name}/count/tracks", rr.Scalars(float(n)))
-        log(f"{name}/count/unconfirmed_tracks", rr.Scalars(float(len(told.id) - n)))
+        log(f"{name}/count/unconfirmed_tracks", rr.Scalars(float(len(all_tracks.id) - n)))
         log(f"{name}/count/surer_tracks", rr.Scalars(float(sure.sum())))
 
     def _show_detections(self, detections: Detections) -> None:

@@ -148,7 +148,7 @@ def test_what_is_wrong_in_a_file_is_named_with_its_line(
     assert (caught.value.line, caught.value.received) == (line, received)
 
 
-def test_a_root_that_is_none_and_poses_that_are_missing_are_told(tmp_path: Path) -> None:
+def test_a_root_that_is_none_and_poses_that_are_missing_are_reported(tmp_path: Path) -> None:
     """An unknown folder, a folder without calibration, and a sequence with neither poses nor oxts."""
     with pytest.raises(DatasetError, match="no such folder"):
         KittiDataset(tmp_path / "nowhere")
@@ -162,7 +162,7 @@ def test_a_root_that_is_none_and_poses_that_are_missing_are_told(tmp_path: Path)
         len(only_sequence(tmp_path))
 
 
-def test_unknown_datasets_and_options_are_told() -> None:
+def test_unknown_datasets_and_options_are_reported() -> None:
     """The error lists what is known."""
     with pytest.raises(DatasetError, match="kitti or nuscenes or scene"):
         open_dataset("waymo")
@@ -230,7 +230,7 @@ def test_a_sequence_with_oxts_needs_no_pose_file(tmp_path: Path) -> None:
     assert len(list(sequence.frames())) == len(sequence) == 5
 
 
-def test_a_scan_of_the_wrong_length_is_told(tmp_path: Path) -> None:
+def test_a_scan_of_the_wrong_length_is_reported(tmp_path: Path) -> None:
     """Sixteen bytes are a point."""
     (tmp_path / "0.bin").write_bytes(b"\0" * 40)
     with pytest.raises(DatasetError, match="16 bytes per point, received 40 bytes"):

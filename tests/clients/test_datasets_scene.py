@@ -116,7 +116,7 @@ def test_detected_velocities_are_over_ground_along_the_axes_of_the_sensor() -> N
         ("colour", 1, "an unknown option"),
     ],
 )
-def test_options_out_of_their_bounds_are_told(option: str, value: float, expected: str) -> None:
+def test_options_out_of_their_bounds_are_reported(option: str, value: float, expected: str) -> None:
     """The error names the option and its bounds."""
     with pytest.raises(DatasetError, match=f"option {option}: .*{expected}"):
         open_dataset("scene", **{option: value})

@@ -243,7 +243,7 @@ def test_real_truth_as_results_is_perfect(tmp_path: Path) -> None:
         assert result.sweep.results[result.sweep.best].mota == 1.0
 
 
-def test_results_of_a_missing_sequence_or_beyond_its_end_are_told(tmp_path: Path) -> None:
+def test_results_of_a_missing_sequence_or_beyond_its_end_are_reported(tmp_path: Path) -> None:
     """A missing result file and a frame that the sequence has not are errors that name the file."""
     sequences = open_dataset("scene", frames=2, vehicles=2, pedestrians=0, cyclists=0).sequences(["all"])
     with pytest.raises(DatasetError, match=r"0000.txt: expected a KITTI result file"):

@@ -238,7 +238,7 @@ def changed(scene: DataSequence, path: Path, change: Callable[[bags.Sent], bags.
     return bags.write_mcap(path, sent)
 
 
-def test_messages_without_a_pose_are_left_out_and_told(
+def test_messages_without_a_pose_are_left_out_and_reported(
     scene: DataSequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Where tf begins later than the detections, the first frames are left out with a note."""
@@ -321,7 +321,7 @@ def test_what_fits_twice_is_to_be_chosen(scene: DataSequence, tmp_path: Path) ->
     assert sequence.has_clouds
 
 
-def test_a_bag_without_detections_is_told(scene: DataSequence, tmp_path: Path) -> None:
+def test_a_bag_without_detections_is_reported(scene: DataSequence, tmp_path: Path) -> None:
     """The error lists the topics that there are."""
     path = changed(scene, tmp_path / "none.mcap", lambda one: None if one.topic == "/detector/boxes" else one)
     with pytest.raises(DatasetError, match=r"Detection3DArray.*received /points \(sensor_msgs/msg/PointCloud2\)"):

@@ -29,7 +29,7 @@ def test_a_load_counts_exactly(service: ServiceProcess, capsys: pytest.CaptureFi
     assert status.get("sessions", []) == []
 
 
-def test_a_latency_that_is_not_held_is_told(service: ServiceProcess, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_latency_that_is_not_held_is_reported(service: ServiceProcess, capsys: pytest.CaptureFixture[str]) -> None:
     """A limit that nothing can hold ends with status 1."""
     options = ("--streams", 1, "--rate", 20, "--seconds", 1, "--latency-ms", 0.1)
     result = run_here(capsys, "load", "--connect", service.endpoint, *options)

@@ -207,7 +207,7 @@ def test_parameters_of_another_session_are_not_recorded(
     assert {one.topic for one in RecordingFile(path)} == {"tracks"}
 
 
-def test_tracks_that_differ_are_told(
+def test_tracks_that_differ_are_reported(
     service: ServiceProcess, incident: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With other parameters the tracks are others: status 1 and the number of the first frame that differs."""
@@ -217,7 +217,7 @@ def test_tracks_that_differ_are_told(
     assert "profile kitti here has other values than what was in force" in done.stderr
 
 
-def test_a_stream_that_was_tracked_before_is_told(incident: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stream_that_was_tracked_before_is_reported(incident: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Played twice under the recorded name, ids go on from the first time: status 1, and why, in one line."""
     with ServiceProcess(environment=PATIENT) as fresh:
         fresh.wait_until_ready()

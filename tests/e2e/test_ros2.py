@@ -235,7 +235,7 @@ def test_either_side_may_restart(robot: Robot, scene: DataSequence, tmp_path: Pa
     assert counted
 
 
-def test_what_is_wrong_on_the_other_side_is_told(robot: Robot, scene: DataSequence, tmp_path: Path) -> None:
+def test_what_is_wrong_on_the_other_side_is_reported(robot: Robot, scene: DataSequence, tmp_path: Path) -> None:
     """A clock that starts late, frames that tf lacks, quality of service or definitions that do not fit are told."""
     frames = frames_of(scene)
     boxes = json.loads(json.dumps(next(one for one in frames[0] if one.topic == "/detector/boxes").message))

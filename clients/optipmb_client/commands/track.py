@@ -136,8 +136,8 @@ def _say_result(result: "TrackedSequence") -> None:
     rate = result.frames / max(result.seconds, 1e-9)
     step = f", step p50 {result.step.p50_ms:.2f} ms p99 {result.step.p99_ms:.2f} ms" if result.step else ""
     others = result.tracks - result.confirmed
-    told = f"{result.confirmed} tracks" + (f" and {others} never confirmed" if others else "")
-    say(f"{result.name}: {result.frames} frames, {told}, {rate:.0f} frames/s{step}")
+    counts = f"{result.confirmed} tracks" + (f" and {others} never confirmed" if others else "")
+    say(f"{result.name}: {result.frames} frames, {counts}, {rate:.0f} frames/s{step}")
 
 
 def _complain(results: "list[TrackedSequence]", profile: str) -> None:

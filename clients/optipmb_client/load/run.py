@@ -149,7 +149,7 @@ def run_load(
         load: how much.
         frames: what of.
         prefix: first part of all keys.
-        on_frame: told of frames sent.
+        on_frame: called with the number of frames sent.
 
     Raises:
         ServiceUnavailable: no service answers.

@@ -74,7 +74,7 @@ def record(  # noqa: PLR0913  one argument per decision of the caller
         points: Whether point clouds are recorded.
         duration: Seconds after which it ends.
         prefix: First part of all keys.
-        about: What is told of the recording in the file.
+        about: What is said of the recording in the file.
         on_flush: Called about once a second.
 
     Raises:

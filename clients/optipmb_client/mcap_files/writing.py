@@ -40,7 +40,7 @@ class RecordingWriter:
 
     Args:
         path: The file; it must not be there yet.
-        about: What is told of the recording as a whole.
+        about: What is said of the recording as a whole.
 
     Raises:
         FileExistsError: It is there.

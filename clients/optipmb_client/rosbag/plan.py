@@ -79,15 +79,15 @@ def read_transforms(bag: Bag, choice: Choice) -> Transforms:
     topics = bag.of_type(_ODOMETRY)
     if choice.odometry and choice.odometry not in topics:
         raise DatasetError("option odometry", f"one of {', '.join(topics) or 'no topics'}", choice.odometry)
-    told: dict[str, str] = {}
+    topic_of: dict[str, str] = {}
     for raw in bag.messages((choice.odometry,) if choice.odometry else topics):
         message = bag.read(raw)
         child = str(message.child_frame_id).removeprefix("/")
-        if transforms.has_parent(child) and child not in told:
+        if transforms.has_parent(child) and child not in topic_of:
             continue
-        if told.setdefault(child, raw.topic) != raw.topic:
+        if topic_of.setdefault(child, raw.topic) != raw.topic:
             expected = f"one topic for the pose of {child!r} (--option odometry=TOPIC)"
-            raise DatasetError(bag.path, expected, f"{told[child]} and {raw.topic}")
+            raise DatasetError(bag.path, expected, f"{topic_of[child]} and {raw.topic}")
         _add(bag, raw, transforms, message.header, child, message.pose.pose, static=False)
     return transforms
 

@@ -109,16 +109,16 @@ def cross_calibration(clips: Sequence[Clip], scorer: Scorer, parameters: Paramet
     The parameters are those found on all sequences, and so is the memory. With one sequence, or without a calibration,
     the tracks are judged as they are.
     """
-    told = parameters.classes[scorer.name].calibration
-    if told is None or len(clips) == 1:
+    calibration = parameters.classes[scorer.name].calibration
+    if calibration is None or len(clips) == 1:
         return judge_calibration(clips, scorer, parameters)
-    rows = [_rows(clip, scorer, parameters, told.memory) for clip in clips]
+    rows = [_rows(clip, scorer, parameters, calibration.memory) for clip in clips]
     parts = []
     for i, clip in enumerate(clips):
         rest = [one for j, one in enumerate(rows) if j != i]
         everything = reduce(add, rest)
         if everything.true.sum() >= LEAST_MATCHED:
-            found = _fitted(everything, told.memory, _widening(rest))
+            found = _fitted(everything, calibration.memory, _widening(rest))
             parts.append(judge_calibration([clip], scorer, with_calibration(parameters, scorer.name, found)))
     return reduce(add, parts)
 
@@ -160,9 +160,9 @@ def _surprise(rows: Sequence[_Rows]) -> float:
     loss, count = 0.0, 0
     for rest, out in _left_out(rows):
         knots = _existence(rest)
-        told = np.clip(np.interp(out.evidence, knots[:, 0], knots[:, 1]), 1e-3, 1.0 - 1e-3)
-        loss -= float(np.log(np.where(out.true, told, 1.0 - told)).sum())
-        count += len(told)
+        predicted = np.clip(np.interp(out.evidence, knots[:, 0], knots[:, 1]), 1e-3, 1.0 - 1e-3)
+        loss -= float(np.log(np.where(out.true, predicted, 1.0 - predicted)).sum())
+        count += len(predicted)
     return loss / max(count, 1)
 
 

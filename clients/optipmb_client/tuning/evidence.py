@@ -48,7 +48,7 @@ def prune(
         start: the values before, by path.
         values: what the search chose.
         caution: standard errors that are taken off.
-        watch: told how far it has come.
+        watch: called with how far it has come.
 
     """
     chosen = {path: value for path, value in values.items() if value != start[path]}

@@ -1,8 +1,9 @@
 """Which score ranks tracks best: the averages over recalls hang on it, and so does the best threshold.
 
 Benchmarks rank a track by the mean of its scores. The same tracks are ranked by several scores that are known when a
-frame is told: that of the paper, x_s = [1 - exp(-x_len)] z_s; the mean of the detections' scores so far; the existence
-probability; the product and the mean of it and x_s; the evidence (`optipmb.calibration`), and the mean of it and x_s.
+frame is published: that of the paper, x_s = [1 - exp(-x_len)] z_s; the mean of the detections' scores so far; the
+existence probability; the product and the mean of it and x_s; the evidence (`optipmb.calibration`), and the mean of it
+and x_s.
 """
 
 import math
@@ -51,10 +52,10 @@ def rank(clips: Sequence[Clip], scorer: Scorer, parameters: Parameters, objectiv
     """
     probe = with_values(parameters, scorer.name, {"calibration.score_of_evidence": 1.0})
     tracked = [track_fully(clip, probe) for clip in clips]
-    told = [_scores(clip, full, parameters.nominal_period) for clip, (_, full) in zip(clips, tracked, strict=True)]
+    scores_of = [_scores(clip, full, parameters.nominal_period) for clip, (_, full) in zip(clips, tracked, strict=True)]
     scores = {
-        name: [replace(tracks, score=one[name]) for (tracks, _), one in zip(tracked, told, strict=True)]
-        for name in told[0]
+        name: [replace(tracks, score=one[name]) for (tracks, _), one in zip(tracked, scores_of, strict=True)]
+        for name in scores_of[0]
     }
     objects = [len(set(clip.truth.id[~clip.truth.ignored].tolist())) for clip in clips]
     groups = deal(objects, _GROUPS)

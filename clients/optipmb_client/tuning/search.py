@@ -127,7 +127,7 @@ class Search:
         Args:
             trials: in all, with those of earlier sessions.
             score: the score of values, which may be a guess where it is below that of the best trial so far.
-            on_trial: told of each new trial.
+            on_trial: called with each new trial.
 
         """
         done = self.outcomes()[:trials]  # with more in the file the result is that of so many all the same

@@ -164,7 +164,7 @@ def refine(
         plan: how.
         storage: the file that keeps the trials.
         context: what else the trials depend on, such as the names of the data.
-        watch: told how far it has come.
+        watch: called with how far it has come.
         executor: where sequences are tracked; by default in this process.
 
     Raises:
@@ -182,8 +182,8 @@ def refine(
     watch.note(f"calibrating {name}")
     first = calibrate(clips, scorer, base)
     work = _Work(bench, base, plan, storage, dict(context), watch, first.memory if first else None)
-    told = work.told(base, everyone).classes[name].calibration
-    work = replace(work, evidence_weight=told.score_of_evidence if told else 0.0)
+    calibration = work.calibrated(base, everyone).classes[name].calibration
+    work = replace(work, evidence_weight=calibration.score_of_evidence if calibration else 0.0)
     folds: list[FoldResult] = []
     crossed: dict[int, list[Measured]] = {}
     for number, group in enumerate(groups):
@@ -251,7 +251,7 @@ class _Work:
         """Return what is best on some sequences, which alone are looked at."""
         plain = [self.bench.variants[0][i] for i in clips]
         estimated = estimate(plain, self.name, self.base, self.bench.scorer.rules).values
-        base = self.told(with_heading_sign(self.base, self.name), clips)
+        base = self.calibrated(with_heading_sign(self.base, self.name), clips)
         space = dimensions(base, self.name, estimated, plain, everything=self.plan.everything)
         plan = asdict(self.plan)
         settings = {
@@ -308,7 +308,7 @@ class _Work:
         """
         return other if other != one and Jury(self.bench, clips, one).gain(other).gain > 0.0 else one
 
-    def told(self, base: Parameters, clips: tuple[int, ...]) -> Parameters:
+    def calibrated(self, base: Parameters, clips: tuple[int, ...]) -> Parameters:
         """Return the parameters with a calibration of their own, and with the score that ranks tracks better."""
         self.watch.note("calibrating")
         plain = self._calibrated(with_calibration(base, self.name, None), clips)

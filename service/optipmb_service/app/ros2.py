@@ -79,8 +79,8 @@ class _Work:
         self._lock = threading.Lock()
         self._filled = threading.Event()
         self._shed = 0
-        self._told_shed = 0
-        self._told_problems: dict[str, int] = {}
+        self._reported_shed = 0
+        self._reported_problems: dict[str, int] = {}
         self._next_diagnostics = 0.0
         self._turned = time.monotonic()
         self._topics = tuple(self._wanted())
@@ -228,7 +228,7 @@ class _Work:
         """Return what takes the bytes of a topic: those of the right type are read and handed over."""
 
         def take(key: graph.TopicKey, payload: bytes) -> None:
-            if key.type == wanted.type and key.hash in {wanted.hash, graph.NO_HASH}:  # else the graph has told
+            if key.type == wanted.type and key.hash in {wanted.hash, graph.NO_HASH}:  # else the graph has reported it
                 self._put(lambda: self._read(wanted, payload, receive), len(payload))
 
         return take
@@ -280,10 +280,10 @@ class _Work:
 
     def _diagnose(self) -> None:
         counts = self._bridge.counts
-        new = {name: one.problems - self._told_problems.get(name, 0) for name, one in counts.items()}
-        self._told_problems = {name: one.problems for name, one in counts.items()}
-        if shed := self._shed - self._told_shed:
-            self._told_shed += shed
+        new = {name: one.problems - self._reported_problems.get(name, 0) for name, one in counts.items()}
+        self._reported_problems = {name: one.problems for name, one in counts.items()}
+        if shed := self._shed - self._reported_shed:
+            self._reported_shed += shed
             log.warning("problem", code="shed", message="the bridge is too slow for what comes in", count=shed)
         if not self._settings.ros2.diagnostics:
             return

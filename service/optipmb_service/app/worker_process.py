@@ -32,7 +32,7 @@ class WorkerProcess:
 
     Args:
         index: which worker.
-        event: told of what the worker says, on the loop's thread.
+        event: called with what the worker says, on the loop's thread.
     """
 
     def __init__(self, index: int, event: Callable[[dict[str, Any]], None]) -> None:

@@ -1,7 +1,7 @@
 """What becomes of each message between ROS 2 and the service: free of the network, the clock is handed in.
 
 Detections and clouds need the pose of their frame. They wait for it, at most `tf_wait_s` and at most `WAITING` of them
-per stream, and go out in the order in which they came. What is refused or lost is counted, and told as a
+per stream, and go out in the order in which they came. What is refused or lost is counted, and reported as a
 problem of the stream.
 """
 

@@ -58,7 +58,7 @@ class Caches(Protocol):
     def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
         """Call `then` soon, on a thread that it must not keep, with what the caches of a stream hold, all frames.
 
-        It is told, too, whether all caches have answered in time.
+        It is called, too, with whether all caches have answered in time.
 
         Raises:
             TransportError: the network is closed.

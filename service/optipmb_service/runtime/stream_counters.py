@@ -41,8 +41,8 @@ class StreamCounters:
     def __init__(self, mailbox: Mailbox) -> None:
         self._mailbox = mailbox
         self._accounts = _Accounts(None, Counters(), MessageCounters(), MessageCounters())
-        self._shed_told = 0
-        self._clouds_shed_told = 0
+        self._shed_counted = 0
+        self._clouds_shed_counted = 0
 
     def receive(self, *, frame: bool) -> None:
         """Count a message that goes to the session."""
@@ -74,13 +74,13 @@ class StreamCounters:
     def shed(self) -> int:
         """Count what the mailbox shed since the last time; returns how many frames."""
         mailbox = self._mailbox
-        if mailbox.shed_frames == self._shed_told and mailbox.shed_clouds == self._clouds_shed_told:
+        if mailbox.shed_frames == self._shed_counted and mailbox.shed_clouds == self._clouds_shed_counted:
             return 0
         shed, _, clouds = mailbox.counts()
-        fresh, self._shed_told = shed - self._shed_told, shed
+        fresh, self._shed_counted = shed - self._shed_counted, shed
         traffic = self._accounts.traffic
-        traffic.clouds_shed += clouds - self._clouds_shed_told
-        self._clouds_shed_told = clouds
+        traffic.clouds_shed += clouds - self._clouds_shed_counted
+        self._clouds_shed_counted = clouds
         traffic.shed += fresh
         traffic.received += fresh
         return fresh
@@ -102,10 +102,10 @@ class StreamCounters:
     def state(self, session: Session) -> schemas.SessionState:
         """Return the state of a session with what was received and shed since it was opened."""
         shed, waiting, _ = self._mailbox.counts()
-        untold = shed - self._shed_told
+        uncounted = shed - self._shed_counted
         _, base, opened, traffic = self._accounts
         before = base.frames + base.duplicates + base.late + base.refused
-        state = session.state(shed=traffic.shed - opened.shed + untold, queue=waiting)
-        received = before + traffic.received - opened.received + untold + waiting
+        state = session.state(shed=traffic.shed - opened.shed + uncounted, queue=waiting)
+        received = before + traffic.received - opened.received + uncounted + waiting
         clouds_refused = traffic.clouds_refused - opened.clouds_refused
         return state.model_copy(update={"received": received, "clouds_refused": clouds_refused})

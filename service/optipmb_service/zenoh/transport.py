@@ -200,7 +200,7 @@ class Transport:
     def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
         """Call `then`, on a thread of the network, with what the caches of a stream hold of its detections, all frames.
 
-        It is told, too, whether all caches have answered in time.
+        It is called, too, with whether all caches have answered in time.
 
         Raises:
             TransportError: the session is closed.
