@@ -154,7 +154,10 @@ class LateJoin(Generic[_S]):
                 self._sources[source] = None
                 self._keys[source] = str(sample.key_expr)
                 self._due[source] = 0
-            waiting = self._sources[source]
+            waiting, number = self._sources[source], info.source_sn
+            if waiting is None and number <= self._due[source]:  # mostly: in order, and nothing waits
+                self._hand_over(source, sample, number)
+                return
             if waiting is None:
                 gap = self._follow(source, [sample])
             else:
@@ -200,13 +203,14 @@ class LateJoin(Generic[_S]):
                 behind = self._sources[source] = samples[index:]
                 self._waiting_bytes += sum(len(one.payload) for one in behind)
                 return _Gap(due, number - 1, behind)
-            self._hand_over(source, sample)
+            self._hand_over(source, sample, number)
         return None
 
-    def _hand_over(self, source: _Source, sample: _S) -> None:
+    def _hand_over(self, source: _Source, sample: _S, number: int) -> None:
         self._receive(sample)
-        if source in self._due:
-            self._due[source] = max(self._due[source], self._number(sample) + 1)
+        due = self._due.get(source)
+        if due is not None and number >= due:  # else the publisher is forgotten, or it is a repetition
+            self._due[source] = number + 1
 
     @staticmethod
     def _number(sample: _S) -> int:
@@ -228,11 +232,11 @@ class LateJoin(Generic[_S]):
             if self._closed:
                 return
             for sample in sorted((one for one in early if one.source_info is not None), key=self._number):
-                self._hand_over(source, sample)
+                self._hand_over(source, sample, self._number(sample))
             waits = self._sources.get(source)
             if waits is gap.behind:
                 waiting = self._taken(source)
-                self._hand_over(source, waiting[0])
+                self._hand_over(source, waiting[0], self._number(waiting[0]))
                 further = self._follow(source, waiting[1:])
             # Else a later gap is still asked for, or the cache may hold what has not come.
             if complete and further is None and (waits is gap.behind or waits is None):
@@ -251,4 +255,4 @@ class LateJoin(Generic[_S]):
     def _release(self, source: _Source) -> None:
         """Hand over what waits, gaps and all: there is too much of it."""
         for sample in self._taken(source):
-            self._hand_over(source, sample)
+            self._hand_over(source, sample, self._number(sample))

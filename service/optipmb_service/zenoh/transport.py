@@ -103,19 +103,20 @@ class Transport:
         def discover(sample: zenoh.Sample) -> None:
             key = str(sample.key_expr)
             if noticed(key, sample.source_info is not None):
-                self._receive(sample, on_frame)
+                self._receive(sample, key, on_frame)
             else:
                 passed_by(key, len(sample.payload))
 
         def detected(sample: zenoh.Sample) -> None:
+            key = str(sample.key_expr)
             if self._all:
-                noticed(str(sample.key_expr), sample.source_info is not None)
-            self._receive(sample, on_frame)
+                noticed(key, sample.source_info is not None)
+            self._receive(sample, key, on_frame)
 
         self._discover = discover
         self._topics = {
             "detections": Topic("detections", self._session, detected, answered),
-            "points": Topic("points", self._session, lambda one: self._receive(one, on_cloud)),
+            "points": Topic("points", self._session, lambda one: self._receive(one, str(one.key_expr), on_cloud)),
         }
 
     def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
@@ -208,7 +209,7 @@ class Transport:
         found: list[tuple[Packet, bool]] = []
 
         def reply(sample: zenoh.Sample) -> None:
-            self._receive(sample, lambda packet: found.append((packet, True)))
+            self._receive(sample, str(sample.key_expr), lambda packet: found.append((packet, True)))
 
         try:
             ask_cache(self._session, f"{self._keys.detections(stream)}/@adv/pub/**", reply, partial(then, found))
@@ -295,12 +296,12 @@ class Transport:
         listener = self._session.info.declare_transport_events_listener(channel.handler, history=True)
         self._readers.add("links", listener, channel, _log_link)
 
-    def _receive(self, sample: zenoh.Sample, receive: Callable[[Packet], None]) -> None:
-        key = str(sample.key_expr)
+    def _receive(self, sample: zenoh.Sample, key: str, receive: Callable[[Packet], None]) -> None:
         wall_ns, now_ns = time.time_ns(), time.monotonic_ns()
-        size = len(sample.payload)
-        payload = sample.payload.to_bytes() if size <= self._max_bytes else None
-        receive(Packet(key, payload, size, str(sample.encoding), wall_ns, now_ns))
+        payload = sample.payload
+        size = len(payload)
+        data = payload.to_bytes() if size <= self._max_bytes else None
+        receive(Packet(key, data, size, str(sample.encoding), wall_ns, now_ns))
 
     # Sending
 
