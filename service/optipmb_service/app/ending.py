@@ -42,7 +42,7 @@ LAST_S: Final = 0.5
 STEP_S: Final = 1.0
 """How long the other steps of an end wait for one that may hang."""
 
-HUNG: Final = 1
+END_HUNG: Final = 1
 """Exit status of a process in which a step of the end hung."""
 
 STDERR: Final = 2
@@ -106,10 +106,10 @@ class EndBound:
     def _watch(self) -> None:
         time.sleep(self.left())
         # Not on this thread: nobody may be reading the log.
-        saying = threading.Thread(target=_say_what_hangs, args=(self._seconds,), name="end", daemon=True)
-        saying.start()
-        saying.join(0.8 * LAST_S)
-        os._exit(HUNG)
+        logging = threading.Thread(target=_log_threads, args=(self._seconds,), name="end", daemon=True)
+        logging.start()
+        logging.join(0.8 * LAST_S)
+        os._exit(END_HUNG)
 
 
 class Steps:
@@ -132,7 +132,7 @@ class Steps:
         thread.start()
         thread.join(STEP_S)
 
-    def hang(self, seconds: float) -> bool:
+    def unfinished(self, seconds: float) -> bool:
         """Whether one has not ended after so long, which is logged."""
         deadline = Deadline(seconds)
         for thread in self._threads:
@@ -156,7 +156,7 @@ def leave(status: int) -> None:
     sys.exit(status)
 
 
-def _say_what_hangs(seconds: float) -> None:
+def _log_threads(seconds: float) -> None:
     names = {thread.ident: thread.name for thread in threading.enumerate() if thread.name != "end"}
     frames = sys._current_frames()  # noqa: SLF001 - the documented way to see what threads do
     threads = {names[ident]: calls for ident, frame in frames.items() if ident in names and (calls := _calls(frame))}

@@ -10,7 +10,7 @@ import structlog
 
 from optipmb_service import __version__
 from optipmb_service.app.edges import monitoring
-from optipmb_service.app.ending import HUNG, EndBound, longest_end_s
+from optipmb_service.app.ending import END_HUNG, EndBound, longest_end_s
 from optipmb_service.app.loops import StopRequest, beat, unless
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability.health import ProcessHealth
@@ -53,7 +53,7 @@ async def run(
         beating.cancel()
     if ended is not None:
         log.info("stopped", drained=ended)
-    return HUNG if ended is False else 0
+    return END_HUNG if ended is False else 0
 
 
 async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHealth, Client], Awaitable[None]]) -> int:

@@ -187,9 +187,9 @@ class Service:
         self._member.close(ends.left())
         self._missed.close(JOIN_S)
         self._reporter.flush(time.monotonic_ns())
-        hangs = steps.hang(ends.left())
+        unfinished = steps.unfinished(ends.left())
         self._transport.close()
-        return ended and not hangs
+        return ended and not unfinished
 
     @property
     def stuck(self) -> bool:

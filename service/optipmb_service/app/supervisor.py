@@ -22,7 +22,7 @@ import structlog
 from optipmb_service import __version__
 from optipmb_service.app.aggregate import QUERIES, AggregateView
 from optipmb_service.app.edges import grpc_edge, monitoring
-from optipmb_service.app.ending import HUNG, EndBound, longest_end_s
+from optipmb_service.app.ending import END_HUNG, EndBound, longest_end_s
 from optipmb_service.app.loops import StopRequest, beat, say_ready, unless
 from optipmb_service.app.private_folder import private_folder
 from optipmb_service.app.worker_process import WorkerProcess
@@ -237,7 +237,7 @@ async def _supervised(
         with contextlib.suppress(Exception):
             await asyncio.to_thread(transport.close)
     log.info("stopped", drained=ended)
-    return supervisor.failed or (0 if ended else HUNG)
+    return supervisor.failed or (0 if ended else END_HUNG)
 
 
 def divided(settings: Settings, socket: str) -> tuple[Settings, Settings]:
