@@ -157,13 +157,16 @@ class Service:
         self._reporter.flush(now_ns)
 
     def stop(self, seconds: float = math.inf) -> bool:
-        """Let others go on, track what was received, within the grace, and close; False when a step would not end.
+        """Let others go on, track what was received, within the grace, and close.
 
         All of it takes a bounded time, so that whoever waits for the end kills nothing that is still being kept; but
         closing the network, before which all that is to be kept is written.
 
         Args:
             seconds: what is left for it.
+
+        Returns:
+            False when a step would not end, or not all checkpoints are written.
         """
         self._state = "stopping"
         grace_s = self._settings.grace_s
@@ -183,13 +186,13 @@ class Service:
         ended = self._scheduler.close(JOIN_S)
         if ended:
             self._registry.keep_now()
-        self._persistence.close(max(SAVE_S, ends.left() - LEASES_S))
+        kept = self._persistence.close(max(SAVE_S, ends.left() - LEASES_S))
         self._member.close(ends.left())
         self._missed.close(JOIN_S)
         self._reporter.flush(time.monotonic_ns())
         unfinished = steps.unfinished(ends.left())
         self._transport.close()
-        return ended and not unfinished
+        return ended and kept and not unfinished
 
     @property
     def stuck(self) -> bool:

@@ -79,10 +79,12 @@ EVENTS: Final = {
     "stop_asked": "SIGINT or SIGTERM, or the parent ends its worker; it stops within 8 s + `grace_s`, a parent of"
     " workers within 10 s + `grace_s`.",
     "stop_asked_again": "Another signal, which has no effect.",
-    "step_hangs": "`steps` of the end hang, as in Zenoh; what was to be kept is kept. The exit status is 1.",
+    "step_hangs": "`steps` of the end do not return, as in Zenoh; checkpoints are written all the same, unless"
+    " `store_failed` says otherwise. The exit status is 1.",
     "end_hangs": "The end took too long, and the process was ended with status 1. `threads` is where each thread was,"
     " the innermost call first.",
-    "stopped": "The service has stopped; `drained` is false when a step was abandoned.",
+    "stopped": "The service has stopped; `drained` is false when a step was abandoned, or not all checkpoints"
+    " are written.",
 }
 """Every event that is logged, and what an operator makes of it."""
 

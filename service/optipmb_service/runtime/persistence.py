@@ -95,8 +95,8 @@ class Persistence(Protocol):
     def forget(self, stream: str) -> None:
         """Drop what is still to be written for a stream: another instance goes on from what it has."""
 
-    def close(self, timeout: float) -> None:
-        """Write what is pending and end."""
+    def close(self, timeout: float) -> bool:
+        """Write what is pending and end; False when not all of it is written."""
 
 
 class NoPersistence:
@@ -130,8 +130,10 @@ class NoPersistence:
     def forget(self, stream: str) -> None:
         """Nothing is to be written."""
 
-    def close(self, timeout: float) -> None:
-        """Nothing is open."""
+    def close(self, timeout: float) -> bool:
+        """Nothing is open, and nothing was to be written."""
+        del timeout
+        return True
 
 
 class Leases(Protocol):
@@ -180,6 +182,7 @@ class CheckpointWriter:
         self._hurry = threading.Event()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="checkpoints", daemon=True)
+        self._whole = True
         self._store_failure = ""
         self._failed_streams: dict[str, tuple[int, str]] = {}
         self.written = 0
@@ -261,8 +264,12 @@ class CheckpointWriter:
                 if not waits or self._ended.wait(RETRY_S):
                     return None
 
-    def close(self, timeout: float) -> None:
-        """Write what is pending and end, within so long (s); to be called when nothing is tracked any more."""
+    def close(self, timeout: float) -> bool:
+        """Write what is pending and end, within so long (s); to be called when nothing is tracked any more.
+
+        Returns:
+            Whether all is written that is still this member's.
+        """
         self._ended.set()
         self._hurry.set()
         self._reading.shutdown(wait=False, cancel_futures=True)
@@ -270,6 +277,8 @@ class CheckpointWriter:
             self._thread.join(timeout)
             if self._thread.is_alive():
                 self._failed(StoreError(f"what is to be kept at the end is not written after {timeout:.1f} s"))
+                return False
+        return self._whole and not self._pending
 
     def _run(self) -> None:
         try:
@@ -320,11 +329,12 @@ class CheckpointWriter:
             self._pending = {stream: one for stream, one in self._pending.items() if stream not in streams}
         mine = {stream: one for stream, one in taken.items() if self._leases.may_write(stream, one[1])}
         # A lease that lapsed is renewed, or the stream is lost: until that is known its newest state is kept.
-        later = {
+        lapsed = {
             stream: one
             for stream, one in taken.items()
-            if stream not in mine and one[1] == self._leases.fence(stream) is not None and not self._ended.is_set()
+            if stream not in mine and one[1] == self._leases.fence(stream) is not None
         }
+        later = {} if self._ended.is_set() else lapsed
         try:
             encoded = self._encoded({stream: checkpoint for stream, (checkpoint, _) in mine.items()}) if mine else {}
             fenced = {
@@ -348,6 +358,7 @@ class CheckpointWriter:
                 log.info("store_back")
             if not (waited_for or later or self.failure):  # all sessions that changed have given their states
                 self.complete_ns = time.monotonic_ns()
+            self._whole = not (lapsed or self._failed_streams)
             for stream in lost:
                 log.warning("checkpoint_refused", stream=stream)
         with self._lock:

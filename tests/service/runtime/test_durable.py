@@ -67,7 +67,10 @@ def test_an_idle_session_is_kept_and_goes_on(start: Callable[..., Any], tmp_path
 
 
 def test_a_store_that_hangs_keeps_no_end_waiting(start: Callable[..., Any], tmp_path: Path) -> None:
-    """Whatever is waited for at the end, all of it takes less than whoever starts a process waits before a kill."""
+    """Whatever is waited for at the end, all of it takes less than whoever starts a process waits before a kill.
+
+    That nothing was kept is said.
+    """
     service, endpoint = start(store=str(tmp_path))
     with Node(endpoint) as node:
         node.send(*(SENSOR.detections(seq) for seq in range(5)))
@@ -76,7 +79,8 @@ def test_a_store_that_hangs_keeps_no_end_waiting(start: Callable[..., Any], tmp_
         for file in files:
             file._lock.acquire()  # as by a call that does not return
         began = time.monotonic()
-        ending = threading.Thread(target=service.stop)
+        ended: list[bool] = []
+        ending = threading.Thread(target=lambda: ended.append(service.stop()))
         ending.start()
         ending.join(60.0)
         took_s, hangs = time.monotonic() - began, ending.is_alive()
@@ -84,6 +88,7 @@ def test_a_store_that_hangs_keeps_no_end_waiting(start: Callable[..., Any], tmp_
             file._lock.release()
         ending.join()
     assert not hangs
+    assert ended == [False]  # nothing was kept
     assert took_s < longest_end_s(service._settings.grace_s)
 
 

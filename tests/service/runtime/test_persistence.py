@@ -163,3 +163,40 @@ def test_what_waits_for_its_lease_grows_older() -> None:
     assert (writer.written, writer.failure) == (1, "")
     writer.close(5)
     store.close()
+
+
+def test_the_end_says_whether_all_is_written() -> None:
+    """What a store refuses, and what has lost its write lease, is not written when the writer ends; else all is."""
+
+    def end(store: SqliteStore, *, lapsed: bool = False) -> bool:
+        leases = Alone(store)
+        leases.lapsed = lapsed
+        writer = CheckpointWriter(store, 60.0, leases)
+        writer.start(lambda: None)
+        writer.put(snapshot(FIRST), leases.fence(FIRST.stream))
+        whole = writer.close(60.0)
+        store.close()
+        return whole
+
+    full = Full()
+    full.full = True
+    full.may_fail.release()
+    assert end(SqliteStore(None)) is True
+    assert end(full) is False
+    assert end(SqliteStore(None), lapsed=True) is False
+
+
+def test_the_end_says_when_a_state_cannot_be_written() -> None:
+    """A stream whose newest state is too large for the store is not kept, also where that was found long before."""
+
+    class Small(SqliteStore):
+        max_bytes = 1
+
+    store, tried = Small(None), threading.Event()
+    leases = Alone(store)
+    writer = CheckpointWriter(store, 60.0, leases)
+    writer.start(lambda: None)
+    writer.put(snapshot(FIRST), leases.fence(FIRST.stream), tried.set)
+    assert tried.wait(60.0)
+    assert writer.close(60.0) is False
+    store.close()
