@@ -10,6 +10,7 @@ is what a new subscription asks Zenoh for. What caches hold from before is asked
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import deque
 from functools import partial
@@ -119,9 +120,11 @@ class Topic:
 
     def close(self, timeout: float) -> None:
         """End it; what came before is handed over within `timeout` seconds, and nothing afterwards."""
-        for _, subscriber in self._subscribers.values():
-            undeclare(subscriber)
-        self._subscribers.clear()
+        # One that does not return is left behind with its thread; whoever closes again goes on with the others.
+        with contextlib.suppress(KeyError):
+            while True:
+                _, (_, subscriber) = self._subscribers.popitem()
+                undeclare(subscriber)
         self._in_turn(self._closed.set)
         self._closed.wait(timeout)
         self._closed.set()

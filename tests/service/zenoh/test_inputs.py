@@ -6,7 +6,7 @@ import threading
 from collections import Counter
 from functools import partial
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import optipmb_service.zenoh.inputs
 import pytest
@@ -196,3 +196,20 @@ def test_a_thread_waits_while_too_many_messages_wait(network: Network, monkeypat
         for sender in senders:
             sender.join(CLOSE_S)  # a session is not closed while another thread is in it
         topic.close(CLOSE_S)
+
+
+def test_a_topic_is_closed_again_while_a_subscription_does_not_return() -> None:
+    """The end closes a topic again whose first close is stuck: each subscription is withdrawn once."""
+    withdrawn: list[str] = []
+    topic = Topic("detections", cast("zenoh.Session", None), lambda _: None)
+
+    def subscriber(name: str) -> Any:
+        def undeclare() -> None:
+            withdrawn.append(name)
+            topic.close(CLOSE_S)  # as from another thread meanwhile
+
+        return SimpleNamespace(undeclare=undeclare)
+
+    topic._subscribers = {name: ("key", subscriber(name)) for name in ("a", "b", "c")}
+    topic.close(CLOSE_S)
+    assert sorted(withdrawn) == ["a", "b", "c"]
