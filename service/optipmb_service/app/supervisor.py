@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import signal
 import sys
 import time
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -53,6 +54,9 @@ WORKERS_S: Final = 2.0
 
 OWN_END_S: Final = 0.5
 """How long a parent may take to end without workers: what is left of them before is killed."""
+
+ORDERLY: Final = frozenset({0, -signal.SIGINT, -signal.SIGTERM})
+"""Statuses of a worker that has ended as it was asked to; by these signals before it could listen to them."""
 
 State = Literal["starting", "ready", "down"]
 
@@ -159,7 +163,7 @@ class Supervisor:
             never_ready = not self._was_ready[index]
             self._set(index, "down")
             if self._asked.is_set():
-                self._hung |= status > 0  # below 0: by a signal, as before it could listen to any
+                self._hung |= status not in ORDERLY
                 return
             if never_ready and not self.began:
                 self.failed = max(status or 0, 1)  # one that was killed has a negative status

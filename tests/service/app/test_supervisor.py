@@ -15,6 +15,9 @@ from optipmb_service.app.loops import StopRequest
 from optipmb_service.app.supervisor import Supervisor
 from optipmb_service.settings.loading import load
 
+NO_BOUND: Any = SimpleNamespace(begin=lambda: True, left=lambda: 60.0)
+"""A real one would end the process of the tests."""
+
 
 @pytest.mark.parametrize(("status", "failed"), [(-9, 1), (0, 1), (3, 3)])
 async def test_a_worker_that_ends_in_its_first_start_ends_the_command(
@@ -35,6 +38,34 @@ async def test_a_worker_that_ends_in_its_first_start_ends_the_command(
     )
     await supervisor._kept(0)
     assert supervisor.failed == failed
+
+
+@pytest.mark.parametrize(
+    ("status", "orderly"), [(0, True), (-15, True), (-2, True), (1, False), (-9, False), (-11, False)]
+)
+async def test_a_worker_that_is_killed_in_its_end_is_no_orderly_end(
+    monkeypatch: pytest.MonkeyPatch, status: int, *, orderly: bool
+) -> None:
+    """One that crashes while it writes its last checkpoints counts; one that a SIGTERM to all met early does not."""
+    asked = StopRequest(NO_BOUND)
+
+    class Ending:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        async def run(self, *_: object) -> int:
+            asked.ask("test")
+            return status
+
+        def end(self) -> None:
+            pass
+
+        kill = end
+
+    monkeypatch.setattr(optipmb_service.app.supervisor, "WorkerProcess", Ending)
+    supervisor = Supervisor(load(None, {"workers": 1, "store": "none"}).settings, asked, Path("unused"))
+    assert not await supervisor.start()
+    assert await supervisor.stop() is orderly
 
 
 @pytest.mark.parametrize(("silent_s", "killed"), [(10.0, False), (2000.0, True)])
