@@ -103,15 +103,20 @@ class Supervisor:
         self.began = not self._over
         return self.began
 
+    async def end(self) -> None:
+        """Tell the workers to end."""
+        for child in self._children:
+            if child is not None:
+                child.end()
+        await asyncio.sleep(0.0)  # only the loop's next turn closes what they read from
+
     async def stop(self) -> bool:
         """End the workers; False when one hung in its end, or had to be killed."""
         if self._watching is not None:
             self._watching.cancel()
         if not self._asked.is_set():
             self._asked.ask("failed start")
-        for child in self._children:
-            if child is not None:
-                child.end()
+        await self.end()
         if not self._tasks:
             return True
         _, late = await asyncio.wait(self._tasks, timeout=max(0.0, self._asked.bound.left() - OWN_END_S))
@@ -233,6 +238,7 @@ async def _supervised(
                     say_ready("instance", settings.instance, (*settings.endpoints, *settings.connect))
                     log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
                     await asked.wait()
+                    await supervisor.end()  # before gRPC closes, which takes of the time that they have
             view.ends()
             ended = await supervisor.stop()
     finally:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import optipmb_service.app.supervisor
 import pytest
 from optipmb_service.app.ending import EndBound
 from optipmb_service.app.loops import StopRequest
-from optipmb_service.app.supervisor import Supervisor
+from optipmb_service.app.supervisor import Supervisor, _supervised
 from optipmb_service.settings.loading import load
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
 
 NO_BOUND: Any = SimpleNamespace(begin=lambda: True, left=lambda: 60.0)
 """A real one would end the process of the tests."""
@@ -66,6 +70,46 @@ async def test_a_worker_that_is_killed_in_its_end_is_no_orderly_end(
     supervisor = Supervisor(load(None, {"workers": 1, "store": "none"}).settings, asked, Path("unused"))
     assert not await supervisor.start()
     assert await supervisor.stop() is orderly
+
+
+async def test_workers_hear_of_the_end_before_grpc_closes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To close it keeps the loop for seconds, of which the workers have need."""
+    happened: list[str] = []
+    asked = StopRequest(NO_BOUND)
+
+    class Ending:
+        def __init__(self, _: int, event: Callable[[dict[str, Any]], None]) -> None:
+            self._event = event
+            self._ended = asyncio.Event()
+
+        async def run(self, *_: object) -> int:
+            self._event({"event": "ready"})
+            await self._ended.wait()
+            return 0
+
+        def end(self) -> None:
+            asyncio.get_running_loop().call_soon(self._close)  # as a pipe is closed
+
+        def _close(self) -> None:
+            happened.append("told")
+            self._ended.set()
+
+        def kill(self) -> None:
+            pass
+
+    @contextlib.contextmanager
+    def grpc(*_: object) -> Iterator[None]:
+        yield
+        happened.append("closed")
+
+    nothing = {name: lambda *_: None for name in ("watch", "serve_service", "announce", "client", "close")}
+    settings = load(None, {"workers": 1, "store": "none"}).settings
+    monkeypatch.setattr(optipmb_service.app.supervisor, "WorkerProcess", Ending)
+    monkeypatch.setattr(optipmb_service.app.supervisor, "grpc_edge", grpc)
+    monkeypatch.setattr(optipmb_service.app.supervisor, "say_ready", lambda *_: asked.ask("test"))
+    transport: Any = SimpleNamespace(**nothing)
+    assert await _supervised(settings, settings, transport, asked, Path("unused")) == 0
+    assert happened[:2] == ["told", "closed"]
 
 
 @pytest.mark.parametrize(("silent_s", "killed"), [(10.0, False), (2000.0, True)])
