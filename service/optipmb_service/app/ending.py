@@ -166,6 +166,6 @@ def _log_threads(seconds: float) -> None:
 def _calls(frame: FrameType) -> str:
     """Return what a thread does; nothing where that is nothing of this package."""
     stack = [(one.f_globals.get("__name__", ""), one, line) for one, line in traceback.walk_stack(frame)]
-    ours = [one for one in stack[1:] if one[0].partition(".")[0] == PACKAGE]
-    calls = [*stack[:1], *ours][:CALLS] if ours else []
+    ours = [one for one in stack if one[0].partition(".")[0] == PACKAGE]
+    calls = [*stack[:1], *(one for one in ours if one is not stack[0])][:CALLS] if ours else []
     return " < ".join(f"{module}.{one.f_code.co_name}:{line}" for module, one, line in calls)

@@ -6,14 +6,18 @@ import contextlib
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from optipmb_schemas import Keys, SessionState
-from optipmb_service.app.ending import LAST_S, longest_end_s
+from optipmb_service.app.ending import LAST_S, _calls, longest_end_s
 from optipmb_service.app.supervisor import WORKERS_S
 from processes import descendants, wait_until_ended
 from router import Node, Sensor
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
+
+if TYPE_CHECKING:
+    from types import FrameType
 
 HANGING = Path(__file__).parents[2] / "support" / "hanging"
 SENSOR = Sensor()
@@ -115,3 +119,17 @@ def test_a_step_that_hangs_before_the_last_checkpoint_does_not_prevent_it(tmp_pa
             assert node.tracks(SENSOR.stream, 1)[0].session == session
             assert node.ask(Keys().query(SENSOR.stream, "state"), SessionState).frames == 6
         assert service.end(signal.SIGTERM)[0] == 0
+
+
+def test_a_thread_is_listed_whose_innermost_call_is_the_only_one_of_the_package() -> None:
+    """As one that waits for a lock of C; a thread without a call of the package is not."""
+
+    def frame(module: str) -> FrameType:
+        names: dict[str, Any] = {"__name__": module}
+        exec("import sys\ndef call(): return sys._getframe()", names)  # noqa: S102 - a function of another module
+        with ThreadPoolExecutor(1) as thread:
+            found: FrameType = thread.submit(names["call"]).result()
+        return found
+
+    assert _calls(frame("optipmb_service.some")) == "optipmb_service.some.call:2"
+    assert _calls(frame("zenoh")) == ""
