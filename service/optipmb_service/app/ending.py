@@ -3,15 +3,19 @@
 Zenoh's `session.close` may hang, and so may any call into a library at the end; whoever waits for the process may have
 nothing that kills it. So a bound runs from the moment when the end begins, beside the end itself:
 
-- A thread waits for most of it, logs where every thread is, and ends the process with status 1.
+- A thread counts most of it, logs where every thread is, and ends the process with status 1.
 - What hangs with the interpreter's lock held lets no other Python run. For that case a thread of `faulthandler`,
   which needs no lock, does the same at the end of the bound, with tracebacks in place of the log line.
+
+The time for which the process is frozen (SIGSTOP, `docker pause`) does not count, as long as it does not outlast what
+is left: else the thread of `faulthandler`, which wakes up first and cannot know of it, ends the process.
 
 A step that may hang before the last checkpoints are written is done on a thread of its own (`Steps`), and left there.
 """
 
 from __future__ import annotations
 
+import contextlib
 import faulthandler
 import math
 import os
@@ -41,6 +45,12 @@ LAST_S: Final = 0.5
 
 STEP_S: Final = 1.0
 """How long the other steps of an end wait for one that may hang."""
+
+SLICE_S: Final = 0.25
+"""The time of an end is counted in slices of so long."""
+
+LATE_S: Final = 2.0
+"""What wakes up so late was frozen, or starved, with all of its process."""
 
 END_HUNG: Final = 1
 """Exit status of a process in which a step of the end hung."""
@@ -87,28 +97,49 @@ class EndBound:
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
-        self._lock = threading.Lock()
-        self._deadline: Deadline | None = None
+        self._lock = threading.RLock()  # a signal may interrupt who holds it, and begin too
+        self._begun = False
+        self._left_s = seconds - LAST_S
 
-    def begin(self) -> None:
-        """The end begins; by any thread, and again without effect."""
+    def begin(self) -> bool:
+        """The end begins; by any thread or signal handler, and again without effect.
+
+        Returns:
+            Whether it has a bound: False where no thread can be started.
+        """
         with self._lock:
-            if self._deadline is not None:
-                return
-            self._deadline = Deadline(self._seconds - LAST_S)
-        faulthandler.dump_traceback_later(self._seconds, exit=True, file=STDERR)
-        threading.Thread(target=self._watch, name="end", daemon=True).start()
+            if not self._begun:
+                self._begun = True
+                try:
+                    self._arm()
+                    threading.Thread(target=self._watch, name="end", daemon=True).start()
+                except RuntimeError:
+                    self._begun = False
+            return self._begun
 
     def left(self) -> float:
         """Return the seconds that are left for the steps of the end."""
-        return self._seconds - LAST_S if self._deadline is None else self._deadline.left()
+        return self._left_s
+
+    def _arm(self) -> None:
+        """Have the thread that needs no lock end the process, when so long has passed as is left."""
+        faulthandler.dump_traceback_later(self._left_s + LAST_S, exit=True, file=STDERR)
 
     def _watch(self) -> None:
-        time.sleep(self.left())
+        before = time.monotonic()
+        while self._left_s > 0.0:
+            time.sleep(min(SLICE_S, self._left_s))
+            now = time.monotonic()
+            if now - before < LATE_S:
+                self._left_s = max(0.0, self._left_s - (now - before))
+            else:
+                self._arm()
+            before = now
         # Not on this thread: nobody may be reading the log.
         logging = threading.Thread(target=_log_threads, args=(self._seconds,), name="end", daemon=True)
-        logging.start()
-        logging.join(0.8 * LAST_S)
+        with contextlib.suppress(RuntimeError):  # no thread can be started
+            logging.start()
+            logging.join(0.8 * LAST_S)
         os._exit(END_HUNG)
 
 
@@ -129,15 +160,17 @@ class Steps:
 
         thread = threading.Thread(target=work, name=name, daemon=True)
         self._threads.append(thread)
-        thread.start()
-        thread.join(STEP_S)
+        with contextlib.suppress(RuntimeError):  # no thread can be started: it remains unfinished
+            thread.start()
+            thread.join(STEP_S)
 
     def unfinished(self, seconds: float) -> bool:
-        """Whether one has not ended after so long, which is logged."""
+        """Whether one has not ended after so long, or could not begin, which is logged."""
         deadline = Deadline(seconds)
         for thread in self._threads:
-            thread.join(deadline.left())
-        names = [thread.name for thread in self._threads if thread.is_alive()]
+            if thread.is_alive():
+                thread.join(deadline.left())
+        names = [thread.name for thread in self._threads if thread.is_alive() or thread.ident is None]
         if names:
             log.error("step_hangs", steps=names)
         return bool(names)

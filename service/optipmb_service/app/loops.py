@@ -40,10 +40,14 @@ class StopRequest:
         self._event = asyncio.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             self._loop.add_signal_handler(number, self.ask, number.name)
+            # The loop hears of it over a descriptor, which stays; in place of a handler that does nothing, the bound
+            # begins, also where the loop hangs. Nothing else may be done there: whatever it interrupts may hold locks.
+            signal.signal(number, lambda *_: bound.begin())
 
     def ask(self, reason: str) -> None:
         """Ask for the end."""
-        self.bound.begin()  # before anything that may block, as a log that nobody reads
+        if not self.bound.begin():  # before anything that may block, as a log that nobody reads
+            log.warning("end_unbounded")
         log.info("stop_asked" if not self.is_set() else "stop_asked_again", signal=reason)
         self._event.set()
 

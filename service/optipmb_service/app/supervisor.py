@@ -23,7 +23,7 @@ import structlog
 from optipmb_service import __version__
 from optipmb_service.app.aggregate import QUERIES, AggregateView
 from optipmb_service.app.edges import grpc_edge, monitoring
-from optipmb_service.app.ending import END_HUNG, EndBound, longest_end_s
+from optipmb_service.app.ending import END_HUNG, LATE_S, SLICE_S, EndBound, longest_end_s
 from optipmb_service.app.loops import StopRequest, beat, say_ready, unless
 from optipmb_service.app.private_folder import private_folder
 from optipmb_service.app.worker_process import WorkerProcess
@@ -45,9 +45,6 @@ STEADY_S: Final = 60.0
 
 START_S: Final = 900.0
 """How long a worker may take to start: where the kernels are compiled, one compiles them and the others wait."""
-
-LATE_S: Final = 2.0
-"""A control loop that turns so late was frozen, or starved, and knows nothing of its workers."""
 
 WORKERS_S: Final = 2.0
 """How much longer the end of a parent may take than that of its workers."""
@@ -119,7 +116,10 @@ class Supervisor:
         await self.end()
         if not self._tasks:
             return True
-        _, late = await asyncio.wait(self._tasks, timeout=max(0.0, self._asked.bound.left() - OWN_END_S))
+        while True:  # the bound does not count the time for which all of them are frozen
+            _, late = await asyncio.wait(self._tasks, timeout=SLICE_S)
+            if not late or self._asked.bound.left() <= OWN_END_S:
+                break
         for child in self._children:
             if child is not None:
                 child.kill()
@@ -135,7 +135,7 @@ class Supervisor:
             now, before = time.monotonic(), turned
             turned = now
             if now - before > LATE_S:
-                # This process was frozen itself: what the workers said meanwhile is still to be read.
+                # This process was frozen itself, or starved: what the workers said meanwhile is still to be read.
                 self._heard = [now] * self.count
                 continue
             for index, child in enumerate(self._children):

@@ -83,6 +83,7 @@ EVENTS: Final = {
     " `store_failed` says otherwise. The exit status is 1.",
     "end_hangs": "The end took too long, and the process was ended with status 1. `threads` is where each thread was,"
     " the innermost call first.",
+    "end_unbounded": "No thread can be started (a limit of processes or memory): the end may take any time.",
     "stopped": "The service has stopped; `drained` is false when a step was abandoned, or not all checkpoints"
     " are written.",
 }

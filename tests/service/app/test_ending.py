@@ -3,33 +3,44 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
+import os
 import signal
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from optipmb_schemas import Keys, SessionState
-from optipmb_service.app.ending import LAST_S, _calls, longest_end_s
+from optipmb_service.app.ending import LAST_S, EndBound, Steps, _calls, longest_end_s
+from optipmb_service.app.loops import StopRequest
 from optipmb_service.app.supervisor import WORKERS_S
 from processes import descendants, wait_until_ended
 from router import Node, Sensor
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess
+from structlog.testing import capture_logs
 
 if TYPE_CHECKING:
     from types import FrameType
+
+    import pytest
 
 HANGING = Path(__file__).parents[2] / "support" / "hanging"
 SENSOR = Sensor()
 GRACE_S = 0.5
 BOUND_S = longest_end_s(GRACE_S)
+FROZEN_S = 4.0
+"""So long that it is noticed, and shorter than the bound."""
 BUSY_S = 30.0
 """How much later a busy machine may notice that a process has ended."""
 
 
 def environment(hang: str = "", **settings: object) -> dict[str, str]:
     """Return variables for a process that is to hang at a place, or nowhere."""
-    hangs = {"PYTHONPATH": str(HANGING), "HANG": hang} if hang else {}
+    path = os.pathsep.join(filter(None, (str(HANGING), os.environ.get("PYTHONPATH"))))
+    hangs = {"PYTHONPATH": path, "HANG": hang} if hang else {}
     return hangs | {f"OPTIPMB_{name}": str(value) for name, value in ({"GRACE_S": GRACE_S} | settings).items()}
 
 
@@ -119,6 +130,49 @@ def test_a_step_that_hangs_before_the_last_checkpoint_does_not_prevent_it(tmp_pa
             assert node.tracks(SENSOR.stream, 1)[0].session == session
             assert node.ask(Keys().query(SENSOR.stream, "state"), SessionState).frames == 6
         assert service.end(signal.SIGTERM)[0] == 0
+
+
+def test_a_control_loop_that_hangs_is_ended_by_the_first_signal() -> None:
+    """Where the loop turns no more, SIGTERM begins the bound all the same."""
+    with ServiceProcess(environment=environment("loop"), fresh=True) as service:
+        service.wait_log("the loop hangs")
+        status, seconds = service.end()
+    assert status == 1
+    assert seconds < BOUND_S + BUSY_S
+    assert "sitecustomize.hang" in service.errors
+
+
+def test_the_time_of_a_frozen_process_does_not_count() -> None:
+    """A process that is stopped during its end has, when it continues, what was left of its time before."""
+    with ServiceProcess("router", environment=environment("close"), fresh=True) as router:
+        router.wait_ready()
+        began = time.monotonic()
+        router.process.send_signal(signal.SIGTERM)
+        router.wait_log("stop_asked")
+        router.process.send_signal(signal.SIGSTOP)
+        time.sleep(FROZEN_S)
+        status, seconds = router.end(signal.SIGCONT)
+    assert status == 1
+    assert time.monotonic() - began > BOUND_S - LAST_S + FROZEN_S / 2
+    assert seconds < BOUND_S + BUSY_S
+    assert "end_hangs" in router.errors
+
+
+async def test_where_no_thread_can_be_started_the_end_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At a limit of processes the first signal counts, though the end has no bound; a step is not done, and said so."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(faulthandler, "dump_traceback_later", lambda *_, **__: None)
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    asked, steps = StopRequest(EndBound(60.0)), Steps()
+    with capture_logs() as logs:
+        asked.ask("SIGTERM")
+        steps.do("leaving", list)
+        assert steps.unfinished(1.0)
+    assert asked.is_set()
+    assert [one["event"] for one in logs] == ["end_unbounded", "stop_asked", "step_hangs"]
 
 
 def test_a_thread_is_listed_whose_innermost_call_is_the_only_one_of_the_package() -> None:

@@ -1,7 +1,8 @@
 """What makes the end of a process hang: Python runs it at the start of a process that has this folder on its path.
 
 `HANG` says where: `close`, in closing the Zenoh session; `lock`, there too, with the interpreter's lock held;
-`leave`, in the first step of a member's end. Workers inherit both variables from their parent.
+`leave`, in the first step of a member's end; `loop`, in its control loop, before the end. Workers inherit both
+variables from their parent.
 """
 
 import ctypes
@@ -9,6 +10,7 @@ import os
 import sys
 import time
 
+from optipmb_service.app import service
 from optipmb_service.zenoh import connection, transport
 
 LONG_S = 3600
@@ -19,6 +21,12 @@ def hang(*_: object) -> None:
     time.sleep(LONG_S)
 
 
+def hang_in_the_loop(*_: object) -> None:
+    """Say so, and wait."""
+    print("the loop hangs", file=sys.stderr, flush=True)  # noqa: T201 - the test waits for it
+    hang()
+
+
 def hang_with_the_lock(*_: object) -> None:
     """Wait in machine code that lets no other Python run."""
     ctypes.PyDLL(None).sleep(LONG_S)
@@ -26,6 +34,8 @@ def hang_with_the_lock(*_: object) -> None:
 
 if os.environ["HANG"] == "leave":
     transport.Transport.leave = hang  # type: ignore[method-assign]  # it is to hang
+elif os.environ["HANG"] == "loop":
+    service.Service.housekeeping = hang_in_the_loop  # type: ignore[method-assign]  # likewise
 else:
     real = connection.close
     for module in [one for name, one in sys.modules.items() if name.startswith("optipmb_service.zenoh")]:
