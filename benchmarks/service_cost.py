@@ -196,7 +196,7 @@ def started(tree: Path, prefix: str, router: str, opened: contextlib.ExitStack) 
 def started_bare(prefix: str, router: str, opened: contextlib.ExitStack) -> int:
     """Start `bare_service.py`; return its process."""
     command = [sys.executable, str(HERE / "benchmarks" / "bare_service.py"), router, prefix]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)  # noqa: S603 - its own
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)  # noqa: S603 - a script here
     opened.callback(process.communicate, timeout=END_S)
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"

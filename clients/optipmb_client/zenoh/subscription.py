@@ -137,7 +137,7 @@ def _on_a_daemon_thread(work: Callable[[], _Result]) -> _Result:
     def do() -> None:
         try:
             done.set_result(work())
-        except BaseException as error:  # noqa: BLE001  raised where the result is waited for
+        except BaseException as error:  # noqa: BLE001 - raised again where the result is waited for
             done.set_exception(error)
 
     threading.Thread(target=do, name="declare", daemon=True).start()

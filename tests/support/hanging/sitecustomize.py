@@ -35,9 +35,9 @@ def hang_with_the_lock(*_: object) -> None:
 if os.environ["HANG"] == "leave":
     transport.Transport.leave = hang  # type: ignore[method-assign]  # it is to hang
 elif os.environ["HANG"] == "loop":
-    service.Service.housekeeping = hang_in_the_loop  # type: ignore[method-assign]  # likewise
+    service.Service.housekeeping = hang_in_the_loop  # type: ignore[method-assign]  # the loop is to hang
 else:
     real = connection.close
     for module in [one for name, one in sys.modules.items() if name.startswith("optipmb_service.zenoh")]:
         if getattr(module, "close", None) is real:
-            module.close = hang if os.environ["HANG"] == "close" else hang_with_the_lock  # type: ignore[attr-defined]  # likewise
+            module.close = hang if os.environ["HANG"] == "close" else hang_with_the_lock  # type: ignore[attr-defined]  # it is to hang
