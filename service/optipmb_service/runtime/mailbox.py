@@ -148,11 +148,6 @@ class Mailbox:
             return "frame", self._taken(item, frames=1)
 
     @property
-    def is_empty(self) -> bool:
-        """Whether nothing waits; what comes at this moment is seen by `leave`."""
-        return not (self._urgent or self._clouds or self._frames)
-
-    @property
     def clouds_waiting(self) -> int:
         """Clouds that wait."""
         return len(self._clouds)

@@ -99,7 +99,7 @@ class StreamActor:
             if taken is None:
                 break
             self._guard(self._handle, *taken)
-            if self.mailbox.is_empty or time.monotonic_ns() >= ends_ns:
+            if time.monotonic_ns() >= ends_ns:
                 break
         paused = self._paused  # asked after `take`: a call of `ring` before that may mean that the pause has ended
         if not paused:

@@ -73,10 +73,7 @@ class StreamCounters:
 
     def shed(self) -> int:
         """Count what the mailbox shed since the last time; returns how many frames."""
-        mailbox = self._mailbox
-        if mailbox.shed_frames == self._shed_counted and mailbox.shed_clouds == self._clouds_shed_counted:
-            return 0
-        shed, _, clouds = mailbox.counts()
+        shed, _, clouds = self._mailbox.counts()
         fresh, self._shed_counted = shed - self._shed_counted, shed
         traffic = self._accounts.traffic
         traffic.clouds_shed += clouds - self._clouds_shed_counted

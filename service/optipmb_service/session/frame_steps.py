@@ -81,7 +81,7 @@ class FrameSteps:
             if now_ns is None and self._clock() >= ends_ns:
                 return [*outputs, *self._refuse_held()]
             if now_ns is not None and self._sensors.enough(taken):
-                self.has_ready = self._sensors.holds
+                self.has_ready = self._sensors.held > 0
                 break
         return outputs
 

@@ -6,8 +6,7 @@ frames and clouds of its own that wait, and no sensor waits for another.
 
 from __future__ import annotations
 
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.pending import PendingFrames
@@ -70,15 +69,10 @@ class SensorQueues:
         """Frames that are held; may be asked by any thread."""
         return sum(len(one) for one in tuple(self.pending.values()))
 
-    @property
-    def holds(self) -> bool:
-        """Whether any frame is held."""
-        return any(map(len, self.pending.values()))
-
     def enough(self, taken: int) -> bool:
         """Whether the others wait when so many were taken at once: no sensor has more bytes held than it may."""
-        policy = self._policy
-        return taken >= policy.at_once and max(map(_held_bytes, self.pending.values()), default=0) <= policy.held_bytes
+        most = self._policy.held_bytes
+        return taken >= self._policy.at_once and all(one.held_bytes <= most for one in self.pending.values())
 
     def follow(self, gone: frozenset[FrameId] = frozenset()) -> None:
         """Take over where the past is now; `gone` are the frames that have left its window."""
@@ -149,9 +143,6 @@ class SensorQueues:
                 name = min(silent, key=lambda one: (newest_ns.get(one, -1), one))
                 del self.pending[name]
                 self.quarantine.pop(name, None)
-
-
-_held_bytes: Final = attrgetter("held_bytes")
 
 
 def _earliest(one: PendingFrames) -> tuple[int, str]:
