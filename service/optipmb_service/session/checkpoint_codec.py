@@ -145,7 +145,7 @@ def _dumped(parameters: optipmb.Parameters) -> dict[str, Any]:
 
 
 def _table(values: FrameCounts | PoseHistory | Deliveries) -> dict[str, Any]:
-    return {name: getattr(values, name) for name in values.__slots__}
+    return {name: getattr(values, name) for name in values.__match_args__}
 
 
 def _packed(one: Recorded, name: str, message: schemas.Message) -> bytes:

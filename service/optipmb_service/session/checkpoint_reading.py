@@ -155,7 +155,7 @@ def _read_state(one: Document, stream: str, parameters: optipmb.Parameters, vers
         generation=one.count("generation"),
         last=None if last is None else FrameId(last.epoch("0"), last.whole("1"), last.whole("2"), of),
         tracks=one.whole("tracks"),
-        counts=FrameCounts(**one.document("counts").counts(FrameCounts.__slots__)),
+        counts=FrameCounts(**one.document("counts").counts(FrameCounts.__match_args__)),
         sensors=sensors,
     )
 

@@ -7,6 +7,7 @@ saved, so that it can be seen again.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from optipmb_service.session.dump import dump_of
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     from optipmb_service.session.fused_timeline import FusedTimeline
-    from optipmb_service.session.pending import Ready
+    from optipmb_service.session.pending import Held
     from optipmb_service.session.processed import ProcessedFrames
     from optipmb_service.session.recovery import Recovery
     from optipmb_service.session.reporting import SessionReporting
@@ -74,13 +75,14 @@ class FrameSteps:
             if (until_ns := self._sensors.recovery_ns) is not None and now_ns >= until_ns:
                 self._recovery.end()
         outputs: list[Output] = []
-        self.has_ready, taken, ends_ns = False, 0, self._clock() + FLUSH_NS
-        while ready := self._sensors.take(now_ns, self._recovery.complete_until):
-            outputs += self._process(ready)
+        self.has_ready, taken = False, 0
+        ends_ns = self._clock() + FLUSH_NS if now_ns is None else None
+        while held := self._sensors.take(now_ns, self._recovery.complete_until):
+            outputs += self._process(held)
             taken += 1
-            if now_ns is None and self._clock() >= ends_ns:
+            if ends_ns is not None and self._clock() >= ends_ns:
                 return [*outputs, *self._refuse_held()]
-            if now_ns is not None and self._sensors.enough(taken):
+            if ends_ns is None and taken >= self._sensors.at_once and self._sensors.within_bounds:
                 self.has_ready = self._sensors.held > 0
                 break
         return outputs
@@ -92,17 +94,18 @@ class FrameSteps:
             return []
         return self._go(placed, self._processed.timeline, frame_id, ticket, began_ns, behind=False)
 
-    def _process(self, ready: Ready) -> list[Output]:
+    def _process(self, held: Held) -> list[Output]:
         """Put a frame in its place."""
-        began_ns, frame_id = self._clock(), ready.held.frame_id
-        judged_by, decision, timeline = ready.held.judged
+        began_ns, entry = self._clock(), held.entry
+        judged_by, decision, timeline = held.judged
         if judged_by is not self._processed.timeline:  # others were held when it came
-            decision, timeline = self._processed.timeline.judge(frame_id)
-        if not decision.verdict.admitted:
-            self._processed.timeline = timeline
-            return self._reporting.refused(frame_id, decision)
-        placed = self._processed.placed(ready, decision, timeline)
-        return self._go(placed, timeline, frame_id, ready.held.ticket, began_ns, behind=decision.last)
+            decision, timeline = self._processed.timeline.judge(entry.frame_id)
+            if not decision.verdict.admitted:
+                self._processed.timeline = timeline
+                return self._reporting.refused(entry.frame_id, decision)
+            entry = replace(entry, place=decision.place)
+        placed = [entry] if decision.last else self._processed.placed(entry, timeline)
+        return self._go(placed, timeline, entry.frame_id, held.ticket, began_ns, behind=decision.last)
 
     def _go(
         self,
@@ -114,20 +117,22 @@ class FrameSteps:
         *,
         behind: bool,
     ) -> list[Output]:
-        """Go through frames with what is new among them; when a step raises, the sensor is quarantined."""
+        """Go through frames, see `ProcessedFrames.go`; when a step raises, the sensor is quarantined."""
         processed = self._processed
         before = processed.head.session
         try:
             outcomes = processed.go(placed, behind=behind)
         except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
-            return self._fail(error, placed, frame_id)
+            return self._fail(error, [*processed.entries, *placed] if behind else placed, frame_id)
         gone = processed.settle(timeline)
         self._sensors.follow(gone)
         self._reporting.deliveries.inserted += not behind
-        begun = self._reporting.begun(outcomes, before, processed.head.session)
+        session = processed.head.session
+        outputs = [] if session == before else self._reporting.begun(outcomes, session)
         took_ns = self._clock() - began_ns
         parameters = processed.transition.parameters
-        return [*begun, *self._reporting.tracked(outcomes, parameters, ticket, took_ns, self.run)]
+        outputs += self._reporting.tracked(outcomes, parameters, ticket, took_ns, self.run)
+        return outputs
 
     def _refuse_held(self) -> list[Output]:
         """Refuse all frames that are held, with a problem for each sensor."""

@@ -18,11 +18,13 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from optipmb_service.session.seen_numbers import WINDOW, SeenNumbers, complete_until, number_of, remembered
-from optipmb_service.session.timeline import JUMP_FRAMES, Cursor, Decision, FrameId, Placement, Verdict
+from optipmb_service.session.timeline import JUMP_FRAMES, Cursor, Decision, FrameId, Placement, Verdict, without
 from optipmb_service.session.values import MAX_SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
+
+    from optipmb_service.session.state import FilterState
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +81,7 @@ class FusedTimeline:
 
     def places(self) -> dict[FrameId, Placement]:
         """Return where each frame of the window belongs."""
-        return dict.fromkeys(self.frame_ids, self._place)
+        return {frame_id: self._place(frame_id) for frame_id in self.frame_ids}
 
     @classmethod
     def resume(
@@ -109,12 +111,9 @@ class FusedTimeline:
         """Remember that a frame came which is not to be processed, so that it is not looked at again."""
         return replace(self, seen=self._remembering(frame_id))
 
-    def settle(self, cursors: Mapping[str, Cursor], floor: FrameId | None, gone: frozenset[FrameId]) -> FusedTimeline:
+    def settle(self, base: FilterState, gone: Sequence[FrameId]) -> FusedTimeline:
         """Return it with a later beginning of the window: `gone` are the frames that fell out of it."""
-        left = self.frame_ids[len(gone) :]  # mostly it was the oldest that went
-        if gone != frozenset(self.frame_ids[: len(gone)]):
-            left = tuple(frame_id for frame_id in self.frame_ids if frame_id not in gone)
-        return replace(self, base=cursors, floor=floor, frame_ids=left)
+        return replace(self, base=base.cursors, floor=base.last, frame_ids=without(self.frame_ids, gone))
 
     def complete_until(self, frame_id: FrameId, processed: tuple[bytes, int] | None) -> bool:
         """Whether no frame of its sensor is missing between the last one processed of its epoch and this one."""
@@ -127,9 +126,8 @@ class FusedTimeline:
 
     # How
 
-    @property
-    def _place(self) -> Placement:
-        return Placement(self.generation, self.generation, None, Verdict.NEXT, 0)
+    def _place(self, frame_id: FrameId, jump_ns: int = 0) -> Placement:
+        return Placement(self.generation, self.generation, None, Verdict.NEXT, jump_ns, frame_id.stamp_ns)
 
     def _jump_ns(self, frame_id: FrameId) -> int:
         return frame_id.stamp_ns - max(self.clock.values(), default=frame_id.stamp_ns)
@@ -178,7 +176,7 @@ class FusedTimeline:
             clock=self._moved(frame_id, seen),
             jumped=jumped,
         )
-        return Decision(opens if last else Verdict.INSERTED, self._place, last=last), timeline
+        return Decision(opens if last else Verdict.INSERTED, self._place(frame_id), last), timeline
 
     def _other_clock(self, frame_id: FrameId) -> tuple[Decision, FusedTimeline]:
         """Refuse a frame whose stamp is far from the session's clock, or begin anew on its own."""
@@ -200,11 +198,10 @@ class FusedTimeline:
             clock={sensor: stamp_ns},
             jumped={},
         )
-        place = Placement(begun.generation, begun.generation, None, Verdict.NEXT, 0)
-        return Decision(Verdict.RESTART, place, last=True), begun
+        return Decision(Verdict.RESTART, begun._place(frame_id), last=True), begun  # noqa: SLF001 - of its own kind
 
     def _refuse(self, frame_id: FrameId, verdict: Verdict) -> tuple[Decision, FusedTimeline]:
-        return Decision(verdict, replace(self._place, jump_ns=self._jump_ns(frame_id))), self
+        return Decision(verdict, self._place(frame_id, self._jump_ns(frame_id))), self
 
     def _moved(self, frame_id: FrameId, seen: Mapping[str, object]) -> Mapping[str, int]:
         """Return the clock with a frame; of sensors that are seen no more, which were not live, nothing is left."""

@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING, Any, Final
 from optipmb.records import record
 from optipmb_service.session.cloud_buffer import CloudBuffer
 from optipmb_service.session.fused_timeline import FusedTimeline
-from optipmb_service.session.state import size_of
-from optipmb_service.session.timeline import FrameId, hold_until
+from optipmb_service.session.state import Entry, size_of
+from optipmb_service.session.timeline import hold_until
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container
+    from collections.abc import Callable, Container, Sequence
 
     import optipmb_schemas as schemas
 
     import optipmb
     from optipmb_service.session.state import FilterState
-    from optipmb_service.session.timeline import Decision, Order, Timeline
+    from optipmb_service.session.timeline import Decision, FrameId, Order, Timeline
     from optipmb_service.session.values import Policy
 
     Judged = tuple[Timeline | FusedTimeline, Decision, Timeline | FusedTimeline]
@@ -42,35 +42,18 @@ class Held:
     """A frame that arrived.
 
     Attributes:
-        message: as it came.
-        frame_id: what identifies it.
-        order: where it belongs among the others.
-        frame: what the tracker takes.
-        ignored: objects left out of it.
+        entry: the frame, without its cloud until its turn has come, where it belonged when it arrived.
+        order: where that was among the others.
         deadline_ns: until when it waits for its cloud (monotonic); None: it does not.
         ticket: what the caller gave with it.
-        weight: bytes that it takes, nearly.
         judged: the timeline that it was judged by, and the decision and the timeline that came of it.
     """
 
-    message: schemas.Detections
-    frame_id: FrameId
+    entry: Entry
     order: Order
-    frame: optipmb.Frame
-    ignored: int
     deadline_ns: int | None
     ticket: Any
-    weight: int
     judged: Judged
-
-
-@record
-class Ready:
-    """A frame whose turn it is, with its cloud; `missed` says that it waited for one in vain."""
-
-    held: Held
-    points: schemas.Points | None
-    missed: bool
 
 
 _order: Final = attrgetter("order")
@@ -105,7 +88,7 @@ class PendingFrames:
             # Frames of other sensors were processed, of which the timeline with those held knows nothing.
             self._behind = False
             for one in self._held:
-                self._timeline = self._timeline.judge(one.frame_id)[1]
+                self._timeline = self._timeline.judge(one.entry.frame_id)[1]
         return self._timeline
 
     @timeline.setter
@@ -122,7 +105,7 @@ class PendingFrames:
         ticket: Any,
         judged: Judged,
     ) -> None:
-        """Put a frame where it belongs; the arguments are those of `Held`, and when it arrived (monotonic)."""
+        """Put a frame where it belongs; the arguments are of `Entry` and `Held`, and when it arrived (monotonic)."""
         deadline_ns = hold_until(
             has_points=message.has_points,
             stamp_ns=frame_id.stamp_ns,
@@ -131,12 +114,16 @@ class PendingFrames:
             cloud_wait_ns=self.policy.cloud_wait_ns,
             cloud_memory_ns=self.policy.cloud_memory_ns,
         )
-        weight, order = size_of(message), judged[1].place.order(frame_id)
+        place, weight = judged[1].place, size_of(message)
         self.held_bytes += weight
-        held = Held(message, frame_id, order, frame, ignored, deadline_ns, ticket, weight, judged)
-        insort(self._held, held, key=_order)
+        entry = Entry(frame_id, place, message, None, False, 0, frame, ignored, weight)
+        held = Held(entry, place.order(frame_id), deadline_ns, ticket, judged)
+        if self._held:
+            insort(self._held, held, key=_order)
+        else:
+            self._held.append(held)
 
-    def follow(self, past: Timeline | FusedTimeline, base: FilterState, gone: frozenset[FrameId]) -> None:
+    def follow(self, past: Timeline | FusedTimeline, base: FilterState, gone: Sequence[FrameId]) -> None:
         """Take over where the past is now.
 
         Args:
@@ -144,14 +131,14 @@ class PendingFrames:
             base: the state before its window.
             gone: the frames that have left the window.
         """
-        if gone and base.last is not None:
+        if gone and self.clouds.newest_ns is not None and base.last is not None:
             self.clouds.forget_before(base.last.stamp_ns, self.policy.gap_limit_ns)
         if not self._held:
-            self.timeline = past
+            self._timeline, self._behind = past, False
         elif isinstance(past, FusedTimeline):
             self._timeline, self._behind = past, True  # judged when it is asked for: many are let go before that
         elif gone:
-            self.timeline = self.timeline.settle(base.cursors, base.last, gone)
+            self.timeline = self.timeline.settle(base, gone)
 
     def unprocessed(self, used: Container[int]) -> list[tuple[schemas.Detections | schemas.Points, Any]]:
         """Return clouds and frames that were not gone through, frames with the ticket they came with.
@@ -160,7 +147,7 @@ class PendingFrames:
             used: of clouds, by `id`, that frames have had.
         """
         clouds = [(cloud, None) for cloud in self.clouds if id(cloud) not in used]
-        return [*clouds, *((one.message, one.ticket) for one in self._held)]
+        return [*clouds, *((one.entry.message, one.ticket) for one in self._held)]
 
     def clear(self) -> int:
         """Drop all; returns how many there were."""
@@ -172,7 +159,7 @@ class PendingFrames:
     @property
     def first(self) -> FrameId | None:
         """The earliest frame held."""
-        return self._held[0].frame_id if self._held else None
+        return self._held[0].entry.frame_id if self._held else None
 
     def deadline_ns(self, complete: Callable[[FrameId], bool]) -> int | None:
         """Return when `take` is due (monotonic); None while nothing waits.
@@ -189,8 +176,8 @@ class PendingFrames:
         self,
         now_ns: int | None,
         complete: Callable[[FrameId], bool],
-    ) -> Ready | None:
-        """Return the next frame if it is ready, None otherwise.
+    ) -> Held | None:
+        """Return the next frame if it is ready, with its cloud, None otherwise.
 
         Args:
             now_ns: monotonic time; None: nothing waits any longer.
@@ -203,20 +190,20 @@ class PendingFrames:
         many = much or len(self._held) > MAX_HELD
         if now_ns is not None and not many and self._behind_gap(head, complete):
             return None
-        points = self._cloud(head)
+        points = self._cloud(head.entry) if self.clouds.newest_ns is not None else None
         missed = points is None and head.deadline_ns is not None
         if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not (many or self._crowded(head)):
             return None
         del self._held[0]
-        self.held_bytes -= head.weight
-        return Ready(head, points, missed)
+        self.held_bytes -= head.entry.weight
+        return replace(head, entry=head.entry.given(points, missed=missed)) if points is not None or missed else head
 
-    def _cloud(self, held: Held) -> schemas.Points | None:
-        if held.message.has_points is False:
+    def _cloud(self, entry: Entry) -> schemas.Points | None:
+        if entry.message.has_points is False:
             return None
-        frame_id = held.frame_id
+        frame_id = entry.frame_id
         return self.clouds.get(
-            frame_id.epoch, frame_id.stamp_ns, lambda one: self.timeline.knows(replace(frame_id, epoch=one))
+            frame_id.epoch, frame_id.stamp_ns, lambda one: self.timeline.knows(frame_id._replace(epoch=one))
         )
 
     def _crowded(self, held: Held) -> bool:
@@ -224,7 +211,7 @@ class PendingFrames:
 
         Else one lost cloud would: each frame would find its own pushed off by the time that the one before was let go.
         """
-        return self.clouds.full_behind(held.frame_id.stamp_ns)
+        return self.clouds.full_behind(held.entry.frame_id.stamp_ns)
 
     def _behind_gap(self, head: Held, complete: Callable[[FrameId], bool]) -> bool:
-        return self.recovery_ns is not None and not complete(head.frame_id)
+        return self.recovery_ns is not None and not complete(head.entry.frame_id)

@@ -21,31 +21,24 @@ if TYPE_CHECKING:
 Position = tuple[float, float, float]
 
 
-def position_of(message: schemas.Detections) -> Position | None:
-    """Return where the sensor was in the world, m; None when the message does not say."""
-    if message.pose is None:
-        return None
-    x, y, z = (float(value) for value in message.pose.translation)
-    return x, y, z
-
-
 def judge(
-    before: PoseHistory, stamp_ns: int, position: Position | None, policy: Policy
+    before: PoseHistory, message: schemas.Detections, policy: Policy
 ) -> tuple[PoseHistory, Literal["near", "astray", "moved"]]:
     """Decide on the pose of a frame.
 
     Args:
         before: what is known from the frames before it.
-        stamp_ns: its stamp.
-        position: of its sensor; None: nothing to judge by.
+        message: the frame.
         policy: what a sensor can do.
 
     Returns:
         What is known with this frame, and whether the sensor is near where it was, astray (the frame is to be refused),
         or taken to have moved.
     """
-    if position is None or policy.max_speed <= 0:
+    if message.pose is None or policy.max_speed <= 0:
         return before, "near"
+    x, y, z = message.pose.translation.tolist()
+    position, stamp_ns = (x, y, z), message.stamp_ns
     there = PoseHistory(stamp_ns, position)
     if before.stamp_ns is None or _near(before.stamp_ns, before.position, stamp_ns, position, policy):
         return there, "near"

@@ -15,7 +15,6 @@ from optipmb_service.session.checkpoint import Recorded
 from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.reorder_window import ReorderWindow
 from optipmb_service.session.restored_window import window_of
-from optipmb_service.session.state import Entry
 from optipmb_service.session.timeline import Timeline
 from optipmb_service.session.transition import Transition, empty
 
@@ -25,9 +24,8 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     from optipmb_service.session.checkpoint import Checkpoint
-    from optipmb_service.session.pending import Ready
-    from optipmb_service.session.state import FilterState
-    from optipmb_service.session.timeline import Decision, FrameId
+    from optipmb_service.session.state import Entry, FilterState
+    from optipmb_service.session.timeline import FrameId
     from optipmb_service.session.transition import Outcome
     from optipmb_service.session.values import Lineage, Policy
 
@@ -68,20 +66,9 @@ class ProcessedFrames:
         """Whether no frame is missing between the last one tracked of its epoch and this one."""
         return self.timeline.complete_until(frame_id, self.head.sensor(frame_id.sensor).tracked)
 
-    def placed(self, ready: Ready, decision: Decision, timeline: Timeline | FusedTimeline) -> list[Entry]:
-        """Return the frames of the window with one more among them.
-
-        Args:
-            ready: the frame.
-            decision: that it is admitted.
-            timeline: with it.
-        """
-        held, points = ready.held, ready.points
-        weight = held.weight if points is None else held.weight + points.xyz.nbytes
-        entry = Entry(
-            held.frame_id, decision.place, held.message, points, ready.missed, 0, held.frame, held.ignored, weight
-        )
-        return [*self.entries, entry] if decision.last else self._history.inserted(entry, timeline.places())
+    def placed(self, entry: Entry, timeline: Timeline | FusedTimeline) -> list[Entry]:
+        """Return the frames of the window with one more among them; the timeline is that with it."""
+        return self._history.inserted(entry, timeline.places())
 
     def amended(self, points: schemas.Points, frame_id: FrameId) -> list[Entry] | None:
         """Return the frames of the window, a late cloud given to those that lack it; None when none does."""
@@ -93,17 +80,17 @@ class ProcessedFrames:
 
         Args:
             placed: the frames of the window as they are to be.
-            behind: whether the last one alone is new.
+            behind: whether `placed` is one frame that belongs behind all others and moves none.
 
         Raises:
             Exception: whatever the tracker raises.
         """
-        return self._history.append(placed[-1]) if behind else self._history.redo(placed)
+        return self._history.append(placed[0]) if behind else self._history.redo(placed)
 
-    def settle(self, timeline: Timeline | FusedTimeline) -> frozenset[FrameId]:
+    def settle(self, timeline: Timeline | FusedTimeline) -> Sequence[FrameId]:
         """Take over the timeline with what was gone through; returns the frames that have left the window by it."""
         gone = self._history.trim(self._policy)
-        self.timeline = timeline.settle(self.base.cursors, self.base.last, gone) if gone else timeline
+        self.timeline = timeline.settle(self._history.base, gone) if gone else timeline
         return gone
 
     def note(self, frame_id: FrameId) -> None:
@@ -114,7 +101,7 @@ class ProcessedFrames:
         """Go on from a moment without a way back behind it; with another transition when the profile changes."""
         self.transition = transition or self.transition
         self._history = ReorderWindow(state, self.transition.step)
-        self.timeline = self.timeline.settle(state.cursors, state.last, frozenset(self.timeline.frame_ids))
+        self.timeline = self.timeline.settle(state, self.timeline.frame_ids)
 
     def begin_anew(self) -> None:
         """Forget the density: another life of it begins, whose track ids go on."""

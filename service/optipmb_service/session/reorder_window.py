@@ -45,6 +45,7 @@ class ReorderWindow:
         self.base = base
         self.step = step
         self._entries = list(entries)
+        self._weight = sum(entry.weight for entry in entries)
         self._after: list[FilterState | None] = [None] * len(self._entries)
         if self._entries:
             self._after[-1] = head
@@ -72,6 +73,7 @@ class ReorderWindow:
         """Go on by a frame that belongs behind all others and moves none."""
         state, outcome = self.step(self.head, entry)
         self._entries.append(entry)
+        self._weight += entry.weight
         self._after.append(state)
         self.head = state
         return [outcome]
@@ -92,7 +94,7 @@ class ReorderWindow:
             published: whether detections came in that epoch; see `CloudBuffer.get`.
         """
         return [
-            replace(one, points=points, missed=False, weight=one.weight + points.xyz.nbytes, packed={})
+            one.given(points)
             if (one.frame_id.stamp_ns, one.frame_id.sensor) == (frame_id.stamp_ns, frame_id.sensor)
             and one.points is None
             and one.message.has_points is not False
@@ -122,21 +124,24 @@ class ReorderWindow:
             after.append(state)
             outcomes.append(outcome)
         self._entries = entries
+        self._weight = sum([entry.weight for entry in entries])
         self._after = [*self._after[:first], *after]
         self.head = state
         return outcomes
 
-    def trim(self, policy: Policy) -> frozenset[FrameId]:
+    def trim(self, policy: Policy) -> tuple[FrameId, ...]:
         """Let what no longer belongs to the window go; returns which frames that were."""
         sensors = max(1, len(self.head.sensors))
         keep = self._fitting(policy.rewind_ns, policy.rewind_frames * sensors, policy.rewind_bytes * sensors)
         cut = len(self._entries) - keep
         if not cut:
-            return frozenset()
+            return ()
         self.base = self.state(cut)
-        gone = frozenset([entry.frame_id for entry in self._entries[:cut]])
+        gone = self._entries[:cut]
         del self._entries[:cut], self._after[:cut]
-        return gone
+        for entry in gone:
+            self._weight -= entry.weight
+        return tuple([entry.frame_id for entry in gone])
 
     def portable(self, most_bytes: int) -> tuple[FilterState, tuple[Entry, ...]]:
         """Return the beginning and the frames of the longest part of the window that takes at most so many bytes."""
@@ -146,19 +151,19 @@ class ReorderWindow:
     def _fitting(self, span_ns: int | None, most: int, most_bytes: int) -> int:
         """Return how many of the newest frames fit."""
         entries = self._entries
-        if span_ns != 0 and entries and len(entries) <= most and sum([one.weight for one in entries]) <= most_bytes:
+        if span_ns != 0 and entries and len(entries) <= most and self._weight <= most_bytes:
             # Mostly all but the oldest few fit, and they are of one generation: their span is that of the two ends.
             last, first = entries[-1], 0
             if span_ns is not None and entries[0].place.generation == last.place.generation:
-                since_ns = last.time_ns - span_ns
-                while entries[first].time_ns < since_ns:
+                since_ns = last.place.time_ns - span_ns
+                while entries[first].place.time_ns < since_ns:
                     first += 1
                 return len(entries) - first
         elapsed, weight, number = 0, 0, 0
         later: Entry | None = None
         for entry in reversed(self._entries):
             if later is not None and later.place.generation == entry.place.generation:
-                elapsed += later.time_ns - entry.time_ns
+                elapsed += later.place.time_ns - entry.place.time_ns
             elif later is not None and entry.frame_id.sensor:
                 break  # the clock of several sensors is not set back
             weight += entry.weight

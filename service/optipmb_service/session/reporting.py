@@ -52,13 +52,13 @@ class SessionReporting:
         self.deliveries.late += 1
         return [self.complain.late(frame_id, decision.place.jump_ns)]
 
-    def begun(self, outcomes: Sequence[Outcome], before: str, session: str) -> list[Output]:
-        """Tell of the life that frames began, the last one if there were several; of none when the id is as before."""
-        last = next((one for one in reversed(outcomes) if one.begins), None)
-        if last is None or last.begins is None or session == before:
-            return []
-        begun = Begun(session, last.begins.reason, last.begins.jump_ns)
-        return [begun] if begun.reason == "first" else [begun, self.complain.restarted(last.entry, begun)]
+    def begun(self, outcomes: Sequence[Outcome], session: str) -> list[Output]:
+        """Tell of the life with a new id that frames began, the last one if there were several."""
+        for one in reversed(outcomes):
+            if (begins := one.begins) is not None:
+                begun = Begun(session, begins.reason, begins.jump_ns)
+                return [begun] if begun.reason == "first" else [begun, self.complain.restarted(one.entry, begun)]
+        return []
 
     def tracked(
         self, outcomes: Sequence[Outcome], parameters: optipmb.Parameters, ticket: Any, took_ns: int, run: int
@@ -75,7 +75,8 @@ class SessionReporting:
         outputs: list[Output] = []
         step_ns = took_ns // max(1, len(outcomes))
         for one in outcomes:
-            outputs += self._left_out(one, parameters)
+            if one.unknown or one.tracks is None:
+                outputs += self._left_out(one, parameters)
             if one.tracks is not None:
                 self.deliveries.corrected += one.entry.revision > 0
                 outputs.append(Tracked(one.tracks, ticket, step_ns, run))

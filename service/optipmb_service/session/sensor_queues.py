@@ -13,12 +13,12 @@ from optipmb_service.session.pending import PendingFrames
 from optipmb_service.session.values import MAX_SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     import optipmb_schemas as schemas
 
     from optipmb_service.session.checkpoint import Checkpoint
-    from optipmb_service.session.pending import Ready
+    from optipmb_service.session.pending import Held
     from optipmb_service.session.processed import ProcessedFrames
     from optipmb_service.session.timeline import FrameId, Timeline
     from optipmb_service.session.values import Policy
@@ -52,7 +52,7 @@ class SensorQueues:
             pending.recovery_ns = self.recovery_ns
         return pending
 
-    def take(self, now_ns: int | None, complete: Callable[[FrameId], bool]) -> Ready | None:
+    def take(self, now_ns: int | None, complete: Callable[[FrameId], bool]) -> Held | None:
         """Take the earliest of the frames that are ready; None while none is.
 
         Args:
@@ -60,8 +60,8 @@ class SensorQueues:
             complete: whether no frame is missing before one.
         """
         for one in self.pending.values() if len(self.pending) == 1 else sorted(self.pending.values(), key=_earliest):
-            if ready := one.take(now_ns, complete):
-                return ready
+            if held := one.take(now_ns, complete):
+                return held
         return None
 
     @property
@@ -69,15 +69,22 @@ class SensorQueues:
         """Frames that are held; may be asked by any thread."""
         return sum(len(one) for one in tuple(self.pending.values()))
 
-    def enough(self, taken: int) -> bool:
-        """Whether the others wait when so many were taken at once: no sensor has more bytes held than it may."""
-        most = self._policy.held_bytes
-        return taken >= self._policy.at_once and all(one.held_bytes <= most for one in self.pending.values())
+    @property
+    def at_once(self) -> int:
+        """How many frames are taken at once, as long as no sensor has more bytes held than it may."""
+        return self._policy.at_once
 
-    def follow(self, gone: frozenset[FrameId] = frozenset()) -> None:
+    @property
+    def within_bounds(self) -> bool:
+        """Whether no sensor has more bytes held than it may."""
+        most = self._policy.held_bytes
+        return all(one.held_bytes <= most for one in self.pending.values())
+
+    def follow(self, gone: Sequence[FrameId] = ()) -> None:
         """Take over where the past is now; `gone` are the frames that have left its window."""
+        past, base = self._processed.timeline, self._processed.base
         for one in self.pending.values():
-            one.follow(self._processed.timeline, self._processed.base, gone)
+            one.follow(past, base, gone)
 
     def begin_anew(self) -> None:
         """Take over a past that has no way back."""

@@ -6,7 +6,7 @@ two sessions that took the same frames have equal states, whatever came twice, l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING, Final
 
 from optipmb.records import record
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import optipmb
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class FrameCounts:
     """What became of the frames that were processed.
 
@@ -47,7 +47,7 @@ class FrameCounts:
     repaired: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class PoseHistory:
     """Where the sensor was, for judging where it can be.
 
@@ -80,7 +80,7 @@ class SensorState:
     cursor: Cursor = field(default_factory=Cursor)
     tracked: tuple[bytes, int] | None = None
     reported: frozenset[str] = frozenset()
-    pose_history: PoseHistory = PoseHistory()
+    pose_history: PoseHistory = field(default_factory=PoseHistory)
 
 
 _UNKNOWN: Final = SensorState()
@@ -107,7 +107,7 @@ class FilterState:
     generation: int = 0
     last: FrameId | None = None
     tracks: int = 0
-    counts: FrameCounts = FrameCounts()
+    counts: FrameCounts = field(default_factory=FrameCounts)
     sensors: Mapping[str, SensorState] = field(default_factory=dict)
 
     def sensor(self, name: str) -> SensorState:
@@ -155,16 +155,15 @@ class Entry:
     weight: int
     packed: dict[str, bytes] = field(default_factory=dict, compare=False)
 
+    def given(self, points: schemas.Points | None, *, missed: bool = False) -> Entry:
+        """Return it with a cloud, or with none for which it waited in vain."""
+        weight = self.weight if points is None else self.weight + points.xyz.nbytes
+        return replace(self, points=points, missed=missed, weight=weight, packed={})
+
     @property
     def order(self) -> Order:
         """The key by which frames are processed."""
         return self.place.order(self.frame_id)
-
-    @property
-    def time_ns(self) -> int:
-        """The stamp by which it is ordered."""
-        place = self.place
-        return self.frame_id.stamp_ns if place.at_ns is None else place.at_ns
 
 
 def size_of(message: schemas.Detections, points: schemas.Points | None = None) -> int:

@@ -18,15 +18,17 @@ Behind the window nothing moves any more. What is later than that is `Verdict.LA
 from __future__ import annotations
 
 from bisect import bisect
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from enum import StrEnum, unique
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from optipmb.records import record
 from optipmb_service.session.seen_numbers import WINDOW, SeenNumbers, complete_until, number_of, remembered
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
+
+    from optipmb_service.session.state import FilterState
 
 JUMP_FRAMES: Final = 3
 """Frames of one epoch that must agree on a jump of the stamps before it is believed."""
@@ -66,8 +68,7 @@ class Verdict(StrEnum):
 _REFUSED: Final = frozenset({Verdict.DUPLICATE, Verdict.JUMPED, Verdict.LATE, Verdict.RETIRED})
 
 
-@dataclass(frozen=True, slots=True)
-class FrameId:
+class FrameId(NamedTuple):
     """What identifies and orders a frame.
 
     Attributes:
@@ -98,6 +99,7 @@ class Placement:
         opens: whether it begins its era, and how: first, new_epoch, restart; next where it does not, unconfirmed where
             its stamp jumped and nothing follows from it yet.
         jump_ns: how far its stamp lies from the newest one before it in its publisher's order.
+        time_ns: the stamp by which it is ordered: its own, unless that cannot be believed.
     """
 
     era: int
@@ -105,17 +107,11 @@ class Placement:
     floor_ns: int | None
     opens: Verdict
     jump_ns: int
-    at_ns: int | None = None
-    """The stamp by which a frame is ordered whose own cannot be believed."""
-
-    def time_ns(self, frame_id: FrameId) -> int:
-        """Return the stamp by which the frame is ordered."""
-        return frame_id.stamp_ns if self.at_ns is None else self.at_ns
+    time_ns: int
 
     def order(self, frame_id: FrameId) -> Order:
         """Return the key by which frames are processed."""
-        time_ns = frame_id.stamp_ns if self.at_ns is None else self.at_ns
-        return self.generation, time_ns, frame_id.sensor, self.era, frame_id.seq
+        return self.generation, self.time_ns, frame_id.sensor, self.era, frame_id.seq
 
 
 @record
@@ -144,18 +140,18 @@ class Cursor:
 
     def follow(self, frame_id: FrameId, gap_limit_ns: int) -> Placement:
         """Return the place of the frame that comes next in its publisher's order."""
+        stamp_ns = frame_id.stamp_ns
         if self.epoch is None:
-            return Placement(self.era + 1, self.generation, None, Verdict.FIRST, 0)
-        jump_ns = frame_id.stamp_ns - self.newest_ns
-        if frame_id.epoch != self.epoch and 0 < jump_ns <= gap_limit_ns:
-            return Placement(self.era + 1, self.generation, self.newest_ns, Verdict.NEW_EPOCH, jump_ns)
-        if frame_id.epoch == self.epoch and abs(jump_ns) > gap_limit_ns and self._agreeing(frame_id) < JUMP_FRAMES:
-            return Placement(
-                self.era, self.generation, self.floor_ns, Verdict.UNCONFIRMED, jump_ns, at_ns=self.newest_ns
-            )
-        if frame_id.epoch != self.epoch or abs(jump_ns) > gap_limit_ns:
-            return Placement(self.era + 1, self.generation + 1, None, Verdict.RESTART, jump_ns)
-        return Placement(self.era, self.generation, self.floor_ns, Verdict.NEXT, jump_ns)
+            return Placement(self.era + 1, self.generation, None, Verdict.FIRST, 0, stamp_ns)
+        jump_ns = stamp_ns - self.newest_ns
+        if frame_id.epoch == self.epoch:
+            if -gap_limit_ns <= jump_ns <= gap_limit_ns:
+                return Placement(self.era, self.generation, self.floor_ns, Verdict.NEXT, jump_ns, stamp_ns)
+            if self._agreeing(frame_id) < JUMP_FRAMES:
+                return Placement(self.era, self.generation, self.floor_ns, Verdict.UNCONFIRMED, jump_ns, self.newest_ns)
+        elif 0 < jump_ns <= gap_limit_ns:
+            return Placement(self.era + 1, self.generation, self.newest_ns, Verdict.NEW_EPOCH, jump_ns, stamp_ns)
+        return Placement(self.era + 1, self.generation + 1, None, Verdict.RESTART, jump_ns, stamp_ns)
 
     def after(self, frame_id: FrameId, place: Placement) -> Cursor:
         """Return the course after a frame at its place."""
@@ -213,6 +209,8 @@ class Timeline:
 
     def judge(self, frame_id: FrameId) -> tuple[Decision, Timeline]:
         """Decide on a frame that arrived; the second result replaces this timeline."""
+        if self.epochs and self.epochs[-1].epoch == frame_id.epoch and frame_id.seq > self.epochs[-1].highest:
+            return self._append(frame_id)
         number = self._number(frame_id.epoch)
         if number < 0:
             return self._append(frame_id)
@@ -221,8 +219,7 @@ class Timeline:
             return self._refuse(frame_id, Verdict.DUPLICATE)
         if seen.highest - frame_id.seq >= WINDOW:
             return self._refuse(frame_id, Verdict.LATE)
-        newest = number == len(self.epochs) - 1 and frame_id.seq > seen.highest
-        return self._append(frame_id) if newest else self._insert(frame_id, number)
+        return self._insert(frame_id, number)
 
     def places(self) -> dict[FrameId, Placement]:
         """Return where each frame of the window belongs."""
@@ -255,13 +252,10 @@ class Timeline:
         """Remember that a frame came which is not to be processed, so that it is not looked at again."""
         return replace(self, epochs=remembered(self.epochs, frame_id))
 
-    def settle(self, cursors: Mapping[str, Cursor], floor: FrameId | None, gone: frozenset[FrameId]) -> Timeline:
+    def settle(self, base: FilterState, gone: Sequence[FrameId]) -> Timeline:
         """Return it with a later beginning of the window: `gone` are the frames that fell out of it."""
-        base = cursors.get("", Cursor())
-        frame_ids = self.frame_ids[len(gone) :]  # mostly it was the oldest that went
-        if gone != frozenset(self.frame_ids[: len(gone)]):
-            frame_ids = tuple(frame_id for frame_id in self.frame_ids if frame_id not in gone)
-        return Timeline(self.gap_limit_ns, self.epochs, base, floor, frame_ids, self.tip)
+        left = without(self.frame_ids, gone)
+        return Timeline(self.gap_limit_ns, self.epochs, base.sensor("").cursor, base.last, left, self.tip)
 
     def complete_until(self, frame_id: FrameId, processed: tuple[bytes, int] | None) -> bool:
         """Whether no frame is missing between the last one processed of its epoch and this one."""
@@ -274,14 +268,10 @@ class Timeline:
         place = self.tip.follow(frame_id, self.gap_limit_ns)
         if not self._free(frame_id, place):
             return self._refuse(frame_id, Verdict.LATE)
-        behind = place.era == self.tip.era and place.time_ns(frame_id) < self.tip.newest_ns
-        epochs, frame_ids, tip = (
-            remembered(self.epochs, frame_id),
-            (*self.frame_ids, frame_id),
-            self.tip.after(frame_id, place),
-        )
-        timeline = Timeline(self.gap_limit_ns, epochs, self.base, self.floor, frame_ids, tip)
-        return Decision(Verdict.INSERTED if behind else place.opens, place, last=not behind), timeline
+        behind = place.jump_ns < 0 and place.opens is Verdict.NEXT
+        epochs, tip = remembered(self.epochs, frame_id), self.tip.after(frame_id, place)
+        timeline = Timeline(self.gap_limit_ns, epochs, self.base, self.floor, (*self.frame_ids, frame_id), tip)
+        return Decision(Verdict.INSERTED if behind else place.opens, place, not behind), timeline
 
     def _insert(self, frame_id: FrameId, number: int) -> tuple[Decision, Timeline]:
         """Take a frame that others came before which its publisher sent after it."""
@@ -333,10 +323,20 @@ class Timeline:
 
     def _refuse(self, frame_id: FrameId, verdict: Verdict) -> tuple[Decision, Timeline]:
         jump_ns = 0 if self.tip.epoch is None else frame_id.stamp_ns - self.tip.newest_ns
-        return Decision(verdict, Placement(self.tip.era, self.tip.generation, None, verdict, jump_ns)), self
+        place = Placement(self.tip.era, self.tip.generation, None, verdict, jump_ns, frame_id.stamp_ns)
+        return Decision(verdict, place), self
 
     def _number(self, epoch: bytes | None) -> int:
         return number_of(self.epochs, epoch)
+
+
+def without(frame_ids: tuple[FrameId, ...], gone: Sequence[FrameId]) -> tuple[FrameId, ...]:
+    """Return the frames of a window but for some that have left it, mostly the oldest."""
+    number = len(gone)
+    if frame_ids[:number] == gone:
+        return frame_ids[number:]
+    left = frozenset(gone)
+    return tuple([frame_id for frame_id in frame_ids if frame_id not in left])
 
 
 def hold_until(

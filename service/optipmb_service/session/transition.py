@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import optipmb
 from optipmb.records import record
 from optipmb_service.session import convert
-from optipmb_service.session.pose_check import judge, position_of
+from optipmb_service.session.pose_check import judge
 from optipmb_service.session.state import Entry, FilterState, FrameCounts, PoseHistory, SensorState
 from optipmb_service.session.timeline import FrameId, Verdict
 from optipmb_service.session.values import MAX_LABELS, MAX_SENSORS, SECOND, total
@@ -106,9 +106,10 @@ class Transition:
             # What comes after is judged, and put in order, as if it had not been there.
             passed = _passed(before, entry, before.sensor(frame_id.sensor).pose_history, unconfirmed=1)
             return replace(passed, last=before.last), Outcome(entry, None, None, {})
-        begins, sensor = _begins(before, entry), before.sensor(frame_id.sensor)
+        sensor = before.sensor(frame_id.sensor)
+        begins = _begins(before, entry)
         known = PoseHistory() if begins else sensor.pose_history
-        pose_history, where = judge(known, frame_id.stamp_ns, position_of(entry.message), self._policy)
+        pose_history, where = judge(known, entry.message, self._policy)
         if where == "moved" and self._others_stayed(before, frame_id):
             # The sensors of a session move together: this one waits for the others to say the same.
             count = sensor.pose_history.astray + 1
@@ -242,7 +243,7 @@ def _counted(  # noqa: PLR0913 - all keywords, each a count
     succeeds = bool(frame_id.sensor) and state.sensor(frame_id.sensor).cursor.epoch not in {None, frame_id.epoch}
     return FrameCounts(
         frames=before.frames + tracked,
-        gaps=total(before.gaps, gap),
+        gaps=total(before.gaps, gap) if gap else before.gaps,
         new_epochs=before.new_epochs + (entry.place.opens in _OPENING or succeeds),
         clouds_used=before.clouds_used + used,
         clouds_missed=before.clouds_missed + entry.missed,

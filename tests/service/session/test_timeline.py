@@ -7,7 +7,10 @@ import itertools
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.session.seen_numbers import WINDOW
+from optipmb_service.session.state import FilterState, SensorState
 from optipmb_service.session.timeline import Cursor, Decision, FrameId, Timeline, Verdict, hold_until
+
+import optipmb
 
 SECOND = 1_000_000_000
 LIMIT = 5 * SECOND
@@ -20,6 +23,11 @@ def mark(seq: int, seconds: float, epoch: bytes = A) -> FrameId:
     return FrameId(epoch, seq, round(seconds * SECOND))
 
 
+def state_after(cursor: Cursor, last: FrameId | None) -> FilterState:
+    """The state before a window whose only sensor got as far as a cursor."""
+    return FilterState(optipmb.Density.empty(("car",)), "", last=last, sensors={"": SensorState(cursor)})
+
+
 def judge_all(marks: list[FrameId], *, window: bool = False) -> tuple[list[Decision], Timeline]:
     """Judge frames; without a window none can be gone behind."""
     timeline, decisions, cursor, floor = Timeline(LIMIT), [], Cursor(), None
@@ -29,7 +37,7 @@ def judge_all(marks: list[FrameId], *, window: bool = False) -> tuple[list[Decis
         if decision.verdict.admitted and not window:
             cursor = cursor.after(one, decision.place)
             floor = floor if decision.verdict is Verdict.UNCONFIRMED else one
-            timeline = timeline.settle({"": cursor}, floor, frozenset(timeline.frame_ids))
+            timeline = timeline.settle(state_after(cursor, floor), timeline.frame_ids)
     return decisions, timeline
 
 
