@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from bisect import bisect_left
 from collections import deque
 from typing import Final
@@ -18,10 +17,9 @@ SILENT_PERIODS: Final = 3
 
 
 class StreamMeter:
-    """Written by the tracking thread, read by whoever asks."""
+    """Written by the tracking thread, read by whoever asks: the interpreter copies a queue of integers in one step."""
 
     def __init__(self, now_ns: int) -> None:
-        self._lock = threading.Lock()
         self._latencies: deque[int] = deque(maxlen=LATENCIES)
         self._arrivals: deque[int] = deque(maxlen=ARRIVALS)
         self.active_ns = now_ns
@@ -33,19 +31,16 @@ class StreamMeter:
         """Note a valid message."""
         self.active_ns = max(self.active_ns, now_ns)
         if frame:
-            with self._lock:
-                self._arrivals.append(now_ns)
-                self.frame_ns = now_ns
+            self._arrivals.append(now_ns)
+            self.frame_ns = now_ns
 
     def published(self, latency_ns: int) -> None:
         """Note the time from the arrival of a frame to the publication of its tracks."""
-        with self._lock:
-            self._latencies.append(latency_ns)
+        self._latencies.append(latency_ns)
 
     def rate_hz(self, now_ns: int) -> float:
         """Return frames per second over the last `RATE_NS`, falling while none comes; 0 with fewer than two."""
-        with self._lock:
-            arrivals = list(self._arrivals)
+        arrivals = list(self._arrivals)
         if len(arrivals) < 2:  # noqa: PLR2004 - a rate needs two frames
             return 0.0
         last = arrivals[-1]
@@ -59,8 +54,7 @@ class StreamMeter:
 
     def latency_ms(self) -> tuple[float, float]:
         """Return the median and the 99th percentile over the last frames; zeros without any."""
-        with self._lock:
-            values = sorted(self._latencies)
+        values = sorted(self._latencies)
         if not values:
             return 0.0, 0.0
         return values[len(values) // 2] / 1e6, values[min(len(values) - 1, len(values) * 99 // 100)] / 1e6

@@ -148,6 +148,11 @@ class Mailbox:
             return "frame", self._taken(item, frames=1)
 
     @property
+    def empty(self) -> bool:
+        """Whether nothing waits."""
+        return not (self._frames or self._clouds or self._urgent)
+
+    @property
     def clouds_waiting(self) -> int:
         """Clouds that wait."""
         return len(self._clouds)

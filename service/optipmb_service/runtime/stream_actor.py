@@ -98,12 +98,17 @@ class StreamActor:
             taken = self.mailbox.take(urgent=self._paused)
             if taken is None:
                 break
-            self._guard(self._handle, *taken)
-            if time.monotonic_ns() >= ends_ns:
+            kind, item = taken
+            if isinstance(item, Packet):
+                self._guard(self._receive, item, frame=kind == "frame")
+            else:
+                self._guard(item)
+            if self.mailbox.empty or time.monotonic_ns() >= ends_ns:
                 break
         paused = self._paused  # asked after `take`: a call of `ring` before that may mean that the pause has ended
         if not paused:
-            self._guard(self._out.tracks.flush)
+            if self._out.tracks.waiting:
+                self._guard(self._out.tracks.flush)
             self._guard(self._settle)
         turn = self.mailbox.leave(close=not self.occupied, urgent=paused)
         if turn is None:
@@ -146,12 +151,6 @@ class StreamActor:
         except Exception as error:
             log.exception("internal_error", stream=self.stream)
             self._out.report("internal", "", "a message handled without an error", f"{type(error).__name__}: {error}")
-
-    def _handle(self, kind: str, item: Packet | Callable[[], None]) -> None:
-        if isinstance(item, Packet):
-            self._receive(item, frame=kind == "frame")
-        else:
-            item()
 
     def _settle(self) -> None:
         """Let go what has waited long enough, and ask for a turn for what has not."""

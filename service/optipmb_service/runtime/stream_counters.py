@@ -73,6 +73,8 @@ class StreamCounters:
 
     def shed(self) -> int:
         """Count what the mailbox shed since the last time; returns how many frames."""
+        if (self._mailbox.shed_frames, self._mailbox.shed_clouds) == (self._shed_counted, self._clouds_shed_counted):
+            return 0
         shed, _, clouds = self._mailbox.counts()
         fresh, self._shed_counted = shed - self._shed_counted, shed
         traffic = self._accounts.traffic

@@ -54,8 +54,8 @@ class StreamTracking:
 
     def accept(self, session: Session, packet: Packet, *, frame: bool) -> None:
         """Give a packet to a session and deliver what comes of it; refused when its stream is degraded."""
-        stream = self._stream_of(packet.origin)
-        if time.monotonic_ns() < self.limit.until_ns.get(stream, 0):
+        stream, resting = self._stream_of(packet.origin), self.limit.until_ns
+        if resting and time.monotonic_ns() < resting.get(stream, 0):
             self._counters.receive(frame=frame)
             self._counters.refuse(session, frame=frame)
             self.limit.refuse(stream)

@@ -6,12 +6,12 @@ Used by the tracking thread alone.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
 import optipmb_schemas as schemas
 import structlog
 
+from optipmb.records import record
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.values import SECOND
 
@@ -26,7 +26,7 @@ log = structlog.get_logger("optipmb_service")
 MILLISECOND: Final = 1e6
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Arrival:
     """What is known of a frame's way when its tracks come out."""
 
@@ -70,7 +70,8 @@ class TrackPublisher:
         self._metrics = metrics
         self._member = member
         self._publisher: Publisher | None = None
-        self._waiting: list[tuple[bytes, Arrival, int, int]] = []
+        self.waiting: list[tuple[bytes, Arrival, int, int]] = []
+        """What waits for the write lease."""
         self._ids = b""
         self._fence: int | None = None
 
@@ -84,7 +85,7 @@ class TrackPublisher:
 
     def close(self) -> None:
         """Withdraw the publisher; what waits is dropped: another owner publishes it."""
-        self._waiting.clear()
+        self.waiting.clear()
         self._count_tracks(b"")
         if self._publisher is not None:
             self._publisher.release()
@@ -107,14 +108,14 @@ class TrackPublisher:
             }
         )
         self._count_tracks(tracked.tracks.id.tobytes())
-        self._waiting.append((schemas.encode(tracked.tracks, delivery=delivery), ticket, waited_ns, tracked.step_ns))
+        self.waiting.append((schemas.encode(tracked.tracks, delivery=delivery), ticket, waited_ns, tracked.step_ns))
         self.flush()
 
     def flush(self) -> None:
         """Publish what waits, if the write lease holds."""
-        if not self._waiting or not self._member.may_write(self._stream, self._fence):
+        if not self.waiting or not self._member.may_write(self._stream, self._fence):
             return
-        waiting, self._waiting = self._waiting, []
+        waiting, self.waiting = self.waiting, []
         for payload, ticket, waited_ns, step_ns in waiting:
             try:
                 if self._publisher is not None:

@@ -72,14 +72,15 @@ class PendingFrames:
         self._timeline = timeline
         self._behind = False
         self.clouds = CloudBuffer(policy.clouds, policy.cloud_bytes)
-        self._held: list[Held] = []
+        self.held: list[Held] = []
+        """The frames held, in order."""
         self.held_bytes = 0
         """Bytes of the frames held, nearly."""
         self.recovery_ns: int | None = None
         """Until when frames behind a gap are held for those missing (monotonic); None: they are not."""
 
     def __len__(self) -> int:
-        return len(self._held)
+        return len(self.held)
 
     @property
     def timeline(self) -> Timeline | FusedTimeline:
@@ -87,7 +88,7 @@ class PendingFrames:
         if self._behind:
             # Frames of other sensors were processed, of which the timeline with those held knows nothing.
             self._behind = False
-            for one in self._held:
+            for one in self.held:
                 self._timeline = self._timeline.judge(one.entry.frame_id)[1]
         return self._timeline
 
@@ -118,10 +119,10 @@ class PendingFrames:
         self.held_bytes += weight
         entry = Entry(frame_id, place, message, None, False, 0, frame, ignored, weight)
         held = Held(entry, place.order(frame_id), deadline_ns, ticket, judged)
-        if self._held:
-            insort(self._held, held, key=_order)
+        if self.held:
+            insort(self.held, held, key=_order)
         else:
-            self._held.append(held)
+            self.held.append(held)
 
     def follow(self, past: Timeline | FusedTimeline, base: FilterState, gone: Sequence[FrameId]) -> None:
         """Take over where the past is now.
@@ -133,7 +134,7 @@ class PendingFrames:
         """
         if gone and self.clouds.newest_ns is not None and base.last is not None:
             self.clouds.forget_before(base.last.stamp_ns, self.policy.gap_limit_ns)
-        if not self._held:
+        if not self.held:
             self._timeline, self._behind = past, False
         elif isinstance(past, FusedTimeline):
             self._timeline, self._behind = past, True  # judged when it is asked for: many are let go before that
@@ -147,19 +148,19 @@ class PendingFrames:
             used: of clouds, by `id`, that frames have had.
         """
         clouds = [(cloud, None) for cloud in self.clouds if id(cloud) not in used]
-        return [*clouds, *((one.entry.message, one.ticket) for one in self._held)]
+        return [*clouds, *((one.entry.message, one.ticket) for one in self.held)]
 
     def clear(self) -> int:
         """Drop all; returns how many there were."""
-        count = len(self._held)
-        self._held.clear()
+        count = len(self.held)
+        self.held.clear()
         self.held_bytes = 0
         return count
 
     @property
     def first(self) -> FrameId | None:
         """The earliest frame held."""
-        return self._held[0].entry.frame_id if self._held else None
+        return self.held[0].entry.frame_id if self.held else None
 
     def deadline_ns(self, complete: Callable[[FrameId], bool]) -> int | None:
         """Return when `take` is due (monotonic); None while nothing waits.
@@ -167,9 +168,9 @@ class PendingFrames:
         Args:
             complete: whether no frame is missing before one.
         """
-        if not self._held:
+        if not self.held:
             return None
-        head = self._held[0]
+        head = self.held[0]
         return self.recovery_ns if self._behind_gap(head, complete) else head.deadline_ns
 
     def take(
@@ -183,18 +184,18 @@ class PendingFrames:
             now_ns: monotonic time; None: nothing waits any longer.
             complete: whether no frame is missing before one.
         """
-        if not self._held:
+        if not self.held:
             return None
-        head = self._held[0]
+        head = self.held[0]
         much = self.held_bytes > self.policy.held_bytes
-        many = much or len(self._held) > MAX_HELD
+        many = much or len(self.held) > MAX_HELD
         if now_ns is not None and not many and self._behind_gap(head, complete):
             return None
         points = self._cloud(head.entry) if self.clouds.newest_ns is not None else None
         missed = points is None and head.deadline_ns is not None
         if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not (many or self._crowded(head)):
             return None
-        del self._held[0]
+        del self.held[0]
         self.held_bytes -= head.entry.weight
         return replace(head, entry=head.entry.given(points, missed=missed)) if points is not None or missed else head
 

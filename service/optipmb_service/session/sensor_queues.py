@@ -60,9 +60,18 @@ class SensorQueues:
             complete: whether no frame is missing before one.
         """
         for one in self.pending.values() if len(self.pending) == 1 else sorted(self.pending.values(), key=_earliest):
-            if held := one.take(now_ns, complete):
+            if one.held and (held := one.take(now_ns, complete)):
                 return held
         return None
+
+    def deadline_ns(self, complete: Callable[[FrameId], bool]) -> int | None:
+        """Return when `take` is due (monotonic); None while nothing waits. The argument is that of `take`."""
+        earliest: int | None = None
+        for one in self.pending.values():
+            due_ns = one.deadline_ns(complete) if one.held else None
+            if due_ns is not None and (earliest is None or due_ns < earliest):
+                earliest = due_ns
+        return earliest
 
     @property
     def held(self) -> int:
@@ -145,7 +154,7 @@ class SensorQueues:
         timeline = self._processed.timeline
         if isinstance(timeline, FusedTimeline):
             live, newest_ns = timeline.live(), timeline.clock
-            silent = [name for name, one in self.pending.items() if not len(one) and name not in live]
+            silent = [name for name, one in self.pending.items() if not one.held and name not in live]
             if silent:
                 name = min(silent, key=lambda one: (newest_ns.get(one, -1), one))
                 del self.pending[name]

@@ -151,10 +151,7 @@ class Session:
     @property
     def deadline_ns(self) -> int | None:
         """When `on_tick` is due (monotonic, ns), 0: at once; None while nothing is held."""
-        if self._steps.has_ready:
-            return 0
-        due = [one.deadline_ns(self._recovery.complete_until) for one in self._sensors.pending.values() if len(one)]
-        return min([one for one in due if one is not None], default=None)
+        return 0 if self._steps.has_ready else self._sensors.deadline_ns(self._recovery.complete_until)
 
     def refuse(self) -> None:
         """Count a message of the stream that was none."""

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import optipmb_schemas as schemas
 
+from optipmb.records import record
+
 if TYPE_CHECKING:
     import optipmb
 
@@ -101,7 +103,7 @@ class Lineage:
     run: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Tracked:
     """Tracks to be published, without their delivery part.
 
