@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 import numba
 from numba.core import event
 
+from optipmb.boxing import use_constant_class
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -54,6 +56,7 @@ class _FirstCompilation(event.Listener):
         """It has compiled the function."""
 
 
+use_constant_class()
 event.register("numba:compile", _FirstCompilation())  # type: ignore[no-untyped-call]  # numba has no types
 
 

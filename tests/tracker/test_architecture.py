@@ -19,6 +19,7 @@ ALLOWED = {
     "tomllib", "types", "typing",
 }  # fmt: skip
 EXCEPTIONS = {
+    "boxing": {"llvmlite"},  # to emit the code of a conversion
     "compiled": {"logging"},  # to say why a first frame takes a minute
     "warm": {"gc"},  # to collect less often while a compiler fills the memory
     "online": {"pandas", "pyarrow"},  # to give tracks in the tables that users ask for
@@ -50,7 +51,7 @@ def own_imports(tree: ast.Module) -> set[str]:
 
 @pytest.mark.parametrize("name", MODULES)
 def test_a_module_imports_computation_only(name: str) -> None:
-    """No service, client, schemas, network, clock or randomness; logging only where kernels are compiled."""
+    """No service, client, schemas, network, clock or randomness; logging and llvmlite only for compiling."""
     assert imports(MODULES[name]) <= ALLOWED | EXCEPTIONS.get(name, set())
 
 
