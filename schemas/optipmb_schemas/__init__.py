@@ -6,7 +6,7 @@
 """
 
 from optipmb_schemas.arrays import Array
-from optipmb_schemas.codec import MESSAGES, decode, encode, encode_json, encoding_of
+from optipmb_schemas.codec import MESSAGES, decode, encode, encode_json, encoded, encoding_of
 from optipmb_schemas.columns import pack_columns, read_columns
 from optipmb_schemas.control import (
     DrainRequest,
@@ -78,6 +78,7 @@ __all__ = [
     "encode",
     "encode_dump",
     "encode_json",
+    "encoded",
     "encoding_of",
     "pack_columns",
     "path_fields",

@@ -110,6 +110,12 @@ def encode(message: Message, **others: Any) -> bytes:
     return numeric.joined(parts)
 
 
+def encoded(message: Message) -> bytes:
+    """Return what `encode` gives, without making it again where the message came as these bytes."""
+    kept: bytes | None = getattr(message, "encoded", None)
+    return encode(message) if kept is None else kept
+
+
 def _without_head(packed: bytes, count: int) -> bytes:
     """Return the fields of a packed map of so many without the head that says how many."""
     return packed[1 if count < _SMALL_MAP else 3 :]

@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optipmb_schemas.arrays import unit_quaternion
+from optipmb_schemas.blocks import ALIGNMENT
 from optipmb_schemas.fields import check_labels, check_stream
-from optipmb_schemas.layout import Layout, layout_of, stream_end
+from optipmb_schemas.layout import Layout, layout_of, stream_begin, stream_end
 from optipmb_schemas.limits import Limits
 from optipmb_schemas.messages import INT64, Detections, FieldOfView, Pose
 from optipmb_schemas.model import Message
@@ -47,6 +48,7 @@ _BLOCK: Final = frozenset({"dtype", "shape", "data"})
 _PADDED: Final = _BLOCK | {"pad"}
 _DTYPES: Final = {"i8": frozenset({"i8", "<i8"}), "f8": frozenset({"f8", "<f8"})}
 _COLUMNS: Final = (("center", 3), ("size", 3), ("yaw", 1), ("score", 1), ("velocity", 2))
+_PAD: Final = b"\xa3pad\xc4"
 _LITTLE: Final = sys.byteorder == "little"
 _FRAMES: Final = frozenset({"world", "sensor"})
 _NUMBERS: Final[dict[type[Message], tuple[tuple[str, int, float, float], ...]]] = {
@@ -68,6 +70,41 @@ _msgpack: Any = msgpack  # its type information is partial
 
 
 @dataclass(frozen=True, slots=True)
+class _Canonical:
+    """Which payloads of a layout are what `encode` gives for their message, one of them being so.
+
+    The form of three values depends on them: that of the stream, behind which large blocks are padded to a multiple of
+    `ALIGNMENT`, and of the two integers, which msgpack writes in as few bytes as it can.
+
+    Attributes:
+        multiple: of which the end of the stream may be moved; 1 where nothing is padded.
+        remainder: of that end.
+        seq: smallest integer that takes as many bytes.
+        stamp_ns: the same.
+    """
+
+    multiple: int
+    remainder: int
+    seq: int
+    stamp_ns: int
+
+    @classmethod
+    def of(cls, payload: bytes, start: int, message: Detections) -> "_Canonical":
+        """Return it of such a payload, of which the stream ends at `start`."""
+        multiple = ALIGNMENT if _PAD in payload else 1
+        return cls(multiple, start % multiple, _least(message.seq), _least(message.stamp_ns))
+
+    def holds(self, stream: bytes, start: int, message: Detections) -> bool:
+        """Whether another payload of the layout is so, of which the stream ends at `start`."""
+        return (
+            message.seq >= self.seq
+            and message.stamp_ns >= self.stamp_ns
+            and start % self.multiple == self.remainder
+            and start - len(stream) == stream_begin(len(stream))
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class _Known:
     """A layout of valid payloads, and what is the same in all of them.
 
@@ -78,6 +115,7 @@ class _Known:
         given: names of the fields that are there.
         inner: names of the fields that are maps.
         count: number of detections.
+        canonical: where a payload of the layout is what `encode` gives for its message; None: nowhere.
     """
 
     layout: Layout
@@ -86,6 +124,7 @@ class _Known:
     given: frozenset[str]
     inner: tuple[str, ...]
     count: int
+    canonical: _Canonical | None
 
 
 _known: OrderedDict[int, list[_Known]] = OrderedDict()
@@ -101,7 +140,10 @@ def read_detections(payload: bytes, limits: Limits) -> Detections | None:
         if found is not None:
             for known in _known.get(len(payload) - found[1], ()):
                 if known.limits is limits and (values := known.layout.values(payload, found[1])) is not None:
-                    return _read_known(known, found[0], values)
+                    message = _read_known(known, found[0], values)
+                    if known.canonical and known.canonical.holds(*found, message):
+                        object.__setattr__(message, "encoded", payload)
+                    return message
         message = _read(payload, limits)
         if found is not None:
             _remember(payload, found[1], message, limits)
@@ -126,6 +168,11 @@ def _read_known(known: _Known, stream: bytes, values: tuple[Any, ...]) -> Detect
     return Detections.of_valid(fields, set(known.given))
 
 
+def _least(number: int) -> int:
+    """Return the smallest integer that msgpack writes in as many bytes as one of at least 128."""
+    return next(least for least in (1 << 32, 1 << 16, 1 << 8, 1 << 7) if number >= least)
+
+
 def _taken(fields: dict[str, Any], name: str, part: str, _length: int) -> bytes:
     """Take the bytes of an array inside a field out of the values."""
     data: bytes = fields.pop(f"{name}.{part}")
@@ -143,6 +190,8 @@ def _remember(payload: bytes, start: int, message: Detections, limits: Limits) -
         return
     if (layout := layout_of(payload, start)) is None:
         return
+    from optipmb_schemas.codec import encode  # noqa: PLC0415  which imports this module
+
     names = {name.partition(".")[0] for name in layout.names}
     fields = {name: None if name in names else value for name, value in message.__dict__.items()}
     known = _Known(
@@ -152,6 +201,7 @@ def _remember(payload: bytes, start: int, message: Detections, limits: Limits) -
         frozenset(message.model_fields_set),
         tuple(name for name in _INNER if name in names),
         len(message.label),
+        _Canonical.of(payload, start, message) if encode(message) == payload else None,
     )
     alike.append(known)
     del alike[:-MOST_LAYOUTS]

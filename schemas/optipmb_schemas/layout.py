@@ -62,6 +62,11 @@ def stream_end(payload: bytes) -> tuple[bytes, int] | None:
     return payload[begin : begin + length], begin + length
 
 
+def stream_begin(length: int) -> int:
+    """Return where a stream of so many bytes begins in a payload that starts with it, as msgpack writes it."""
+    return _AT + (1 if length < len(_SHORT) else 2)
+
+
 def layout_of(payload: bytes, start: int) -> Layout | None:
     """Return the layout of a valid payload; None where it is not of the kind that comes again.
 

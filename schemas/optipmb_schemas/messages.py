@@ -100,6 +100,8 @@ class SensorMessage(Header):
 class Detections(SensorMessage):
     """The detected objects of one frame, M of them (M may be 0). One row of every array is one object."""
 
+    __slots__ = ("encoded",)  # what `encode` gives for it, if it came as these bytes; a changed copy has none
+
     labels: Labels = Field(description="Names of the classes, as `car`; all different.")
     label: Annotated[Integers, Array("i8", ("M",), 0, 255)] = Field(
         description="Class of each object as an index into `labels`, from 0."

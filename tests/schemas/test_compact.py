@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_schemas import Detections, Limits, Message, MessageError, codec, compact, decode, encode
+from optipmb_schemas import Detections, Limits, Message, MessageError, codec, compact, decode, encode, encoded
 from optipmb_schemas.compact import MOST, read_detections
 from optipmb_schemas.layout import stream_end
 from optipmb_schemas.limits import DEFAULT
@@ -49,7 +49,14 @@ def check(payload: bytes, limits: Limits = DEFAULT, made: Detections | None = No
             assert one.dtype == other.dtype
             for flag in ("C_CONTIGUOUS", "ALIGNED", "WRITEABLE"):
                 assert one.flags[flag] == other.flags[flag]
+        assert taken(read) in {None, payload}
+        assert encoded(read) == encode(made)
     return read is not None
+
+
+def taken(message: Detections) -> bytes | None:
+    """Return the bytes that a message keeps as its encoding."""
+    return getattr(message, "encoded", None)
 
 
 def arrays(message: Message) -> list[Any]:
@@ -134,6 +141,50 @@ def test_streams_share_a_layout_and_other_labels_have_another(examples: dict[str
     assert known(payload)
     assert not check(payload.replace(example.stream.encode(), b"owner" + b"/" * (len(example.stream) - 5)))
     assert not check(payload, Limits(max_detections=len(example.label) - 1))
+
+
+def test_the_bytes_of_a_known_layout_are_kept_where_encoding_gives_them_again(examples: dict[str, Message]) -> None:
+    """So for every name of a stream, unless it moves the padding; a copy that is changed has none."""
+    example = examples["Detections"].model_copy(update={"seq": 300})
+    count = 200
+    rows = {"label": np.zeros(count, int), "center": np.ones((count, 3)), "size": np.ones((count, 3))}
+    rows |= {"yaw": np.ones(count), "score": np.ones(count), "velocity": None}
+    padded = Detections(**dict(example.present()) | rows)
+    streams = ["a/b/c", "a/b/d", "a/b/c12345678", f"a/b/{'c' * 27}", f"a/b/{'c' * 28}", f"a/b/{'c' * 60}"]
+    for message, kept in (example, [True] * 6), (padded, [True, True, True, False, False, False]):
+        compact._known.clear()
+        for _ in range(2):
+            decode(encode(message.model_copy(update={"stream": "a/b/c"})), Detections)
+        read = [decode(encode(message.model_copy(update={"stream": stream})), Detections) for stream in streams]
+        assert [taken(one) is not None for one in read] == kept
+        assert all(encoded(one) == encode(one) for one in read)
+        changed = read[0].model_copy(update={"seq": 301})
+        assert taken(changed) is None
+        assert encoded(changed) == encode(changed)
+    moved = encode(padded.model_copy(update={"stream": "a/b/c"})).replace(b"\xa5a/b/c", b"\xa6a/b/cd")
+    assert known(moved)
+    assert taken(decode(moved, Detections)) is None
+
+
+def test_bytes_that_encoding_does_not_give_again_are_not_kept(examples: dict[str, Message]) -> None:
+    """Integers and names in more bytes than they need, another order of fields, other names of the number types."""
+    example = examples["Detections"].model_copy(update={"seq": 300, "stream": "a/b/c"})
+    payload = encode(example)
+    wide = payload.replace(b"\xa3seq\xcd\x01\x2c", b"\xa3seq\xce\x00\x00\x01\x2c")
+    long = payload.replace(b"\xa5a/b/c", b"\xd9\x05a/b/c")
+    other = payload.replace(b"\xa5dtype\xa2f8", b"\xa5dtype\xa3<f8")
+    fields = list(msgpack.unpackb(payload).items())
+    turned = msgpack.packb(dict([fields[0], *reversed(fields[1:])]))
+    small = payload.replace(b"\xa3seq\xcd\x01\x2c", b"\xa3seq\xcd\x00\x2c")
+    compact._known.clear()
+    stamp = b"\xa8stamp_ns\xcf"
+    early = payload.replace(stamp + example.stamp_ns.to_bytes(8, "big"), stamp + (2**32 - 1).to_bytes(8, "big"))
+    for one in (payload, wide, long, other, turned, small, early):
+        for _ in range(3):
+            read = decode(one, Detections)
+        assert known(one)
+        assert taken(read) == (payload if one is payload else None)
+        assert encoded(read) == encode(read)
 
 
 def test_layouts_that_are_remembered_are_few(examples: dict[str, Message]) -> None:

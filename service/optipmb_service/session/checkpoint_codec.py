@@ -151,7 +151,7 @@ def _table(values: FrameCounts | PoseHistory | Deliveries) -> dict[str, Any]:
 def _packed(one: Recorded, name: str, message: schemas.Message) -> bytes:
     packed = one.packed.get(name)
     if packed is None:
-        packed = one.packed[name] = schemas.encode(message)
+        packed = one.packed[name] = schemas.encoded(message)
     return packed
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from optipmb.records import record
 from optipmb_service.session.cloud_buffer import CloudBuffer
 from optipmb_service.session.fused_timeline import FusedTimeline
-from optipmb_service.session.state import Entry, size_of
+from optipmb_service.session.state import Entry, held_size, size_of
 from optipmb_service.session.timeline import hold_until
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class PendingFrames:
             cloud_memory_ns=self.policy.cloud_memory_ns,
         )
         place, weight = judged[1].place, size_of(message)
-        self.held_bytes += weight
+        self.held_bytes += held_size(message)
         entry = Entry(frame_id, place, message, None, False, 0, frame, ignored, weight)
         held = Held(entry, place.order(frame_id), deadline_ns, ticket, judged)
         if self.held:
@@ -196,7 +196,7 @@ class PendingFrames:
         if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not (many or self._crowded(head)):
             return None
         del self.held[0]
-        self.held_bytes -= head.entry.weight
+        self.held_bytes -= held_size(head.entry.message)
         return replace(head, entry=head.entry.given(points, missed=missed)) if points is not None or missed else head
 
     def _cloud(self, entry: Entry) -> schemas.Points | None:

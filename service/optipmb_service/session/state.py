@@ -172,6 +172,11 @@ def size_of(message: schemas.Detections, points: schemas.Points | None = None) -
     return 256 + row * len(message.label) + (points.xyz.nbytes if points is not None else 0)
 
 
+def held_size(message: schemas.Detections) -> int:
+    """Return the bytes that a frame takes that is held, with those that it came as."""
+    return size_of(message) + len(getattr(message, "encoded", b""))
+
+
 _ROW: Final = 8 * (1 + 3 + 3 + 1 + 1)
 """Bytes of label, center, size, yaw and score of a detection."""
 

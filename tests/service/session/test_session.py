@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sessions
-from optipmb_schemas import PATHS
+from optipmb_schemas import PATHS, Detections, decode, encode
 from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Lineage, Output, Policy, RefusedError
@@ -230,6 +230,24 @@ def test_more_than_one_at_a_time_goes_for_the_bytes_that_are_held() -> None:
         one.on_detections(SENSOR.detections(seq, objects=400, has_points=True), 0)
         assert one.held_bytes <= most
     assert one.held < before
+
+
+def test_frames_that_came_as_bytes_give_the_checkpoint_of_those_that_did_not() -> None:
+    """A checkpoint takes the bytes as they came; while frames are held, these count with what was read of them."""
+    made = [SENSOR.detections(2**20 + number, has_points=True) for number in range(10)]
+    came = [decode(encode(message), Detections) for message in (*made[:3], *made)][3:]
+    sizes = [len(getattr(message, "encoded", b"")) for message in came]
+    assert sizes == [len(encode(message)) for message in made]
+    one, other = session(), session()
+    for message, same in zip(made, came, strict=True):
+        one.on_detections(message, 0)
+        other.on_detections(same, 0)
+    assert other.held_bytes - one.held_bytes == sum(sizes)
+    assert len(tracks(one.on_tick(WAIT_NS))) == len(tracks(other.on_tick(WAIT_NS))) == 10
+    assert other.held_bytes == one.held_bytes
+    checkpoint = other.snapshot()
+    assert encode_checkpoint(checkpoint) == encode_checkpoint(one.snapshot())
+    assert all(two.packed["detections"] is two.message.encoded for two in checkpoint.window)
 
 
 def test_a_reset_takes_no_longer_than_it_may() -> None:
