@@ -1,12 +1,14 @@
 """Named arrays as plain maps of array blocks, for files in which messages are kept together with other arrays."""
 
 from collections.abc import Mapping
+from functools import lru_cache
 from math import prod
 from typing import TYPE_CHECKING, Any, Final
 
 from optipmb_schemas.errors import MessageError, invalid
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
 DTYPES: Final = {"f8": "<f8", "i8": "<i8", "b1": "?"}
@@ -15,14 +17,18 @@ MAX_DIMENSIONS: Final = 4
 
 def pack_columns(columns: Mapping[str, "NDArray[Any]"]) -> dict[str, dict[str, Any]]:
     """Return named arrays of float64, int64 or bool as blocks; equal arrays give equal blocks."""
-    import numpy as np  # noqa: PLC0415  messages alone need no numpy
-
     packed: dict[str, dict[str, Any]] = {}
     for name, column in columns.items():
-        little = np.ascontiguousarray(column, column.dtype.newbyteorder("<"))
-        dtype = f"{column.dtype.kind}{column.dtype.itemsize}"
-        packed[name] = {"dtype": dtype, "shape": list(column.shape), "data": little.tobytes()}
+        dtype, little = _form(column.dtype)
+        data = column.astype(little, copy=False).tobytes()
+        packed[name] = {"dtype": dtype, "shape": list(column.shape), "data": data}
     return packed
+
+
+@lru_cache(16)
+def _form(dtype: "np.dtype[Any]") -> "tuple[str, np.dtype[Any]]":
+    """Return the name of a number type in blocks, and the type in the byte order that they have."""
+    return f"{dtype.kind}{dtype.itemsize}", dtype.newbyteorder("<")
 
 
 def read_columns(value: object) -> "dict[str, NDArray[Any]]":
@@ -37,7 +43,7 @@ def read_columns(value: object) -> "dict[str, NDArray[Any]]":
 
 
 def _read(name: str, block: object) -> "NDArray[Any]":
-    import numpy as np  # noqa: PLC0415  as above
+    import numpy as np  # noqa: PLC0415  messages alone need no numpy
 
     if not isinstance(block, dict):
         raise invalid(name, "an array block", block)
