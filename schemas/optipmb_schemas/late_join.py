@@ -62,6 +62,21 @@ _S = TypeVar("_S", bound=_Sample)
 _Source = tuple[str, int]
 
 
+@dataclass(slots=True)
+class _Publisher(Generic[_S]):
+    """What is known of a publisher with a cache.
+
+    Attributes:
+        key: where it publishes.
+        due: the number after the highest that was handed over.
+        waiting: the samples that wait for the answer of its cache; None: none does.
+    """
+
+    key: str
+    due: int = 0
+    waiting: list[_S] | None = None
+
+
 @dataclass(frozen=True)
 class _Gap(Generic[_S]):
     """Numbers that are missing, first to last, and the samples that wait behind them."""
@@ -130,9 +145,7 @@ class LateJoin(Generic[_S]):
         self._receive = receive
         self._ask = ask
         self._on_answered = answered
-        self._sources: dict[_Source, list[_S] | None] = {}  # what waits for the answer of a cache; None: nothing does
-        self._due: dict[_Source, int] = {}  # the number after the highest that was handed over
-        self._keys: dict[_Source, str] = {}
+        self._publishers: dict[_Source, _Publisher[_S]] = {}
         self._waiting_bytes = 0
         self._lock = threading.Lock()
         self._closed = False
@@ -145,72 +158,68 @@ class LateJoin(Generic[_S]):
                 if not self._closed:
                     self._receive(sample)
             return
-        source = str(info.source_id.zid), info.source_id.eid
+        entity, number = info.source_id, info.source_sn
+        source = str(entity.zid), entity.eid
         with self._lock:
             if self._closed:
                 return
-            if source not in self._sources:
-                self._make_room()
-                self._sources[source] = None
-                self._keys[source] = str(sample.key_expr)
-                self._due[source] = 0
-            waiting, number = self._sources[source], info.source_sn
-            if waiting is None and number <= self._due[source]:  # mostly: in order, and nothing waits
-                self._hand_over(source, sample, number)
+            publisher = self._publishers.get(source) or self._added(source, str(sample.key_expr))
+            waiting = publisher.waiting
+            if waiting is None and number <= publisher.due:  # mostly: in order, and nothing waits
+                self._receive(sample)
+                if number == publisher.due:  # else it is a repetition
+                    publisher.due = number + 1
                 return
             if waiting is None:
-                gap = self._follow(source, [sample])
+                gap = self._follow(publisher, [sample])
             else:
                 gap = None
                 waiting.append(sample)
                 self._waiting_bytes += len(sample.payload)
             if len(waiting or ()) >= MAX_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
-                self._release(source)
+                self._release(publisher)
         self._ask_for(source, str(sample.key_expr), gap)
 
     def keep(self, keys: Container[str]) -> None:
         """Forget the publishers of all other keys: when they are heard again, their caches are asked once more."""
         with self._lock:
-            for source in [one for one, key in self._keys.items() if key not in keys and self._sources[one] is None]:
-                self._forget(source)
+            known = self._publishers.items()
+            for source in [one for one, of in known if of.key not in keys and of.waiting is None]:
+                del self._publishers[source]
 
     def close(self) -> None:
         """Hand over what still waits, and nothing afterwards."""
         with self._lock:
-            for waiting in self._sources.values():
-                for sample in waiting or ():
+            for publisher in self._publishers.values():
+                for sample in publisher.waiting or ():
                     self._receive(sample)
-            self._sources.clear()
-            self._keys.clear()
-            self._due.clear()
+            self._publishers.clear()
             self._closed = True
 
-    def _make_room(self) -> None:
-        """Make room for a new publisher."""
-        if len(self._sources) >= MAX_SOURCES:
-            oldest = next((source for source, waiting in self._sources.items() if waiting is None), None)
+    def _added(self, source: _Source, key: str) -> "_Publisher[_S]":
+        """Return a new publisher, in the place of the oldest where there are too many."""
+        if len(self._publishers) >= MAX_SOURCES:
+            oldest = next((one for one, publisher in self._publishers.items() if publisher.waiting is None), None)
             if oldest is not None:
-                self._forget(oldest)
+                del self._publishers[oldest]
+        publisher = self._publishers[source] = _Publisher(key)
+        return publisher
 
-    def _forget(self, source: _Source) -> None:
-        del self._sources[source], self._keys[source], self._due[source]
-
-    def _follow(self, source: _Source, samples: list[_S]) -> "_Gap[_S] | None":
+    def _follow(self, publisher: "_Publisher[_S]", samples: list[_S]) -> "_Gap[_S] | None":
         """Hand over samples of a publisher up to a gap, behind which they wait; return the gap."""
         for index, sample in enumerate(samples):
-            due, number = self._due[source], self._number(sample)
-            if number > due:
-                behind = self._sources[source] = samples[index:]
+            number = self._number(sample)
+            if number > publisher.due:
+                behind = publisher.waiting = samples[index:]
                 self._waiting_bytes += sum(len(one.payload) for one in behind)
-                return _Gap(due, number - 1, behind)
-            self._hand_over(source, sample, number)
+                return _Gap(publisher.due, number - 1, behind)
+            self._hand_over(publisher, sample)
         return None
 
-    def _hand_over(self, source: _Source, sample: _S, number: int) -> None:
+    def _hand_over(self, publisher: "_Publisher[_S] | None", sample: _S) -> None:
         self._receive(sample)
-        due = self._due.get(source)
-        if due is not None and number >= due:  # else the publisher is forgotten, or it is a repetition
-            self._due[source] = number + 1
+        if publisher is not None:  # else it is forgotten
+            publisher.due = max(publisher.due, self._number(sample) + 1)
 
     @staticmethod
     def _number(sample: _S) -> int:
@@ -231,28 +240,27 @@ class LateJoin(Generic[_S]):
         with self._lock:
             if self._closed:
                 return
+            publisher = self._publishers.get(source)
             for sample in sorted((one for one in early if one.source_info is not None), key=self._number):
-                self._hand_over(source, sample, self._number(sample))
-            waits = self._sources.get(source)
-            if waits is gap.behind:
-                waiting = self._taken(source)
-                self._hand_over(source, waiting[0], self._number(waiting[0]))
-                further = self._follow(source, waiting[1:])
+                self._hand_over(publisher, sample)
+            waits = None if publisher is None else publisher.waiting
+            if publisher is not None and waits is gap.behind:
+                waiting = self._taken(publisher)
+                self._hand_over(publisher, waiting[0])
+                further = self._follow(publisher, waiting[1:])
             # Else a later gap is still asked for, or the cache may hold what has not come.
             if complete and further is None and (waits is gap.behind or waits is None):
                 self._on_answered(key)
         self._ask_for(source, key, further)
 
-    def _taken(self, source: _Source) -> list[_S]:
+    def _taken(self, publisher: "_Publisher[_S]") -> list[_S]:
         """Take what waits of a publisher; nothing waits any longer."""
-        waiting = self._sources.get(source)
-        if waiting is None:  # released before, and perhaps forgotten since
-            return []
-        self._sources[source] = None
+        waiting = publisher.waiting or []  # nothing where it was released before
+        publisher.waiting = None
         self._waiting_bytes -= sum(len(sample.payload) for sample in waiting)
         return waiting
 
-    def _release(self, source: _Source) -> None:
+    def _release(self, publisher: "_Publisher[_S]") -> None:
         """Hand over what waits, gaps and all: there is too much of it."""
-        for sample in self._taken(source):
-            self._hand_over(source, sample, self._number(sample))
+        for sample in self._taken(publisher):
+            self._hand_over(publisher, sample)

@@ -44,6 +44,10 @@ and Zenoh would take these for lost. Heartbeats tell of what was missed.
 MOST: Final = 256
 """Messages of a topic that may wait while another thread hands over those before them."""
 
+ERROR: Final = "internal_error"
+
+PUT: Final = zenoh.SampleKind.PUT
+
 RECOVERY: Final = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
 
 
@@ -67,9 +71,10 @@ class Topic:
         self._name = name
         self._session = session
         self._receive = receive
-        self._waiting: deque[Callable[[], object]] = deque()
+        self._waiting: deque[tuple[Callable[..., object], tuple[object, ...]]] = deque()
         self._turn = threading.Lock()
-        self._closed = threading.Event()
+        self._closed = False
+        self._drained = threading.Event()
         self._subscribers: dict[str, tuple[str, Undeclared]] = {}
         self._queries: CacheQueries[zenoh.Sample] = CacheQueries(lambda *query: ask_cache(session, *query))
         self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._hand_over, self._queries.ask, answered)
@@ -112,7 +117,7 @@ class Topic:
         if left and ALL not in self._subscribers:
             kept = frozenset(key for key, _ in self._subscribers.values())
             # After what has come, which would be known again.
-            self._in_turn(partial(self._late_join.keep, kept))
+            self._in_turn(self._late_join.keep, kept)
 
     def pass_through(self, then: Callable[[], object]) -> None:
         """Call `then`, on some thread, when all that has come until now is handed over."""
@@ -125,36 +130,41 @@ class Topic:
             while True:
                 _, (_, subscriber) = self._subscribers.popitem()
                 undeclare(subscriber)
-        self._in_turn(self._closed.set)
-        self._closed.wait(timeout)
-        self._closed.set()
+        self._in_turn(self._end)
+        self._drained.wait(timeout)
+        self._end()
         self._queries.close()
         self._late_join.close()
 
     def _take(self, handle: Callable[[zenoh.Sample], None], sample: zenoh.Sample) -> None:
         """Take a sample on the thread of the network that brings it; of several links there are several threads."""
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._in_turn(partial(handle, sample))
+        if sample.kind == PUT:
+            self._in_turn(handle, sample)
 
-    def _in_turn(self, work: Callable[[], object]) -> None:
+    def _in_turn(self, work: Callable[..., object], *arguments: object) -> None:
         """Have work done after all that came before it: here, or on the thread that is doing so already."""
-        self._waiting.append(work)
+        self._waiting.append((work, arguments))
         # The thread that holds the lock looks at the queue again after it has released it, so nothing stays behind.
         # This thread waits for it only where too much is in the queue.
         while self._waiting and self._turn.acquire(blocking=len(self._waiting) > MOST):
             try:
-                while self._waiting and not self._closed.is_set():
-                    self._guarded(self._waiting.popleft())
-                if self._closed.is_set():
+                while self._waiting and not self._closed:
+                    work, arguments = self._waiting.popleft()
+                    try:
+                        work(*arguments)
+                    except Exception:
+                        log.exception(ERROR, topic=self._name)  # one message must not end the subscription
+                if self._closed:
                     self._waiting.clear()
             finally:
                 self._turn.release()
 
-    def _hand_over(self, sample: zenoh.Sample) -> None:
-        self._guarded(partial(self._receive, sample))
+    def _end(self) -> None:
+        self._closed = True
+        self._drained.set()
 
-    def _guarded(self, work: Callable[[], object]) -> None:
+    def _hand_over(self, sample: zenoh.Sample) -> None:
         try:
-            work()
+            self._receive(sample)
         except Exception:
-            log.exception("internal_error", topic=self._name)  # one message must not end the subscription
+            log.exception(ERROR, topic=self._name)  # nor what waits for its turn in `LateJoin`
