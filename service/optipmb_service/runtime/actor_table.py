@@ -72,7 +72,8 @@ class ActorTable:
             limited: whether none is made when too many streams are new.
         """
         while True:
-            actor = self._actor(stream, limited=limited)
+            # A look without the lock finds most.
+            actor = self._actors.get(stream) or self._actor(stream, limited=limited)
             if actor is None:
                 return False
             must_schedule = offer(actor)

@@ -54,15 +54,12 @@ class Admission:
             Quota(settings.node_sessions, settings.node_rate, settings.node_mb_s * MEGABYTE),
             Quota(settings.site_sessions, settings.site_rate, settings.site_mb_s * MEGABYTE),
         )
+        self.exceeded = self._quotas.exceeded
         self._lock = threading.Lock()
         self._sessions = 0
         self._lives: OrderedDict[str, Lineage] = OrderedDict()
         self._refused: dict[str, tuple[int, str]] = {}
         self._evicted: tuple[str, int] = "", 0
-
-    def exceeded(self, stream: str, size: int, now_ns: int) -> str:
-        """Take a message of a stream from its quotas; say which has no more, empty while all have."""
-        return self._quotas.exceeded(stream, size, now_ns)
 
     def room(self, stream: str) -> str:
         """Return why a further stream has no room; empty when it has. A refusal is remembered for a moment."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections import Counter, OrderedDict
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -41,6 +42,15 @@ class _Bucket:
     bytes: float
     at_ns: int
 
+    def take(self, quota: Quota, size: int, now_ns: int) -> bool:
+        """Fill it up to the present and take a message; False when it is empty."""
+        passed_s = max(0, now_ns - self.at_ns) / SECOND
+        messages = min(quota.messages, self.messages + passed_s * quota.messages)
+        filled = min(quota.bytes, self.bytes + passed_s * quota.bytes)
+        taken = (messages >= 1 or not quota.messages) and (filled > 0 or not quota.bytes)
+        self.messages, self.bytes, self.at_ns = messages - taken, filled - taken * size, now_ns
+        return taken
+
 
 class Quotas:
     """The quotas of all nodes and sites; may be used by any thread.
@@ -52,16 +62,20 @@ class Quotas:
 
     def __init__(self, node: Quota, site: Quota) -> None:
         self._quotas = {"node": node, "site": site}
+        self._rated = [(at, quota) for at, quota in enumerate((node, site)) if quota.messages or quota.bytes]
         self._lock = threading.Lock()
         self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
         self._sessions: Counter[tuple[str, str]] = Counter()
 
     def exceeded(self, stream: str, size: int, now_ns: int) -> str:
         """Take a message of a stream from its quotas; say which has no more, empty while all have."""
+        owners = _owners(stream)
         with self._lock:
-            for kind, owner in _owners(stream):
-                quota = self._quotas[kind]
-                if (quota.messages or quota.bytes) and not self._take(owner, quota, size, now_ns):
+            for at, quota in self._rated:
+                kind, owner = owners[at]
+                bucket = self._buckets.get(owner) or self._added(owner, quota, now_ns)
+                self._buckets.move_to_end(owner)
+                if not bucket.take(quota, size, now_ns):
                     return f"{kind} {owner}: at most {_said(quota)} a second"
         return ""
 
@@ -82,22 +96,11 @@ class Quotas:
                     return f"{kind} {owner}: at most {most} streams at once"
         return ""
 
-    def _take(self, owner: str, quota: Quota, size: int, now_ns: int) -> bool:
-        bucket = self._buckets.get(owner)
-        if bucket is None:
-            bucket = self._buckets[owner] = _Bucket(quota.messages, quota.bytes, now_ns)
-            if len(self._buckets) > MAX_OWNERS:
-                self._buckets.popitem(last=False)
-        self._buckets.move_to_end(owner)
-        passed_s = max(0, now_ns - bucket.at_ns) / SECOND
-        bucket.messages = min(quota.messages, bucket.messages + passed_s * quota.messages)
-        bucket.bytes = min(quota.bytes, bucket.bytes + passed_s * quota.bytes)
-        bucket.at_ns = now_ns
-        if (quota.messages and bucket.messages < 1) or (quota.bytes and bucket.bytes <= 0):
-            return False
-        bucket.messages -= 1
-        bucket.bytes -= size
-        return True
+    def _added(self, owner: str, quota: Quota, now_ns: int) -> _Bucket:
+        bucket = self._buckets[owner] = _Bucket(quota.messages, quota.bytes, now_ns)
+        if len(self._buckets) > MAX_OWNERS:
+            self._buckets.popitem(last=False)
+        return bucket
 
 
 def victim_of(stream: str, tracked: Iterable[tuple[str, int]], now_ns: int, idle_ns: int) -> str | None:
@@ -124,6 +127,7 @@ def victim_of(stream: str, tracked: Iterable[tuple[str, int]], now_ns: int, idle
     return next(other for other, _ in used if other.partition("/")[0] == largest)
 
 
+@lru_cache(MAX_OWNERS)  # asked about with each message
 def _owners(stream: str) -> tuple[tuple[str, str], tuple[str, str]]:
     site, _, rest = stream.partition("/")
     return ("node", f"{site}/{rest.partition('/')[0]}"), ("site", site)

@@ -8,8 +8,8 @@ them now and then.
 from __future__ import annotations
 
 import time
-from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import optipmb_schemas as schemas
 
@@ -94,7 +94,8 @@ class Registry:
         self._reporter = reporter
         self._scheduler = scheduler
         self._actors = ActorTable(lambda stream: StreamActor(stream, self._context), scheduler, member)
-        self._streams: dict[str, tuple[str, str]] = {}
+        self.parsed = lru_cache(MAX_KEYS)(self._parsed)
+        """Returns the stream of a key and its session, or raises MessageError where it is none."""
         self._metrics = metrics
         self._admission = Admission(settings, self._used, self._evict_for_another)
         self._rivals = Rivals(round(RIVAL_LEASES * settings.lease_s * SECOND))
@@ -158,13 +159,19 @@ class Registry:
             self._count_refused(frame=frame)
             self._report("invalid_value", "", error.expected, error.received)
             return
-        own = self._member.holds(session)
-        if not own and self.untracked.keep(session, packet, frame=frame):
-            self._metrics.foreign("detections" if frame else "points", packet.size)
+        topic: Literal["detections", "points"] = "detections" if frame else "points"
+        passes = self.untracked.passes(session)
+        if not passes and not self._member.holds(session) and self.untracked.keep(session, packet, frame=frame):
+            self._metrics.foreign(topic, packet.size)
+            return
+        self._metrics.received(topic, packet.size)
+        if exceeded := self._admission.exceeded(stream, packet.size, packet.now_ns):
+            self._count_refused(frame=frame)
+            self._report("quota", stream, exceeded, "more")
+        elif passes:
+            self._hand(session, packet, frame=frame)
         else:
-            self._metrics.received("detections" if frame else "points", packet.size)
-            if not self._over_quota(stream, packet, frame=frame):
-                self._keep(session, packet, frame=frame)
+            self._keep(session, packet, frame=frame)
 
     def caches_answered(self, key: str) -> None:
         """Tell a session that all has come which the cache of its publisher held."""
@@ -297,15 +304,6 @@ class Registry:
 
     # Room
 
-    def _over_quota(self, stream: str, packet: Packet, *, frame: bool) -> bool:
-        """Refuse a message for which its node, or site, has no more quota."""
-        exceeded = self._admission.exceeded(stream, packet.size, packet.now_ns)
-        if not exceeded:
-            return False
-        self._count_refused(frame=frame)
-        self._report("quota", stream, exceeded, "more")
-        return True
-
     def _used(self) -> list[tuple[str, int]]:
         """Return the streams with a session, and when each was last used."""
         return [(actor.stream, actor.meter.active_ns) for actor in self.actors()]
@@ -338,22 +336,11 @@ class Registry:
     def _count_refused(self, *, frame: bool) -> None:
         self._actors.count(MessageCounters(received=frame, refused=frame, clouds_refused=not frame))
 
-    def parsed(self, key: str) -> tuple[str, str]:
-        """Return the stream of a key and its session, remembered.
-
-        Raises:
-            MessageError: it is none.
-        """
-        parsed = self._streams.get(key)
-        if parsed is None:
-            stream = self.keys.stream_of(key)
-            if self.fusion.is_session(stream):
-                raise schemas.MessageError("invalid_value", "key", f"a sensor not named {FUSED}, as its tracks", key)
-            parsed = stream, self.fusion.session_of(stream)
-            if len(self._streams) >= MAX_KEYS:
-                self._streams.clear()
-            self._streams[key] = parsed
-        return parsed
+    def _parsed(self, key: str) -> tuple[str, str]:
+        stream = self.keys.stream_of(key)
+        if self.fusion.is_session(stream):
+            raise schemas.MessageError("invalid_value", "key", f"a sensor not named {FUSED}, as its tracks", key)
+        return stream, self.fusion.session_of(stream)
 
     def _report(self, code: str, stream: str, expected: str, received: str) -> None:
         message = f"Key: expected {expected}, received {received}."

@@ -53,6 +53,10 @@ class UntrackedMessages:
     def __contains__(self, session: object) -> bool:
         return session in self._buffers
 
+    def passes(self, session: str) -> bool:
+        """Whether a packet of a session is to be tracked here at once: nothing of it is kept that would go first."""
+        return session not in self._buffers and self._holds(session)
+
     # Keeping
 
     def keep(self, session: str, packet: Packet, *, frame: bool, own: bool = False) -> bool:
@@ -61,10 +65,10 @@ class UntrackedMessages:
         Those that were received to be tracked here (`own`) are kept until somebody asks for them, and are reported when
         they are dropped.
         """
-        if self._holds(session) and session not in self._buffers:
+        if self.passes(session):
             return False
         with self._lock:
-            if session not in self._buffers and self._holds(session):
+            if self.passes(session):
                 return False
             buffer = self._buffer_of(session, packet.now_ns)
             buffer.unasked |= own
