@@ -12,6 +12,7 @@ import optipmb
 from optipmb.association import associate
 from optipmb.class_posterior import UNGROUPED
 from optipmb.density import BernoulliArrays, PoissonArrays, columns_of_components, columns_of_objects
+from optipmb.effort import UNLIMITED
 from optipmb.hypotheses import local_hypotheses
 from optipmb.points import points_in_boxes
 from optipmb.predict import predict
@@ -38,7 +39,7 @@ def test_preprocess(benchmark: BenchmarkFixture, objects: int) -> None:
     """Canonical order, score filter and suppression."""
     _, _, frame = settled(objects)
     measurements, below, suppressed = benchmark(preprocess, frame, TABLE)
-    assert len(measurements) + below + suppressed == len(frame.score)
+    assert len(measurements.score) + below + suppressed == len(frame.score)
 
 
 @pytest.mark.parametrize("apart", [1.0, 6.0], ids=["heap", "street"])
@@ -49,7 +50,7 @@ def test_suppression(benchmark: BenchmarkFixture, apart: float) -> None:
     boxes[:, :2] *= apart
     classes = np.zeros(1, CLASS)
     classes["nms_iou"] = 0.1
-    keep = benchmark(non_maximum_suppression, boxes, np.zeros(1000, np.int64), classes)
+    keep = benchmark(non_maximum_suppression, boxes, np.zeros(1000, np.int64), classes, UNLIMITED)
     assert 0 < keep.sum() < 1000
 
 
@@ -78,7 +79,7 @@ def test_associate(benchmark: BenchmarkFixture, objects: int) -> None:
     given = before_association(objects)
     found = local_hypotheses(*given)
     pairs = found.row, found.measurement, found.detection_cost, found.first_cost
-    assigned = benchmark(associate, *pairs, given[1].size)
+    assigned = benchmark(associate, *pairs, given[2].size)
     assert (assigned >= 0).sum() > 0.5 * objects
 
 
