@@ -1,7 +1,7 @@
-"""Messages to bytes and back: pure, total and bounded.
+"""Bytes to messages, whose types and versions are named here: pure, total and bounded. `encoder` goes the other way.
 
 Total: `decode` returns a message or raises `MessageError`, whatever the bytes are. Bounded: sizes, counts and nesting
-are checked before memory is taken for them. `encode` is deterministic: equal messages give equal bytes.
+are checked before memory is taken for them.
 """
 
 import json
@@ -11,8 +11,7 @@ from typing import Any, Final, TypeVar
 
 import msgpack
 
-from optipmb_schemas.arrays import ARRAY, numeric
-from optipmb_schemas.blocks import block_of, large_head, read_array, small_head
+from optipmb_schemas.blocks import read_array
 from optipmb_schemas.control import (
     DrainRequest,
     MoveRequest,
@@ -65,10 +64,6 @@ _UNDECLARED: Final = frozenset({"", "zenoh/bytes", "zenoh/string"})  # what Zeno
 _JSON_STARTS: Final = frozenset(b"{ \t\r\n")  # in msgpack these are small integers, never the start of a map
 _DIGITS: Final = 20  # of a 64-bit integer with its sign; the time to read longer ones grows with their square
 
-_SMALL_MAP: Final = 16
-"""Fields from which on the head of a map has three bytes."""
-
-_SCALARS: Final = frozenset({str, bytes, int, float, bool})  # what msgpack takes as it is
 
 _msgpack: Any = msgpack  # its type information is partial
 
@@ -77,54 +72,6 @@ def encoding_of(message: Message | type[Message], *, form: str = "msgpack") -> s
     """Return the Zenoh encoding of a message or type, as `application/msgpack;optipmb.Detections.v1`."""
     kind = message if isinstance(message, type) else type(message)
     return f"application/{form};optipmb.{kind.__name__}.v{MAJOR}"
-
-
-def encode(message: Message, **others: Any) -> bytes:
-    """Return the message as msgpack, arrays as blocks. Fields that are None are left out.
-
-    Args:
-        message: what is encoded.
-        others: values that are known to be valid, in place of those of the message.
-    """
-    kind, values = type(message), message.__dict__ | others if others else message.__dict__
-    fields = [(name, value) for name in kind.names if (value := values[name]) is not None]
-    packer = _msgpack.Packer()
-    parts: list[Any] = [packer.pack_map_header(len(fields))]
-    offset, plain = len(parts[0]), {}
-    for name, value in fields:
-        if type(value) is not ARRAY:
-            plain[name] = value if type(value) in _SCALARS else _plain(value, blocks=True)
-            continue
-        if plain:
-            parts.append(_without_head(packer.pack(plain), len(plain)))
-            offset += len(parts[-1])
-            plain = {}
-        head, length = small_head(kind, name, value.shape)
-        if not head:
-            head = large_head(name, kind.arrays[name].dtype, value.shape, offset)
-            length += len(head)
-        parts += head, value
-        offset += length
-    if plain:
-        parts.append(_without_head(packer.pack(plain), len(plain)))
-    return numeric.joined(parts)
-
-
-def encoded(message: Message) -> bytes:
-    """Return what `encode` gives, without making it again where the message came as these bytes."""
-    kept: bytes | None = getattr(message, "encoded", None)
-    return encode(message) if kept is None else kept
-
-
-def _without_head(packed: bytes, count: int) -> bytes:
-    """Return the fields of a packed map of so many without the head that says how many."""
-    return packed[1 if count < _SMALL_MAP else 3 :]
-
-
-def encode_json(message: Message) -> bytes:
-    """Return the message as one line of JSON: arrays as nested lists, the epoch as hexadecimal digits."""
-    plain = _plain(message, blocks=False)
-    return json.dumps(plain, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
 
 
 def decode(payload: bytes, expected: type[T], *, encoding: str = "", limits: Limits = DEFAULT) -> T:
@@ -257,27 +204,3 @@ def _read_arrays(fields: dict[str, Any], kind: type[Message], limits: Limits) ->
                 _read_arrays(fields[name], inner, limits)
     except MessageError as error:
         raise error.under(name) from None
-
-
-def _plain(value: Any, *, blocks: bool) -> Any:
-    """Return a message as maps, lists and scalars, in a fixed order."""
-    if isinstance(value, Message):
-        fields: dict[str, Any] = {}
-        for name, field in value.present():
-            if type(field) in _SCALARS and blocks:
-                fields[name] = field
-            elif isinstance(field, ARRAY):
-                array = value.arrays[name]
-                fields[name] = block_of(field, array.dtype) if blocks else array.to_lists(field)
-            else:
-                fields[name] = _plain(field, blocks=blocks)
-        return fields
-    if isinstance(value, tuple | list):
-        if blocks and _SCALARS.issuperset(map(type, value)):
-            return value
-        return [_plain(item, blocks=blocks) for item in value]
-    if isinstance(value, dict):
-        return {key: _plain(value[key], blocks=blocks) for key in sorted(value)}
-    if isinstance(value, bytes) and not blocks:
-        return value.hex()
-    return value

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from optipmb_schemas.arrays import unit_quaternion
 from optipmb_schemas.blocks import ALIGNMENT
+from optipmb_schemas.encoder import encode
 from optipmb_schemas.fields import check_labels, check_stream
 from optipmb_schemas.layout import Layout, layout_of, stream_begin, stream_end
 from optipmb_schemas.limits import Limits
@@ -71,7 +72,7 @@ _msgpack: Any = msgpack  # its type information is partial
 
 @dataclass(frozen=True, slots=True)
 class _Canonical:
-    """Which payloads of a layout are what `encode` gives for their message, one of them being so.
+    """When a payload of a layout is what `encode` gives for its message, where one payload of the layout is.
 
     The form of three values depends on them: that of the stream, behind which large blocks are padded to a multiple of
     `ALIGNMENT`, and of the two integers, which msgpack writes in as few bytes as it can.
@@ -90,12 +91,12 @@ class _Canonical:
 
     @classmethod
     def of(cls, payload: bytes, start: int, message: Detections) -> "_Canonical":
-        """Return it of such a payload, of which the stream ends at `start`."""
+        """Return when it is so, from a payload that is; its stream ends at `start`."""
         multiple = ALIGNMENT if _PAD in payload else 1
         return cls(multiple, start % multiple, _least(message.seq), _least(message.stamp_ns))
 
     def holds(self, stream: bytes, start: int, message: Detections) -> bool:
-        """Whether another payload of the layout is so, of which the stream ends at `start`."""
+        """Whether it is so for another payload of the layout; its stream ends at `start`."""
         return (
             message.seq >= self.seq
             and message.stamp_ns >= self.stamp_ns
@@ -190,8 +191,6 @@ def _remember(payload: bytes, start: int, message: Detections, limits: Limits) -
         return
     if (layout := layout_of(payload, start)) is None:
         return
-    from optipmb_schemas.codec import encode  # noqa: PLC0415  which imports this module
-
     names = {name.partition(".")[0] for name in layout.names}
     fields = {name: None if name in names else value for name, value in message.__dict__.items()}
     known = _Known(

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgpack
 
-from optipmb_schemas.codec import decode, encode
+from optipmb_schemas.codec import decode
 from optipmb_schemas.columns import pack_columns, read_columns
+from optipmb_schemas.encoder import encode
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import Limits
 from optipmb_schemas.messages import Detections, Points
