@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ PACKET_BYTES: Final = 512
 """What a message takes beside its payload, nearly."""
 
 
-@dataclass(slots=True, init=False)
+@dataclass(slots=True)
 class Packet:
     """A message as it arrived, not decoded.
 
@@ -36,18 +36,12 @@ class Packet:
     encoding: str
     wall_ns: int
     now_ns: int
-    origin: str
-    held: int
+    origin: str = field(init=False)
+    held: int = field(init=False)
 
-    def __init__(self, key: str, payload: bytes | None, size: int, encoding: str, wall_ns: int, now_ns: int) -> None:
-        self.key = key
-        self.payload = payload
-        self.size = size
-        self.encoding = encoding
-        self.wall_ns = wall_ns
-        self.now_ns = now_ns
-        self.origin = key.rpartition("/")[0]
-        self.held = PACKET_BYTES + (0 if payload is None else size)
+    def __post_init__(self) -> None:
+        self.origin = self.key.rpartition("/")[0]
+        self.held = PACKET_BYTES + (0 if self.payload is None else self.size)
 
 
 class Caches(Protocol):

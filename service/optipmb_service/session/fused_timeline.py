@@ -81,7 +81,7 @@ class FusedTimeline:
 
     def places(self) -> dict[FrameId, Placement]:
         """Return where each frame of the window belongs."""
-        return {frame_id: self._place(frame_id) for frame_id in self.frame_ids}
+        return {frame_id: _placed(frame_id, self.generation) for frame_id in self.frame_ids}
 
     @classmethod
     def resume(
@@ -125,9 +125,6 @@ class FusedTimeline:
         return {name: stamp for name, stamp in self.clock.items() if newest_ns - stamp <= self.gap_limit_ns}
 
     # How
-
-    def _place(self, frame_id: FrameId, jump_ns: int = 0) -> Placement:
-        return Placement(self.generation, self.generation, None, Verdict.NEXT, jump_ns, frame_id.stamp_ns)
 
     def _jump_ns(self, frame_id: FrameId) -> int:
         return frame_id.stamp_ns - max(self.clock.values(), default=frame_id.stamp_ns)
@@ -176,7 +173,7 @@ class FusedTimeline:
             clock=self._moved(frame_id, seen),
             jumped=jumped,
         )
-        return Decision(opens if last else Verdict.INSERTED, self._place(frame_id), last), timeline
+        return Decision(opens if last else Verdict.INSERTED, _placed(frame_id, self.generation), last), timeline
 
     def _other_clock(self, frame_id: FrameId) -> tuple[Decision, FusedTimeline]:
         """Refuse a frame whose stamp is far from the session's clock, or begin anew on its own."""
@@ -198,10 +195,10 @@ class FusedTimeline:
             clock={sensor: stamp_ns},
             jumped={},
         )
-        return Decision(Verdict.RESTART, begun._place(frame_id), last=True), begun  # noqa: SLF001 - of its own kind
+        return Decision(Verdict.RESTART, _placed(frame_id, begun.generation), last=True), begun
 
     def _refuse(self, frame_id: FrameId, verdict: Verdict) -> tuple[Decision, FusedTimeline]:
-        return Decision(verdict, self._place(frame_id, self._jump_ns(frame_id))), self
+        return Decision(verdict, _placed(frame_id, self.generation, self._jump_ns(frame_id))), self
 
     def _moved(self, frame_id: FrameId, seen: Mapping[str, object]) -> Mapping[str, int]:
         """Return the clock with a frame; of sensors that are seen no more, which were not live, nothing is left."""
@@ -217,6 +214,11 @@ class FusedTimeline:
             for name in sorted(silent, key=lambda one: (self.clock.get(one, -1), one))[: len(seen) - MAX_SENSORS]:
                 del seen[name]
         return seen
+
+
+def _placed(frame_id: FrameId, generation: int, jump_ns: int = 0) -> Placement:
+    """Return the place of a frame of a generation; the eras are the generations."""
+    return Placement(generation, generation, None, Verdict.NEXT, jump_ns, frame_id.stamp_ns)
 
 
 def _latest(jumped: Mapping[str, JumpedFrames], most: int) -> dict[str, JumpedFrames]:

@@ -56,8 +56,6 @@ def number_of(epochs: Sequence[SeenNumbers], epoch: bytes | None) -> int:
 
 def remembered(epochs: tuple[SeenNumbers, ...], frame_id: FrameId) -> tuple[SeenNumbers, ...]:
     """Return the epochs of a publisher with one more frame that came."""
-    if epochs and epochs[-1].epoch == frame_id.epoch:
-        return (*epochs[:-1], epochs[-1].add(frame_id.seq))
     number = number_of(epochs, frame_id.epoch)
     if number < 0:
         return (*epochs, SeenNumbers(frame_id.epoch, frame_id.seq, 1))[-EPOCHS:]

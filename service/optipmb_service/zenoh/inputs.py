@@ -44,10 +44,6 @@ and Zenoh would take these for lost. Heartbeats tell of what was missed.
 MOST: Final = 256
 """Messages of a topic that may wait while another thread hands over those before them."""
 
-ERROR: Final = "internal_error"
-
-PUT: Final = zenoh.SampleKind.PUT
-
 RECOVERY: Final = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
 
 
@@ -138,7 +134,7 @@ class Topic:
 
     def _take(self, handle: Callable[[zenoh.Sample], None], sample: zenoh.Sample) -> None:
         """Take a sample on the thread of the network that brings it; of several links there are several threads."""
-        if sample.kind == PUT:
+        if sample.kind == zenoh.SampleKind.PUT:
             self._in_turn(handle, sample)
 
     def _in_turn(self, work: Callable[..., object], *arguments: object) -> None:
@@ -153,7 +149,7 @@ class Topic:
                     try:
                         work(*arguments)
                     except Exception:
-                        log.exception(ERROR, topic=self._name)  # one message must not end the subscription
+                        log.exception("internal_error", topic=self._name)  # one message must not end the subscription
                 if self._closed:
                     self._waiting.clear()
             finally:
@@ -167,4 +163,4 @@ class Topic:
         try:
             self._receive(sample)
         except Exception:
-            log.exception(ERROR, topic=self._name)  # nor what waits for its turn in `LateJoin`
+            log.exception("internal_error", topic=self._name)  # nor what waits for its turn in `LateJoin`
