@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
+    Turn = tuple[float, float, float, float]
 
 SPREAD = math.sqrt(STATE)
 """Distance of the sigma points in units of the square root, sqrt(n + kappa)."""
@@ -69,6 +70,25 @@ def wrap(angle: float) -> float:
 
 
 @kernel
+def small_turn(u: float) -> tuple[float, float]:
+    """Sum ``int_0^1 cos(u t) dt`` and ``int_0^1 sin(u t) dt`` as series, for turns u below `SMALL_TURN`, rad."""
+    u2 = u * u
+    sinc = 1.0 - u2 / 6.0 * (1.0 - u2 / 20.0 * (1.0 - u2 / 42.0))
+    cosc = u / 2.0 * (1.0 - u2 / 12.0 * (1.0 - u2 / 30.0 * (1.0 - u2 / 56.0)))
+    return sinc, cosc
+
+
+@kernel
+def turn_integrals(u: float) -> Turn:
+    """Return cos u, sin u and the integrals of `small_turn`, for any turn u, rad."""
+    cos_u, sin_u = math.cos(u), math.sin(u)
+    if abs(u) < SMALL_TURN:
+        sinc, cosc = small_turn(u)
+        return cos_u, sin_u, sinc, cosc
+    return cos_u, sin_u, sin_u / u, (1.0 - cos_u) / u
+
+
+@kernel
 def ctra_displacement(v: float, omega: float, a: float, dt: float) -> tuple[float, float]:
     """Integrate the speed v + a t along a heading that turns with omega, from 0 to dt (eq. Motion Predict).
 
@@ -79,8 +99,7 @@ def ctra_displacement(v: float, omega: float, a: float, dt: float) -> tuple[floa
     u = omega * dt
     if abs(u) < SMALL_TURN:
         u2 = u * u
-        sinc = 1.0 - u2 / 6.0 * (1.0 - u2 / 20.0 * (1.0 - u2 / 42.0))
-        cosc = u / 2.0 * (1.0 - u2 / 12.0 * (1.0 - u2 / 30.0 * (1.0 - u2 / 56.0)))
+        sinc, cosc = small_turn(u)
         ramp_cos = 0.5 - u2 / 8.0 + u2 * u2 / 144.0 - u2 * u2 * u2 / 5760.0
         ramp_sin = u / 3.0 - u * u2 / 30.0 + u * u2 * u2 / 840.0 - u * u2 * u2 * u2 / 45360.0
     else:
@@ -96,7 +115,9 @@ def ctra_displacement(v: float, omega: float, a: float, dt: float) -> tuple[floa
 
 
 @kernel
-def travel(v: float, omega: float, a: float, dt: float, tau: float) -> tuple[float, float, float, float]:
+def travel(
+    v: float, omega: float, a: float, dt: float, tau: float, kept: float, turn: Turn
+) -> tuple[float, float, float, float]:
     """Move for dt under an acceleration that decays with time constant tau and never turns the speed round.
 
     ``v(t) = v + a tau (1 - e^(-t/tau))``; the way is the integral of ``v(t) [cos(omega t), sin(omega t)]``, with
@@ -110,19 +131,19 @@ def travel(v: float, omega: float, a: float, dt: float, tau: float) -> tuple[flo
         omega: turn rate, rad/s.
         a: acceleration, m/s^2.
         dt: time, s, positive.
-        tau: time constant, s; infinite: the acceleration is constant and has no limit.
+        tau: time constant, s, finite.
+        kept: ``e^(-dt/tau)``, which the sigma points of an object share.
+        turn: `turn_integrals` of omega dt, which those share that turn alike.
 
     Returns:
         The way along the starting heading and across it, m, the speed and the acceleration afterwards.
     """
-    if tau == math.inf:
-        along, across = ctra_displacement(v, omega, a, dt)
-        return along, across, v + a * dt, a
     limit = abs(v) / tau if v * a < 0.0 else START * abs(v) / tau
     a = min(max(a, -limit), limit)
-    kept, u, beta = math.exp(-dt / tau), omega * dt, 1.0 / tau
-    along, across = ctra_displacement(v + a * tau, omega, 0.0, dt)
-    real, imaginary = 1.0 - kept * math.cos(u), -kept * math.sin(u)
+    cos_u, sin_u, sinc, cosc = turn
+    top, beta = v + a * tau, 1.0 / tau
+    along, across = dt * (top * sinc + 0.0), dt * (top * cosc + 0.0)  # no way is -0.0
+    real, imaginary = 1.0 - kept * cos_u, -kept * sin_u
     scale = a * tau / (beta * beta + omega * omega)
     along -= scale * (real * beta - imaginary * omega)
     across -= scale * (real * omega + imaginary * beta)
@@ -187,7 +208,13 @@ def predict_state(
         return 0
     v, phi = mean[V], mean[PHI]
     omega, a = (0.0, 0.0) if straight else (mean[OMEGA], mean[A])
-    along0, across0, v0, a0 = travel(v, omega, a, dt, tau)
+    kept, turn0 = 1.0, (1.0, 0.0, 1.0, 0.0)
+    if tau == math.inf:
+        along0, across0 = ctra_displacement(v, omega, a, dt)
+        v0, a0 = v + a * dt, a
+    else:
+        kept, turn0 = math.exp(-dt / tau), turn_integrals(omega * dt)
+        along0, across0, v0, a0 = travel(v, omega, a, dt, tau, kept, turn0)
     cos_phi, sin_phi = math.cos(phi), math.sin(phi)
     dx0 = cos_phi * along0 - sin_phi * across0
     dy0 = sin_phi * along0 + cos_phi * across0
@@ -200,14 +227,15 @@ def predict_state(
             if column < STATE - 2:  # the columns of x and y leave the motion itself as it is at the centre
                 if straight:
                     along, across, speed, acceleration = (v + point[V]) * dt, 0.0, v + point[V], point[A]
-                elif tau == math.inf:  # as `travel` has it, without a call for each point
+                elif tau == math.inf:
                     speed, acceleration = v + point[V], a + point[A]
                     along, across = ctra_displacement(speed, omega + point[OMEGA], acceleration, dt)
                     speed += acceleration * dt
                 else:
-                    along, across, speed, acceleration = travel(
-                        v + point[V], omega + point[OMEGA], a + point[A], dt, tau
-                    )
+                    turn, rate = turn0, omega + point[OMEGA]
+                    if rate != omega:  # the column of a leaves the turn as it is at the centre
+                        turn = turn_integrals(rate * dt)
+                    along, across, speed, acceleration = travel(v + point[V], rate, a + point[A], dt, tau, kept, turn)
                 point[V], point[A] = speed - v0, acceleration - a0
                 cos_point, sin_point = cos_phi, sin_phi
                 if point[PHI] != 0.0:  # only the columns of v and phi turn the heading
