@@ -140,6 +140,7 @@ def stages() -> dict[str, dict[str, float]]:
 
     for objects, points in ((10, 0), (100, 0), (800, 0), (100, 30_000)):
         tracker, density, frame = settled(objects, points)
+        tracker._compiled = False  # noqa: SLF001 - stage by stage, whatever the frame has
         taken = []
         with pytest.MonkeyPatch.context() as patch:
             for stage in STAGES:
