@@ -25,6 +25,8 @@ KILLS = int(os.environ.get("OPTIPMB_TEST_KILLS", "3"))
 FEW = 10
 FRAMES = 120 if KILLS > FEW else 40
 SEED = int(os.environ.get("OPTIPMB_TEST_SEED", "1"))
+LONG_S = 2.0
+"""From so long an outage on, the log of the new process is shown."""
 RESTART_S = 200.0  # on a machine that is busy with other things
 SEQUENCES = ("0000", "0002", "0004", "0011")
 
@@ -74,6 +76,8 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
                 repeated += result.repeated
             if KILLS > FEW:
                 _tell(capsys, f"kill {round_ + 1} of {KILLS}: outage {outages[-1]:.2f} s")
+            if outages[-1] > LONG_S:
+                _tell(capsys, f"the log of the new process:\n{service.errors}")
             for subscription in subscriptions:
                 subscription.close()
             inbox.close()
