@@ -140,9 +140,9 @@ def stages() -> dict[str, dict[str, float]]:
 
     for objects, points in ((10, 0), (100, 0), (800, 0), (100, 30_000)):
         tracker, density, frame = settled(objects, points)
-        tracker._compiled = False  # noqa: SLF001 - stage by stage, whatever the frame has
         taken = []
         with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(tracker, "_compiled", False)  # stage by stage, whatever the frame has
             for stage in STAGES:
                 owner, attribute = optipmb.tracker, stage
                 if stage == "detection_probability":

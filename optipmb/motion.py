@@ -133,7 +133,7 @@ def travel(
         dt: time, s, positive.
         tau: time constant, s, finite.
         kept: ``e^(-dt/tau)``, which the sigma points of an object share.
-        turn: `turn_integrals` of omega dt, which those share that turn alike.
+        turn: `turn_integrals` of omega dt, which sigma points of one turn rate share.
 
     Returns:
         The way along the starting heading and across it, m, the speed and the acceleration afterwards.
@@ -141,8 +141,8 @@ def travel(
     limit = abs(v) / tau if v * a < 0.0 else START * abs(v) / tau
     a = min(max(a, -limit), limit)
     cos_u, sin_u, sinc, cosc = turn
-    top, beta = v + a * tau, 1.0 / tau
-    along, across = dt * (top * sinc + 0.0), dt * (top * cosc + 0.0)  # no way is -0.0
+    final, beta = v + a * tau, 1.0 / tau  # the speed that it comes to in the end
+    along, across = dt * (final * sinc + 0.0), dt * (final * cosc + 0.0)  # 0.0 and not -0.0
     real, imaginary = 1.0 - kept * cos_u, -kept * sin_u
     scale = a * tau / (beta * beta + omega * omega)
     along -= scale * (real * beta - imaginary * omega)
@@ -208,7 +208,7 @@ def predict_state(
         return 0
     v, phi = mean[V], mean[PHI]
     omega, a = (0.0, 0.0) if straight else (mean[OMEGA], mean[A])
-    kept, turn0 = 1.0, (1.0, 0.0, 1.0, 0.0)
+    kept, turn0 = 1.0, (1.0, 0.0, 1.0, 0.0)  # replaced where the acceleration decays, and not read elsewhere
     if tau == math.inf:
         along0, across0 = ctra_displacement(v, omega, a, dt)
         v0, a0 = v + a * dt, a

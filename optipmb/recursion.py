@@ -127,11 +127,10 @@ def recursion(
     period: float,
     classes: Sequence[ClassRow],
 ) -> tuple[Columns, Columns, Columns, tuple[int, int, int, int, int]]:
-    """Go through Algorithm 1 where p_d is that of the class, every frame looks everywhere, and no classes are groups.
+    """Run one recursion of Algorithm 1, where p_d is that of the class and no classes have a group in common.
 
-    It calls the stages that `Tracker.step` calls one by one where something has to be decided between them, and gives
-    the same bytes. A step of few objects takes three quarters of the time so: what one stage hands to the next does not
-    pass through Python.
+    It calls the stages that `Tracker.step` otherwise calls one by one, and gives the same bytes. What one stage hands
+    to the next does not pass through Python, so a step of few objects takes three quarters of the time.
 
     Args:
         objects: detected objects.

@@ -144,7 +144,7 @@ class Tracker:
         self._horizons = np.array(parameters.horizons, np.float64)
         table = self._table
         self._compiled = self.modules.habm and self.modules.rpp and not (len(table.confusion) or table.noise_grows)
-        """Whether `recursion` is for this profile."""
+        """Whether the profile and the modules allow a step in one call."""
 
     def initial(self, next_id: int = 1) -> Density:
         """Return the density before the first frame."""
@@ -233,10 +233,10 @@ class Tracker:
         return StepResult(posterior, tracks, diagnostics, paths, pi)
 
     def _step_in_one_call(self, density: Density, frame: Frame, dt: float) -> StepResult | None:
-        """Do all of a step by `recursion`; None where the stages have to be called one by one, or are to raise.
+        """Do all of a step by `recursion`; None where the stages have to be called one by one, or have to raise.
 
-        They are with a cloud, a field of view or another R than that of the class, for the first frame, for one of the
-        same stamp as the frame before, and where `max_pairs` might be exceeded.
+        That is so with a cloud, a field of view or another R than that of the class, for the first frame, for one of
+        the same stamp as the frame before, and where `max_pairs` might be exceeded.
         """
         bernoulli, poisson, table, now = density.bernoulli, density.poisson, self._table, frame.stamp_ns
         objects, components = columns_of_objects(bernoulli), columns_of_components(poisson)

@@ -18,7 +18,7 @@ EVERYTHING = optipmb.FieldOfView(pose=optipmb.Pose(np.zeros(3), np.array([1.0, 0
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many objects each step in one call began with."""
+    """For each step that was one call, the number of objects that it began with."""
     begun: list[int] = []
 
     def counted(*arguments: Any) -> Any:
@@ -30,7 +30,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def in_stages(tracker: optipmb.Tracker) -> optipmb.Tracker:
-    """The tracker, which calls the stages one by one whatever it is given."""
+    """Have a tracker call the stages one by one whatever it is given."""
     tracker._compiled = False
     return tracker
 
@@ -53,7 +53,7 @@ def parameters_of(which: str) -> optipmb.Parameters:
 
 @pytest.mark.parametrize("two_thresholds", [True, False])
 @pytest.mark.parametrize("which", ["generic", "kitti", "nuscenes", "0", "2", "3", "5", "6", "8"])
-def test_one_call_gives_what_the_stages_give(calls: list[int], which: str, two_thresholds: bool) -> None:  # noqa: FBT001 - a parameter of the test
+def test_one_call_gives_what_the_stages_give(calls: list[int], which: str, *, two_thresholds: bool) -> None:
     """Density, tracks and diagnostics are equal in every byte, in frames with gaps, ties, clutter and nothing."""
     parameters = parameters_of(which)
     modules = optipmb.Modules(ote=two_thresholds)
@@ -76,7 +76,7 @@ def test_one_call_gives_what_the_stages_give(calls: list[int], which: str, two_t
     assert tracks > 0
 
 
-def test_a_frame_that_python_decides_about_is_taken_in_stages(calls: list[int]) -> None:
+def test_what_one_call_cannot_do_is_done_in_stages(calls: list[int]) -> None:
     """With a cloud, a field of view, an own R, a stamp seen before, many pairs or a baseline, it is not one call."""
     parameters = optipmb.load_profile("kitti")
     tracker = optipmb.Tracker(parameters)
