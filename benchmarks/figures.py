@@ -142,7 +142,6 @@ def stages() -> dict[str, dict[str, float]]:
         tracker, density, frame = settled(objects, points)
         taken = []
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(tracker, "_compiled", False)  # stage by stage, whatever the frame has
             for stage in STAGES:
                 owner, attribute = optipmb.tracker, stage
                 if stage == "detection_probability":

@@ -38,9 +38,6 @@ CLASSES: Final = "classes.probability"
 ROUNDING: Final = 1e-6
 """By how much the sum of probabilities may differ from 1."""
 
-UNFIT: Final = (AttributeError, TypeError, ValueError, NumbaError, NumbaWarning)
-"""What a kernel raises for columns of somebody else that it cannot take, or that do not fit together."""
-
 _Rows = TypeVar("_Rows", Bernoullis, Misses, Poissons)
 
 

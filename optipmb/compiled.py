@@ -63,8 +63,8 @@ event.register("numba:compile", _FirstCompilation())  # type: ignore[no-untyped-
 def kernel(function: F) -> F:
     """Compile `function` with numba at its first call; later processes load the machine code from beside the source.
 
-    It keeps the lock of the interpreter. A step of 40 objects spends 0.1 ms in kernels: to give the lock to another
-    thread, and to wait for it afterwards, takes longer.
+    It keeps the lock of the interpreter. A step of 40 objects spends 0.1 ms in five kernels: to give the lock to
+    another thread in each of them, and to wait for it afterwards, takes longer than the kernel.
 
     Kernels have others compiled into them, and constants, from other modules. Numba takes code from its cache while the
     file of the kernel itself is as it was; here it does while the whole package is.

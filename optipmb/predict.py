@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numba.core.errors import NumbaError, NumbaWarning
 
 from optipmb.class_posterior import predict_classes
-from optipmb.columns import UNFIT, check_fitting, columns_fit, only_arrays
+from optipmb.columns import check_fitting, columns_fit, only_arrays
 from optipmb.compiled import kernel
 from optipmb.density import (
     NO_FRAME,
@@ -81,7 +82,7 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
             table.period,
             table.classes,
         )
-    except UNFIT:
+    except (AttributeError, TypeError, ValueError, NumbaError, NumbaWarning):
         check_fitting(density, density.labels)  # names the column
         raise
     kept, mean, covariance, existence, repaired = objects

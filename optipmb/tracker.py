@@ -7,12 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optipmb.class_posterior import UNGROUPED
-from optipmb.columns import UNFIT, only_arrays
+from optipmb.association import associate
+from optipmb.birth import first_detected_states
+from optipmb.births_beside import forbid_births
+from optipmb.class_posterior import UNGROUPED, update_classes
+from optipmb.compiled import kernel
 from optipmb.density import (
     NO_FRAME,
+    STATE,
+    BernoulliArrays,
     Bernoullis,
     Density,
+    PoissonArrays,
     Poissons,
     columns_of_components,
     columns_of_objects,
@@ -20,26 +26,112 @@ from optipmb.density import (
 from optipmb.detection_probability import detection_probability, over_time
 from optipmb.effort import UNLIMITED, check_effort
 from optipmb.errors import FrameError
-from optipmb.extract import Tracks, extract
+from optipmb.extract import extract
 from optipmb.field_of_view import detection_probability_in_view, follow_looks, look
+from optipmb.hypotheses import local_hypotheses
+from optipmb.lightweight import light_weight_filter
 from optipmb.paths import paths_of
 from optipmb.predict import predict
-from optipmb.preprocess import preprocess
-from optipmb.prune import Survivors
+from optipmb.preprocess import Measurements, preprocess
+from optipmb.prune import Survivors, surviving_objects
 from optipmb.records import record
-from optipmb.recursion import recursion, update
 from optipmb.table import ClassTable
-from optipmb.undetected import with_measurement_births
+from optipmb.undetected import update_undetected, with_measurement_births
+from optipmb.update import ukf_updates
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
+    from optipmb.extract import Tracks
     from optipmb.field_of_view import Looks
     from optipmb.frame import Frame, PointCloud
     from optipmb.parameters import Parameters
     from optipmb.paths import PredictedPaths
+    from optipmb.records import Columns
+    from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+
+@kernel
+def update(
+    objects: Columns,
+    class_probability: Array,
+    p_d: Array,
+    missed_from_ns: Index,
+    components: Columns,
+    p_d_poisson: Array,
+    n_predicted: int,
+    measurements: Columns,
+    dt: float,
+    stamp_ns: int,
+    before_ns: int,
+    next_id: int,
+    adaptive: bool,
+    period: float,
+    confusion: Array,
+    classes: Sequence[ClassRow],
+) -> tuple[Columns, Array, Columns, Index, Index, int, int, int]:
+    """Update the prediction with the measurements: the PMB update of Algorithm 1.
+
+    Args:
+        objects: predicted objects.
+        class_probability: (N, C) their class posteriors, (0, 0) where no classes have a group in common.
+        p_d: (N,) their detection probabilities.
+        missed_from_ns: (N,) stamps from which their misses count.
+        components: predicted Poisson components, and behind them, without HABM, those of the measurements.
+        p_d_poisson: (J,) their detection probabilities.
+        n_predicted: how many of them were predicted.
+        measurements: Z_k.
+        dt: s since the frame before.
+        stamp_ns: stamp of the frame.
+        before_ns: stamp of the frame before.
+        next_id: id of the first new object.
+        adaptive: whether HABM is on.
+        period: nominal period, s.
+        confusion: (C, C) Lambda of `optipmb.class_posterior`, (0, 0) likewise.
+        classes: (C,) parameters.
+
+    Returns:
+        The columns of the objects, their class posteriors and the columns of the Poisson components; the other fields
+        of `Survivors`; how many covariances had to be repaired.
+    """
+    z = Measurements(*measurements)
+    objects, components = BernoulliArrays(*objects), PoissonArrays(*components)
+
+    # Local hypotheses: missed, detected, first-time detected; HABM
+    hypotheses = local_hypotheses(
+        objects, class_probability, p_d, components, p_d_poisson, z, dt, period, confusion, classes
+    )
+
+    # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
+    row, measurement, cost = hypotheses.row, hypotheses.measurement, hypotheses.detection_cost
+    assigned = associate(row, measurement, cost, hypotheses.first_cost, p_d.shape[0])
+    forbid_births(objects, assigned, hypotheses, z, missed_from_ns, stamp_ns, period, classes)
+    kept = surviving_objects(objects, p_d, assigned, hypotheses, z.label, missed_from_ns, stamp_ns, period, classes)
+
+    # Motion states: detected and missed objects by the UKF, then the births of first-time detections
+    count, known = kept.row.shape[0], kept.known
+    mean, covariance = np.empty((count, STATE)), np.empty((count, STATE, STATE))
+    repaired = ukf_updates(kept.row, kept.measurement, objects.mean, objects.covariance, z, classes, mean, covariance)
+    repaired += first_detected_states(
+        kept.measurement[known:], hypotheses, components, z, classes, mean[known:], covariance[known:]
+    )
+
+    # Other states: class, light-weight filter
+    label, class_probability = update_classes(kept, objects.label, class_probability, z, confusion, classes)
+    posterior = light_weight_filter(
+        kept, label, mean, covariance, objects, next_id, z, stamp_ns, before_ns, period, classes
+    )
+
+    # Undetected objects: PPP update, RPP, and the births of HABM
+    undetected = update_undetected(
+        components, p_d_poisson, n_predicted, hypotheses, z, stamp_ns, period, classes, adaptive
+    )
+    return posterior, class_probability, undetected, kept.row, kept.measurement, known, kept.detected, repaired
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,9 +234,6 @@ class Tracker:
         self._labels = parameters.labels
         self._table = ClassTable.of(parameters)
         self._horizons = np.array(parameters.horizons, np.float64)
-        table = self._table
-        self._compiled = self.modules.habm and self.modules.rpp and not (len(table.confusion) or table.noise_grows)
-        """Whether the profile and the modules allow a step in one call."""
 
     def initial(self, next_id: int = 1) -> Density:
         """Return the density before the first frame."""
@@ -169,8 +258,6 @@ class Tracker:
         self._check(density, frame)
         now, table, modules = frame.stamp_ns, self._table, self.modules
         dt = table.period if density.stamp_ns == NO_FRAME else (now - density.stamp_ns) * 1e-9
-        if self._compiled and (result := self._step_in_one_call(density, frame, dt)) is not None:
-            return result
 
         # PMB prediction
         predicted, repaired = predict(density, now, table)
@@ -231,54 +318,6 @@ class Tracker:
         )
         pi = None if pi is None else pi[np.searchsorted(objects.id, tracks.id)]
         return StepResult(posterior, tracks, diagnostics, paths, pi)
-
-    def _step_in_one_call(self, density: Density, frame: Frame, dt: float) -> StepResult | None:
-        """Do all of a step by `recursion`; None where the stages have to be called one by one, or have to raise.
-
-        That is so with a cloud, a field of view or another R than that of the class, for the first frame, for one of
-        the same stamp as the frame before, and where `max_pairs` might be exceeded.
-        """
-        bernoulli, poisson, table, now = density.bernoulli, density.poisson, self._table, frame.stamp_ns
-        objects, components = columns_of_objects(bernoulli), columns_of_components(poisson)
-        count = frame.score.shape[0]
-        if (
-            (frame.cloud is not None and self.modules.adp)
-            or frame.field_of_view is not None
-            or frame.position_covariance is not None
-            or density.misses is not None
-            or density.class_probability is not None
-            or density.stamp_ns in {NO_FRAME, now}
-            or not only_arrays(objects, components)
-            or (len(bernoulli) + len(poisson) + count) * count > self._max_pairs
-        ):
-            return None
-        share = dt / table.period if table.detection_over_time else 1.0
-        try:
-            posterior, undetected, columns, counts = recursion(
-                objects,
-                components,
-                (frame.center, frame.size, frame.yaw, frame.velocity, frame.score, frame.label, frame.source),
-                np.ascontiguousarray(over_time(table["detection"], share)),
-                dt,
-                density.stamp_ns,
-                now,
-                density.next_id,
-                self.modules.ote,
-                self._max_pairs,
-                table.period,
-                table.classes,
-            )
-        except UNFIT:
-            return None
-        above, measured, detected, known, repaired = counts
-        if above < 0:
-            return None
-        objects_after, tracks = Bernoullis(*posterior), Tracks(*columns)
-        born = len(objects_after) - known
-        after = Density(now, density.next_id + born, objects_after, Poissons(*undetected), density.labels)
-        paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None
-        diagnostics = Diagnostics(False, count, count - above, above - measured, detected, born, repaired)
-        return StepResult(after, tracks, diagnostics, paths)
 
     def _check(self, density: Density, frame: Frame) -> None:
         """Refuse other classes, which kernels would read out of bounds for, and frames of the past."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import sys
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -95,6 +94,3 @@ def _run() -> None:
     with suppress(EffortError):
         Tracker(parameters, max_pairs=8).step(posterior, given)
     Tracker(parameters, Modules(habm=False)).step(posterior, given)
-    # And in one call: what has seen no field of view, without a cloud.
-    plain = replace(given, cloud=None, field_of_view=None)
-    tracker.step(replace(posterior, misses=None), replace(plain, stamp_ns=plain.stamp_ns + 1))
