@@ -6,14 +6,18 @@ import os
 import socket
 import tempfile
 from pathlib import Path
-from typing import IO, Final
+from typing import Final
 
 import zenoh
 
 PORTS: Final = range(10_000, 20_000)
 """Below those that the system gives to outgoing connections, and to whom asks for any: these are nobody's by chance."""
 
-_taken: list[IO[bytes]] = []
+_taken: set[int] = set()
+"""The ports that this process was given."""
+
+_locks = (Path(tempfile.gettempdir()) / f"optipmb-test-ports-{os.getuid()}").open("ab")
+"""The byte at the number of a port is locked by the process that was given the port, until that ends."""
 
 
 def free_endpoint() -> str:
@@ -21,16 +25,16 @@ def free_endpoint() -> str:
     first = os.getpid() * 61 + len(_taken)
     for number in range(len(PORTS)):
         port = PORTS[(first + number) % len(PORTS)]
-        lock = (Path(tempfile.gettempdir()) / f"optipmb-test-port-{port}").open("wb")
+        if port in _taken:
+            continue
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.lockf(_locks, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, port)
             with socket.socket() as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # whose connections are closing is free
                 probe.bind(("127.0.0.1", port))
         except OSError:
-            lock.close()
             continue
-        _taken.append(lock)
+        _taken.add(port)
         return f"tcp/127.0.0.1:{port}"
     raise AssertionError("no port is free")
 
