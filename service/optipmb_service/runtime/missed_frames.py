@@ -115,7 +115,7 @@ def positions_of(checkpoint: Checkpoint) -> dict[str, Position]:
             before = epochs[: max(0, number_of(epochs, cursor.epoch))]
             at = Position(frozenset(one.epoch for one in before), cursor.epoch, cursor.seq, tracked=True)
         else:
-            ids = [one for one in map(checkpoint.frame_id, checkpoint.window) if one.sensor == name]
+            ids = [one.frame_id for one in checkpoint.window if one.frame_id.sensor == name]
             if not ids:
                 continue
             first = min(ids, key=lambda one: (number_of(epochs, one.epoch), one.seq))

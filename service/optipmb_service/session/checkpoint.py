@@ -7,7 +7,6 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Final
 
 from optipmb_service.session.state import FrameCounts
-from optipmb_service.session.timeline import FrameId
 from optipmb_service.session.values import Deliveries
 
 if TYPE_CHECKING:
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     import optipmb
     from optipmb_service.session.seen_numbers import SeenNumbers
     from optipmb_service.session.state import FilterState
+    from optipmb_service.session.timeline import FrameId
 
 _SOFTWARE: Final = version("optipmb")
 
@@ -31,18 +31,20 @@ class Recorded:
     """A frame of the window.
 
     Attributes:
-        message: its detections.
+        frame_id: which.
+        detections: what `schemas.encode` gives for its detections.
         points: its cloud.
         missed: whether it waited for a cloud in vain.
         revision: of the tracks that were published last for it.
-        packed: both as bytes, as soon as they were made.
+        packed: its cloud as bytes, as soon as they were made.
     """
 
-    message: schemas.Detections
+    frame_id: FrameId
+    detections: bytes
     points: schemas.Points | None
     missed: bool
     revision: int
-    packed: dict[str, bytes] = field(default_factory=dict, compare=False)
+    packed: list[bytes] = field(default_factory=list, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +85,6 @@ class Checkpoint:
     def session(self) -> str:
         """The id of the present life of the density."""
         return self.head.session
-
-    def frame_id(self, one: Recorded) -> FrameId:
-        """Return which frame one of the window is."""
-        message = one.message
-        return FrameId(message.epoch, message.seq, message.stamp_ns, message.stream if self.fused else "")
 
 
 def forgotten(checkpoint: Checkpoint) -> Checkpoint:

@@ -119,8 +119,8 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
         "base": _state(checkpoint.base),
         "window": [
             {
-                "detections": _packed(one, "detections", one.message),
-                "points": None if one.points is None else _packed(one, "points", one.points),
+                "detections": one.detections,
+                "points": _packed_cloud(one),
                 "missed": one.missed,
                 "revision": one.revision,
             }
@@ -148,11 +148,10 @@ def _table(values: FrameCounts | PoseHistory | Deliveries) -> dict[str, Any]:
     return {name: getattr(values, name) for name in values.__match_args__}
 
 
-def _packed(one: Recorded, name: str, message: schemas.Message) -> bytes:
-    packed = one.packed.get(name)
-    if packed is None:
-        packed = one.packed[name] = schemas.encoded(message)
-    return packed
+def _packed_cloud(one: Recorded) -> bytes | None:
+    if one.points is not None and not one.packed:
+        one.packed.append(schemas.encode(one.points))
+    return one.packed[0] if one.packed else None
 
 
 def _mask(mask: int) -> bytes:

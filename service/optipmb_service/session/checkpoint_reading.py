@@ -61,7 +61,7 @@ def _read(body: Document, version_: int) -> Checkpoint:
     schemas.SessionParameters(profile=parameters.name)  # as messages take it
     fused = version_ >= FUSED and body.flag("fused")
     base = _read_state(body.document("base"), stream, parameters, version_)
-    window = tuple(_read_recorded(one, None if fused else stream) for one in body.documents("window"))
+    window = tuple(_read_recorded(one, None if fused else stream, parameters) for one in body.documents("window"))
     head = _read_state(body.document("head"), stream, parameters, version_) if window else base
     if version_ < FUSED:
         newest_ns = body.optional("newest_cloud_ns", body.whole)
@@ -85,7 +85,7 @@ def _read(body: Document, version_: int) -> Checkpoint:
         run=body.count("run"),
         software=body.text("software", MAX_SOFTWARE),
     )
-    if len({checkpoint.frame_id(one) for one in window}) != len(window):
+    if len({one.frame_id for one in window}) != len(window):
         raise body.wrong("window", "every frame once", "one again")
     names = {*head.sensors, *base.sensors, *checkpoint.seen, *quarantine, *newest_cloud_ns}
     if any(bool(name) != fused for name in names) or (fused and base.last and base.last.sensor not in base.sensors):
@@ -118,11 +118,12 @@ def _read_seen(row: Document, first: int) -> SeenNumbers:
     return SeenNumbers(row.epoch(epoch), highest, mask)
 
 
-def _read_recorded(one: Document, stream: str | None) -> Recorded:
+def _read_recorded(one: Document, stream: str | None, parameters: optipmb.Parameters) -> Recorded:
     """Read a frame of the window, of one stream or, without its name, of the stream that it says."""
     points = one.optional("points", one.binary)
     message = schemas.decode(one.binary("detections"), schemas.Detections, limits=schemas.STORED)
     cloud = None if points is None else schemas.decode(points, schemas.Points, limits=schemas.STORED)
+    frame_id = FrameId(message.epoch, message.seq, message.stamp_ns, message.stream if stream is None else "")
     stream = message.stream if stream is None else stream
     if message.stream != stream:
         raise one.wrong("detections", f"a frame of {stream}", f"one of {message.stream}")
@@ -130,7 +131,8 @@ def _read_recorded(one: Document, stream: str | None) -> Recorded:
         if (cloud.stream, cloud.stamp_ns) != (stream, message.stamp_ns):
             raise one.wrong("points", f"the cloud of {stream} at {message.stamp_ns}", f"that of {cloud.stamp_ns}")
         convert.cloud_of(cloud)
-    return Recorded(message, cloud, one.flag("missed"), one.count("revision"))
+    convert.frame_of(parameters, message)  # the tracker takes it
+    return Recorded(frame_id, schemas.encoded(message), cloud, one.flag("missed"), one.count("revision"))
 
 
 def _read_state(one: Document, stream: str, parameters: optipmb.Parameters, version_: int) -> FilterState:

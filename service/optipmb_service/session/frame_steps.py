@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from optipmb_service.session.recovery import Recovery
     from optipmb_service.session.reporting import SessionReporting
     from optipmb_service.session.sensor_queues import SensorQueues
-    from optipmb_service.session.state import Entry
+    from optipmb_service.session.state import Contents, Entry
     from optipmb_service.session.timeline import FrameId, Timeline
     from optipmb_service.session.values import Output
 
@@ -92,7 +92,7 @@ class FrameSteps:
         began_ns, placed = self._clock(), self._processed.amended(message, frame_id)
         if placed is None:
             return []
-        return self._go(placed, self._processed.timeline, frame_id, ticket, began_ns, behind=False)
+        return self._go(placed, self._processed.timeline, frame_id, ticket, began_ns, None)
 
     def _process(self, held: Held) -> list[Output]:
         """Put a frame in its place."""
@@ -104,8 +104,9 @@ class FrameSteps:
                 self._processed.timeline = timeline
                 return self._reporting.refused(entry.frame_id, decision)
             entry = replace(entry, place=decision.place)
+        contents = held.contents if decision.last else None
         placed = [entry] if decision.last else self._processed.placed(entry, timeline)
-        return self._go(placed, timeline, entry.frame_id, held.ticket, began_ns, behind=decision.last)
+        return self._go(placed, timeline, entry.frame_id, held.ticket, began_ns, contents)
 
     def _go(
         self,
@@ -114,19 +115,18 @@ class FrameSteps:
         frame_id: FrameId,
         ticket: Any,
         began_ns: int,
-        *,
-        behind: bool,
+        contents: Contents | None,
     ) -> list[Output]:
         """Go through frames, see `ProcessedFrames.go`; when a step raises, the sensor is quarantined."""
         processed = self._processed
         before = processed.head.session
         try:
-            outcomes = processed.go(placed, behind=behind)
+            outcomes = processed.go(placed, contents)
         except Exception as error:  # noqa: BLE001 - a fault in one session's step must not end the others
-            return self._fail(error, [*processed.entries, *placed] if behind else placed, frame_id)
+            return self._fail(error, placed if contents is None else [*processed.entries, *placed], frame_id)
         gone = processed.settle(timeline)
         self._sensors.follow(gone)
-        self._reporting.deliveries.inserted += not behind
+        self._reporting.deliveries.inserted += contents is None
         session = processed.head.session
         outputs = [] if session == before else self._reporting.begun(outcomes, session)
         took_ns = self._clock() - began_ns

@@ -11,19 +11,18 @@ from dataclasses import replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
 
+import optipmb_schemas as schemas
+
 from optipmb.records import record
 from optipmb_service.session.cloud_buffer import CloudBuffer
 from optipmb_service.session.fused_timeline import FusedTimeline
-from optipmb_service.session.state import Entry, held_size, size_of
+from optipmb_service.session.state import Entry, size_of
 from optipmb_service.session.timeline import hold_until
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Sequence
 
-    import optipmb_schemas as schemas
-
-    import optipmb
-    from optipmb_service.session.state import FilterState
+    from optipmb_service.session.state import Contents, FilterState
     from optipmb_service.session.timeline import Decision, FrameId, Order, Timeline
     from optipmb_service.session.values import Policy
 
@@ -43,6 +42,7 @@ class Held:
 
     Attributes:
         entry: the frame, without its cloud until its turn has come, where it belonged when it arrived.
+        contents: what was read of it.
         order: where that was among the others.
         deadline_ns: until when it waits for its cloud (monotonic); None: it does not.
         ticket: what the caller gave with it.
@@ -50,10 +50,16 @@ class Held:
     """
 
     entry: Entry
+    contents: Contents
     order: Order
     deadline_ns: int | None
     ticket: Any
     judged: Judged
+
+    @property
+    def size(self) -> int:
+        """The bytes that it takes, nearly: those of its detections, and as many once more for what was read of them."""
+        return self.entry.weight + len(self.entry.detections)
 
 
 _order: Final = attrgetter("order")
@@ -98,27 +104,25 @@ class PendingFrames:
 
     def add(
         self,
-        message: schemas.Detections,
+        contents: Contents,
         frame_id: FrameId,
-        frame: optipmb.Frame,
-        ignored: int,
         arrived_ns: int,
         ticket: Any,
         judged: Judged,
     ) -> None:
         """Put a frame where it belongs; the arguments are of `Entry` and `Held`, and when it arrived (monotonic)."""
         deadline_ns = hold_until(
-            has_points=message.has_points,
+            has_points=contents.message.has_points,
             stamp_ns=frame_id.stamp_ns,
             arrived_ns=arrived_ns,
             newest_cloud_ns=self.clouds.newest_ns,
             cloud_wait_ns=self.policy.cloud_wait_ns,
             cloud_memory_ns=self.policy.cloud_memory_ns,
         )
-        place, weight = judged[1].place, size_of(message)
-        self.held_bytes += held_size(message)
-        entry = Entry(frame_id, place, message, None, False, 0, frame, ignored, weight)
-        held = Held(entry, place.order(frame_id), deadline_ns, ticket, judged)
+        place, detections = judged[1].place, schemas.encoded(contents.message)
+        entry = Entry(frame_id, place, detections, None, False, 0, size_of(detections))
+        held = Held(entry, contents, place.order(frame_id), deadline_ns, ticket, judged)
+        self.held_bytes += held.size
         if self.held:
             insort(self.held, held, key=_order)
         else:
@@ -148,7 +152,7 @@ class PendingFrames:
             used: of clouds, by `id`, that frames have had.
         """
         clouds = [(cloud, None) for cloud in self.clouds if id(cloud) not in used]
-        return [*clouds, *((one.entry.message, one.ticket) for one in self.held)]
+        return [*clouds, *((one.contents.message, one.ticket) for one in self.held)]
 
     def clear(self) -> int:
         """Drop all; returns how many there were."""
@@ -191,18 +195,18 @@ class PendingFrames:
         many = much or len(self.held) > MAX_HELD
         if now_ns is not None and not many and self._behind_gap(head, complete):
             return None
-        points = self._cloud(head.entry) if self.clouds.newest_ns is not None else None
+        points = self._cloud(head) if self.clouds.newest_ns is not None else None
         missed = points is None and head.deadline_ns is not None
         if missed and now_ns is not None and now_ns < (head.deadline_ns or 0) and not (many or self._crowded(head)):
             return None
         del self.held[0]
-        self.held_bytes -= held_size(head.entry.message)
+        self.held_bytes -= head.size
         return replace(head, entry=head.entry.given(points, missed=missed)) if points is not None or missed else head
 
-    def _cloud(self, entry: Entry) -> schemas.Points | None:
-        if entry.message.has_points is False:
+    def _cloud(self, held: Held) -> schemas.Points | None:
+        if held.contents.message.has_points is False:
             return None
-        frame_id = entry.frame_id
+        frame_id = held.entry.frame_id
         return self.clouds.get(
             frame_id.epoch, frame_id.stamp_ns, lambda one: self.timeline.knows(frame_id._replace(epoch=one))
         )

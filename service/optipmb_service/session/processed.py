@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     from optipmb_service.session.checkpoint import Checkpoint
-    from optipmb_service.session.state import Entry, FilterState
+    from optipmb_service.session.state import Contents, Entry, FilterState
     from optipmb_service.session.timeline import FrameId
     from optipmb_service.session.transition import Outcome
     from optipmb_service.session.values import Lineage, Policy
@@ -75,17 +75,17 @@ class ProcessedFrames:
         placed = self._history.amended(points, frame_id, published=self.timeline.knows(frame_id))
         return None if all(new is old for new, old in zip(placed, self.entries, strict=True)) else placed
 
-    def go(self, placed: Sequence[Entry], *, behind: bool) -> list[Outcome]:
+    def go(self, placed: Sequence[Entry], contents: Contents | None) -> list[Outcome]:
         """Go through the frames from the first that is not as it was; returns what became of each in order.
 
         Args:
-            placed: the frames of the window as they are to be.
-            behind: whether `placed` is one frame that belongs behind all others and moves none.
+            placed: the frames of the window as they are to be, or one that belongs behind all others and moves none.
+            contents: what was read of that one; None: they are those of the window.
 
         Raises:
             Exception: whatever the tracker raises.
         """
-        return self._history.append(placed[0]) if behind else self._history.redo(placed)
+        return self._history.redo(placed) if contents is None else self._history.append(placed[0], contents)
 
     def settle(self, timeline: Timeline | FusedTimeline) -> Sequence[FrameId]:
         """Take over the timeline with what was gone through; returns the frames that have left the window by it."""
@@ -124,13 +124,11 @@ class ProcessedFrames:
     def portable(self) -> tuple[FilterState, tuple[Recorded, ...]]:
         """Return the beginning and the frames of as much of the window as a checkpoint takes along."""
         base, entries = self._history.portable(self._policy.checkpoint_bytes)
-        return base, tuple(Recorded(one.message, one.points, one.missed, one.revision, one.packed) for one in entries)
+        return base, tuple(
+            Recorded(one.frame_id, one.detections, one.points, one.missed, one.revision, one.packed) for one in entries
+        )
 
     def resume(self, checkpoint: Checkpoint) -> None:
-        """Take up what was written down.
-
-        Raises:
-            CheckpointError: its frames do not fit together.
-        """
+        """Take up what was written down."""
         self.timeline, entries = window_of(checkpoint, self._policy.gap_limit_ns)
         self._history = ReorderWindow(checkpoint.base, self.transition.step, entries, checkpoint.head)

@@ -50,7 +50,7 @@ class Recovery:
         """Wait for missed frames: the session was restored."""
         if checkpoint.fused and checkpoint.base.last is None:
             # Of the beginning of a session: other sensors may have been there that it does not know yet.
-            self._young_ns = min((one.message.stamp_ns for one in checkpoint.window), default=None)
+            self._young_ns = min((one.frame_id.stamp_ns for one in checkpoint.window), default=None)
         self._sensors.hold_until(now_ns + self._wait_ns)
 
     def end(self) -> None:

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
     import optipmb_schemas as schemas
 
-    from optipmb_service.session.state import Entry, FilterState
+    from optipmb_service.session.state import Contents, Entry, FilterState
     from optipmb_service.session.timeline import FrameId, Placement
     from optipmb_service.session.transition import Outcome
     from optipmb_service.session.values import Policy
 
-    Step = Callable[[FilterState, Entry], tuple[FilterState, Outcome]]
+    Step = Callable[[FilterState, Entry, Contents | None], tuple[FilterState, Outcome]]
 
 
 class ReorderWindow:
@@ -65,13 +65,13 @@ class ReorderWindow:
         state = self._after[known - 1] if known else self.base
         assert state is not None  # noqa: S101 - the search ended at one that is there; said for the type checker
         for at in range(known, number):
-            state, _ = self.step(state, self._entries[at])
+            state, _ = self.step(state, self._entries[at], None)
             self._after[at] = state
         return state
 
-    def append(self, entry: Entry) -> list[Outcome]:
+    def append(self, entry: Entry, contents: Contents) -> list[Outcome]:
         """Go on by a frame that belongs behind all others and moves none."""
-        state, outcome = self.step(self.head, entry)
+        state, outcome = self.step(self.head, entry, contents)
         self._entries.append(entry)
         self._weight += entry.weight
         self._after.append(state)
@@ -120,7 +120,7 @@ class ReorderWindow:
         for i in range(first, len(entries)):
             if entries[i].frame_id in known:
                 entries[i] = replace(entries[i], revision=entries[i].revision + 1)
-            state, outcome = self.step(state, entries[i])
+            state, outcome = self.step(state, entries[i], None)
             after.append(state)
             outcomes.append(outcome)
         self._entries = entries

@@ -26,6 +26,7 @@ from optipmb_service.session.processed import ProcessedFrames
 from optipmb_service.session.recovery import Recovery
 from optipmb_service.session.reporting import SessionReporting
 from optipmb_service.session.sensor_queues import SensorQueues
+from optipmb_service.session.state import Contents
 from optipmb_service.session.timeline import FrameId
 from optipmb_service.session.values import SECOND, Begun, Counters, Lineage, Output, Policy, total
 
@@ -120,7 +121,8 @@ class Session:
             return [*outputs, self._reporting.complain.invalid(frame_id, invalid)]
         pending.timeline = arrived
         since_ns = now_ns if arrived_ns is None else arrived_ns
-        pending.add(message, frame_id, frame, ignored, since_ns, ticket, (judged_by, decision, arrived))
+        contents = Contents(message, frame, ignored)
+        pending.add(contents, frame_id, since_ns, ticket, (judged_by, decision, arrived))
         return [*outputs, *self._steps.advance(now_ns)]
 
     def on_points(self, message: schemas.Points, now_ns: int, *, ticket: Any = None) -> list[Output]:
@@ -256,9 +258,6 @@ class Session:
             instance: name of the service, for problems.
             tracker: makes the tracker.
             clock: measures how long a step takes, ns.
-
-        Raises:
-            CheckpointError: its frames do not fit together.
         """
         session = cls(
             checkpoint.stream,

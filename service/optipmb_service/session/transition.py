@@ -21,7 +21,7 @@ import optipmb
 from optipmb.records import record
 from optipmb_service.session import convert
 from optipmb_service.session.pose_check import judge
-from optipmb_service.session.state import Entry, FilterState, FrameCounts, PoseHistory, SensorState
+from optipmb_service.session.state import Contents, Entry, FilterState, FrameCounts, PoseHistory, SensorState
 from optipmb_service.session.timeline import FrameId, Verdict
 from optipmb_service.session.values import MAX_LABELS, MAX_SENSORS, SECOND, total
 
@@ -95,8 +95,13 @@ class Transition:
         digest.update(json.dumps([self.stream, starts, *where]).encode())
         return digest.hexdigest()
 
-    def step(self, before: FilterState, entry: Entry) -> tuple[FilterState, Outcome]:
+    def step(self, before: FilterState, entry: Entry, contents: Contents | None = None) -> tuple[FilterState, Outcome]:
         """Go on by one frame.
+
+        Args:
+            before: the state.
+            entry: the frame.
+            contents: what was read of it; None: it is read here.
 
         Raises:
             Exception: whatever the tracker raises.
@@ -106,10 +111,13 @@ class Transition:
             # What comes after is judged, and put in order, as if it had not been there.
             passed = _passed(before, entry, before.sensor(frame_id.sensor).pose_history, unconfirmed=1)
             return replace(passed, last=before.last), Outcome(entry, None, None, {})
+        if contents is None:
+            message = entry.message
+            contents = Contents(message, *convert.frame_of(self.parameters, message))
         sensor = before.sensor(frame_id.sensor)
         begins = _begins(before, entry)
         known = PoseHistory() if begins else sensor.pose_history
-        pose_history, where = judge(known, entry.message, self._policy)
+        pose_history, where = judge(known, contents.message, self._policy)
         if where == "moved" and self._others_stayed(before, frame_id):
             # The sensors of a session move together: this one waits for the others to say the same.
             count = sensor.pose_history.astray + 1
@@ -123,14 +131,15 @@ class Transition:
         if where == "moved":
             begins = SessionStart("pose", place.jump_ns)
         try:
-            return self._track(before, entry, begins, pose_history)
+            return self._track(before, entry, contents, begins, pose_history)
         except optipmb.EffortError as error:
             # What the frame cannot be tracked with may be a density of too many objects: they are given up when they
             # have not been updated for so long, and the frame alone is not too much.
             silent_ns = frame_id.stamp_ns - before.density.stamp_ns
             if begins is None and before.density.stamp_ns >= 0 and silent_ns > GIVE_UP_NS:
                 with suppress(optipmb.EffortError):
-                    return self._track(before, entry, SessionStart("effort", place.jump_ns), pose_history)
+                    begins = SessionStart("effort", place.jump_ns)
+                    return self._track(before, entry, contents, begins, pose_history)
             return _passed(before, entry, sensor.pose_history, effort=1), Outcome(entry, None, None, {}, error)
 
     def _others_stayed(self, before: FilterState, frame_id: FrameId) -> bool:
@@ -144,7 +153,12 @@ class Transition:
         )
 
     def _track(
-        self, before: FilterState, entry: Entry, begins: SessionStart | None, pose_history: PoseHistory
+        self,
+        before: FilterState,
+        entry: Entry,
+        contents: Contents,
+        begins: SessionStart | None,
+        pose_history: PoseHistory,
     ) -> tuple[FilterState, Outcome]:
         frame_id = entry.frame_id
         if begins:
@@ -153,7 +167,7 @@ class Transition:
                 density = optipmb.Density.empty(self.parameters.labels, density.next_id)
             before = before.begun_anew(density, self.name(frame_id, starts), starts)
         sensor = before.sensor(frame_id.sensor)
-        frame = entry.frame
+        frame = contents.frame
         if entry.points is not None:
             frame = replace(frame, cloud=convert.cloud_of(entry.points))
         result = self._tracker.step(before.density, frame)
@@ -172,9 +186,9 @@ class Transition:
             parameters=self.parameters,
             cloud_used=used,
             gap=gap,
-            ignored=entry.ignored,
+            ignored=contents.ignored,
         )
-        unknown = self._unknown(entry, sensor.reported) if entry.ignored else {}
+        unknown = self._unknown(contents.message, sensor.reported) if contents.ignored else {}
         repaired = int(result.diagnostics.repaired)
         known = SensorState(
             cursor=sensor.cursor.after(frame_id, entry.place),
@@ -194,8 +208,8 @@ class Transition:
         )
         return after, Outcome(entry, tracks, begins, unknown)
 
-    def _unknown(self, entry: Entry, reported: frozenset[str]) -> dict[str, int]:
-        found = convert.unknown_labels(self.parameters, entry.message)
+    def _unknown(self, message: schemas.Detections, reported: frozenset[str]) -> dict[str, int]:
+        found = convert.unknown_labels(self.parameters, message)
         new = sorted(found.keys() - reported)[: max(0, MAX_LABELS - len(reported))]
         return {label: found[label] for label in found if label in new}
 

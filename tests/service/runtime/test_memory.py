@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import optipmb_schemas as schemas
 import pytest
 from optipmb_service.runtime.byte_budget import MEGABYTE
 from optipmb_service.runtime.sweep import Sweep
@@ -76,7 +77,7 @@ def test_a_cloud_counts_once() -> None:
         kept.append(session.held_bytes)
         assert session.on_detections(SENSOR.detections(seq, has_points=True), 0)
         kept.append(session.held_bytes)
-    cloud, detections = SENSOR.points(0).xyz.nbytes, size_of(SENSOR.detections(0))
+    cloud, detections = SENSOR.points(0).xyz.nbytes, size_of(schemas.encode(SENSOR.detections(0, has_points=True)))
     assert kept == [seq * (cloud + detections) + one for seq in range(3) for one in (cloud, cloud + detections)]
 
 

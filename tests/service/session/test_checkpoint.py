@@ -138,7 +138,7 @@ def test_large_clouds_shorten_the_window_not_the_checkpoint() -> None:
         feed(one, [seq], SENSOR)
     checkpoint = one.snapshot()
     assert len(one._processed.entries) == 6
-    assert [entry.message.seq for entry in checkpoint.window] == [5, 6]
+    assert [entry.frame_id.seq for entry in checkpoint.window] == [5, 6]
     assert len(encode_checkpoint(checkpoint)) < 130_000
     two = Session.restore(checkpoint, 0, policy)
     assert state_bytes(two.snapshot()) == state_bytes(checkpoint)
@@ -311,7 +311,7 @@ def test_every_version_is_read(version: int) -> None:
     """A file that an earlier build wrote is taken up, and goes on."""
     checkpoint = decode_checkpoint((GOLDEN / f"checkpoint-{version}.bin").read_bytes())
     assert (checkpoint.stream, checkpoint.head.counts.frames, checkpoint.head.counts.gaps) == (SENSOR.stream, 6, 2)
-    assert [entry.message.seq for entry in checkpoint.window] == [2, 4, 5, 7]
+    assert [entry.frame_id.seq for entry in checkpoint.window] == [2, 4, 5, 7]
     assert [entry.revision for entry in checkpoint.window] == [0, 0, 1, 0]
     one = Session.restore(checkpoint, 0, tracker=chained)
     assert [m.seq for m in tracks(feed(one, [6], SENSOR, has_points=False))] == [6, 7]
