@@ -7,7 +7,7 @@ For the same reason a step gives the fields of the long records by position.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar, dataclass_transform
 
 import numpy as np
@@ -29,7 +29,7 @@ FLAG: Final = np.dtype(np.bool_)
 """Types of columns. Given to `np.empty` so, an array takes three quarters of the time that it takes by `np.int64`."""
 
 
-@dataclass_transform(frozen_default=True)
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def record(cls: type[T]) -> type[T]:
     """Make a class a dataclass with slots whose fields are assigned by its constructor alone."""
     return dataclass(slots=True)(cls)

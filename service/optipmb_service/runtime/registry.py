@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from functools import lru_cache, partial
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import optipmb_schemas as schemas
@@ -46,6 +47,12 @@ if TYPE_CHECKING:
 
 RIVAL_LEASES: Final = 3
 """Leases for which the token of an instance may stay whose stream has been taken over."""
+
+KEPT_AT_ONCE: Final = 8
+"""States that are given to the checkpoint writer at once: a frame that comes meanwhile waits for a fraction of its own.
+
+A turn of each stream, asked for by another thread, takes four times as long.
+"""
 
 MAX_KEYS: Final = 8192
 """Keys whose stream is remembered."""
@@ -288,9 +295,8 @@ class Registry:
 
     def keep(self) -> None:
         """Have every session that changed give its state to the checkpoint writer."""
-        for actor in self._actors.tracking():
-            if actor.changed:  # thousands may be silent
-                actor.tell(StreamActor.keep)
+        changed = [actor for actor in self._actors.tracking() if actor.changed]  # thousands may be silent
+        self._scheduler.submit(_Keeping(changed))
 
     def keep_now(self) -> None:
         """Do the same in the calling thread, when the tracking thread has ended."""
@@ -354,6 +360,24 @@ class Registry:
             message=message,
         )
         self._reporter.report(problem, time.monotonic_ns())
+
+
+class _Keeping:
+    """Has actors give the states of their sessions to the checkpoint writer, on the tracking thread, few at a time.
+
+    Args:
+        actors: those with sessions that changed.
+    """
+
+    def __init__(self, actors: list[StreamActor]) -> None:
+        self._left = iter(actors)
+
+    def work(self) -> bool:
+        """Go on; True: there are more, after the frames that wait."""
+        some = list(islice(self._left, KEPT_AT_ONCE))
+        for actor in some:
+            actor.keep()
+        return len(some) == KEPT_AT_ONCE
 
 
 def _flush(actor: StreamActor) -> None:

@@ -361,7 +361,11 @@ class StreamActor:
 
     def keep(self) -> None:
         """Give the state to the checkpoint writer, if it changed."""
-        if self.changed and self.session is not None:
+        if self.changed:
+            self._guard(self._keep)
+
+    def _keep(self) -> None:
+        if self.session is not None:
             self._tracking.changed = False
             self._context.persistence.put(self.session.snapshot(), self._fence)
 

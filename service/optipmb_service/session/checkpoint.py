@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Final
 
@@ -12,39 +12,15 @@ from optipmb_service.session.values import Deliveries
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import optipmb_schemas as schemas
-
     import optipmb
     from optipmb_service.session.seen_numbers import SeenNumbers
-    from optipmb_service.session.state import FilterState
-    from optipmb_service.session.timeline import FrameId
+    from optipmb_service.session.state import FilterState, Recorded
 
 _SOFTWARE: Final = version("optipmb")
 
 
 class CheckpointError(ValueError):
     """The bytes are no checkpoint that this service can read; the text says why."""
-
-
-@dataclass(frozen=True, slots=True)
-class Recorded:
-    """A frame of the window.
-
-    Attributes:
-        frame_id: which.
-        detections: what `schemas.encode` gives for its detections.
-        points: its cloud.
-        missed: whether it waited for a cloud in vain.
-        revision: of the tracks that were published last for it.
-        packed: its cloud as bytes, as soon as they were made.
-    """
-
-    frame_id: FrameId
-    detections: bytes
-    points: schemas.Points | None
-    missed: bool
-    revision: int
-    packed: list[bytes] = field(default_factory=list, compare=False)
 
 
 @dataclass(frozen=True, slots=True)

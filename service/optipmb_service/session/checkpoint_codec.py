@@ -1,9 +1,9 @@
 """The state of a session as bytes and back: whole or not at all.
 
-The bytes are a head (magic, version, BLAKE2b digest of version and body) and a body, one msgpack map. Equal checkpoints
-give equal bytes. Reading is total and bounded: it returns a checkpoint or raises `CheckpointError`, and the digest is
-compared before anything else is looked at. A service reads the versions that earlier ones wrote (`checkpoint_reading`),
-and refuses later ones by number.
+The bytes are a head (magic, version, the first 16 bytes of the SHA-256 digest of version and body) and a body, one
+msgpack map. Equal checkpoints give equal bytes. Reading is total and bounded: it returns a checkpoint or raises
+`CheckpointError`, and the digest is compared before anything else is looked at. A service reads the versions that
+earlier ones wrote (`checkpoint_reading`), and refuses later ones by number.
 
 What depends on how messages were delivered (duplicates, the revisions of corrected tracks, crashes) is kept, but is no
 state: `state_bytes` leaves it out, so that two sessions that took the same frames can be compared.
@@ -25,19 +25,22 @@ from optipmb_service.session.document import Document
 from optipmb_service.session.values import Deliveries
 
 if TYPE_CHECKING:
-    from optipmb_service.session.checkpoint import Checkpoint, Recorded
-    from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, SensorState
+    from optipmb_service.session.checkpoint import Checkpoint
+    from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, Recorded, SensorState
 
-VERSION: Final = 3
+VERSION: Final = 4
 MAGIC: Final = b"OPTIPMB\0"
 DIGEST: Final = 16
 HEAD: Final = len(MAGIC) + 2 + DIGEST
+SHA: Final = 4
+"""The version since which the digest is SHA-256; before it was BLAKE2b."""
 MAX_BYTES: Final = 2**28
 MAX_PROFILES: Final = 64
 """Profiles whose form in checkpoints is remembered."""
 
+_PERSON: Final = b"optipmb-check"
 _msgpack: Any = msgpack  # its type information is partial
-_profiles: dict[int, tuple[optipmb.Parameters, dict[str, Any]]] = {}
+_profiles: dict[int, tuple[optipmb.Parameters, bytes]] = {}
 """The profiles that were written last, by their ids."""
 
 
@@ -93,21 +96,21 @@ def _open(data: bytes) -> tuple[int, bytes]:
 
 
 def _digest(version_: int, body: bytes) -> bytes:
-    digest = hashlib.blake2b(version_.to_bytes(2, "big"), digest_size=DIGEST, person=b"optipmb-check")
+    # Processors have instructions for SHA-256: it takes a third of the time that BLAKE2b takes.
+    start = version_.to_bytes(2, "big")
+    digest = hashlib.sha256(start) if version_ >= SHA else hashlib.blake2b(start, digest_size=DIGEST, person=_PERSON)
     digest.update(body)
-    return digest.digest()
+    return digest.digest()[:DIGEST]
 
 
 # Writing
 
 
 def _body(checkpoint: Checkpoint) -> dict[str, Any]:
-    parameters = _dumped(checkpoint.parameters)
-    # Most sessions of a store have one of a few profiles; the order of the classes is that of their indices.
     return {
         "software": checkpoint.software,
         "stream": checkpoint.stream,
-        "parameters": parameters,
+        "parameters": _packed_profile(checkpoint.parameters),
         "fused": checkpoint.fused,
         "cloud_wait_ns": checkpoint.cloud_wait_ns,
         "quarantine": [list(one) for one in sorted(checkpoint.quarantine.items())],
@@ -134,13 +137,13 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
     }
 
 
-def _dumped(parameters: optipmb.Parameters) -> dict[str, Any]:
-    """Return a profile as maps and numbers; sessions write the same one every second."""
+def _packed_profile(parameters: optipmb.Parameters) -> bytes:
+    """Return a profile as bytes, classes in the order of their indices; sessions write the same few every second."""
     known = _profiles.get(id(parameters))
     if known is None or known[0] is not parameters:
         if len(_profiles) >= MAX_PROFILES:
             _profiles.clear()
-        known = _profiles[id(parameters)] = parameters, parameters.model_dump(mode="json")
+        known = _profiles[id(parameters)] = parameters, _msgpack.packb(parameters.model_dump(mode="json"))
     return known[1]
 
 

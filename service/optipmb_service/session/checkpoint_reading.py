@@ -12,22 +12,23 @@ import optipmb_schemas as schemas
 
 import optipmb
 from optipmb_service.session import convert
-from optipmb_service.session.checkpoint import Checkpoint, Recorded
+from optipmb_service.session.checkpoint import Checkpoint
+from optipmb_service.session.document import Document
 from optipmb_service.session.seen_numbers import EPOCHS, WINDOW, SeenNumbers
-from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, SensorState
+from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, Recorded, SensorState
 from optipmb_service.session.timeline import Cursor, FrameId
 from optipmb_service.session.values import MAX_CLOUD_WAIT_NS, MAX_COUNT, MAX_ERROR, MAX_LABELS, MAX_SENSORS, Deliveries
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from optipmb_service.session.document import Document
-
 MAX_SOFTWARE: Final = 100
 MAX_STREAM: Final = 512
 """Characters of the name of a stream, at least."""
 FUSED: Final = 3
 """The version since which a session may have several sensors."""
+PACKED: Final = 4
+"""The version since which a profile is bytes, which sessions with the same one need not make again."""
 MAX_LABEL: Final = 64
 """Characters of a class name, as messages take it."""
 
@@ -52,12 +53,18 @@ def _read_2(body: Document) -> Checkpoint:
 
 
 def _read_3(body: Document) -> Checkpoint:
+    """Read version 3, whose profile is a map like others."""
     return _read(body, 3)
+
+
+def _read_4(body: Document) -> Checkpoint:
+    return _read(body, 4)
 
 
 def _read(body: Document, version_: int) -> Checkpoint:
     stream = body.stream("stream")
-    parameters = optipmb.parse_parameters(body.map("parameters"))
+    profile = body.map("parameters") if version_ < PACKED else Document.of(body.binary("parameters")).fields
+    parameters = optipmb.parse_parameters(profile)
     schemas.SessionParameters(profile=parameters.name)  # as messages take it
     fused = version_ >= FUSED and body.flag("fused")
     base = _read_state(body.document("base"), stream, parameters, version_)
@@ -132,7 +139,7 @@ def _read_recorded(one: Document, stream: str | None, parameters: optipmb.Parame
             raise one.wrong("points", f"the cloud of {stream} at {message.stamp_ns}", f"that of {cloud.stamp_ns}")
         convert.cloud_of(cloud)
     convert.frame_of(parameters, message)  # the tracker takes it
-    return Recorded(frame_id, schemas.encoded(message), cloud, one.flag("missed"), one.count("revision"))
+    return Recorded(frame_id, schemas.encoded(message), cloud, one.flag("missed"), one.count("revision"), [])
 
 
 def _read_state(one: Document, stream: str, parameters: optipmb.Parameters, version_: int) -> FilterState:
@@ -190,5 +197,5 @@ def _read_sensor_state(one: Document) -> SensorState:
     )
 
 
-READERS: Final[dict[int, Callable[[Document], Checkpoint]]] = {1: _read_1, 2: _read_2, 3: _read_3}
+READERS: Final[dict[int, Callable[[Document], Checkpoint]]] = {1: _read_1, 2: _read_2, 3: _read_3, 4: _read_4}
 """What reads the body of each version."""

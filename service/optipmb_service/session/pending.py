@@ -120,7 +120,7 @@ class PendingFrames:
             cloud_memory_ns=self.policy.cloud_memory_ns,
         )
         place, detections = judged[1].place, schemas.encoded(contents.message)
-        entry = Entry(frame_id, place, detections, None, False, 0, size_of(detections))
+        entry = Entry(frame_id, detections, None, False, 0, [], place, size_of(detections))
         held = Held(entry, contents, place.order(frame_id), deadline_ns, ticket, judged)
         self.held_bytes += held.size
         if self.held:

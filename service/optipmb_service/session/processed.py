@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import optipmb
-from optipmb_service.session.checkpoint import Recorded
 from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.reorder_window import ReorderWindow
 from optipmb_service.session.restored_window import window_of
@@ -121,12 +120,9 @@ class ProcessedFrames:
     def _no_objects(self) -> optipmb.Density:
         return optipmb.Density.empty(self.transition.parameters.labels, self.head.density.next_id)
 
-    def portable(self) -> tuple[FilterState, tuple[Recorded, ...]]:
+    def portable(self) -> tuple[FilterState, tuple[Entry, ...]]:
         """Return the beginning and the frames of as much of the window as a checkpoint takes along."""
-        base, entries = self._history.portable(self._policy.checkpoint_bytes)
-        return base, tuple(
-            Recorded(one.frame_id, one.detections, one.points, one.missed, one.revision, one.packed) for one in entries
-        )
+        return self._history.portable(self._policy.checkpoint_bytes)
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Take up what was written down."""

@@ -34,13 +34,13 @@ def window_of(checkpoint: Checkpoint, gap_limit_ns: int) -> tuple[Timeline | Fus
     entries = [
         Entry(
             one.frame_id,
-            places[one.frame_id],
             one.detections,
             one.points,
             one.missed,
             one.revision,
-            size_of(one.detections, one.points),
             one.packed,
+            places[one.frame_id],
+            size_of(one.detections, one.points),
         )
         for one in checkpoint.window
     ]

@@ -143,8 +143,8 @@ class Contents:
 
 
 @record
-class Entry:
-    """A frame that is or was processed.
+class Recorded:
+    """A frame of the window as checkpoints have it.
 
     Its detections are bytes: few of the frames that are kept are processed again, and those are read once more. What is
     read takes twice the memory, in some forty pieces, and where each frame fills the memory of one long past instead of
@@ -152,23 +152,32 @@ class Entry:
 
     Attributes:
         frame_id: which.
-        place: where it belongs.
         detections: what `schemas.encode` gives for its detections.
         points: its cloud.
         missed: whether it waited for a cloud in vain.
         revision: of the tracks that were published last for it.
-        weight: bytes that its inputs take, nearly.
         packed: its cloud as bytes, once a checkpoint has made them: it is in one checkpoint after the other.
     """
 
     frame_id: FrameId
-    place: Placement
     detections: bytes
     points: schemas.Points | None
     missed: bool
     revision: int
+    packed: list[bytes] = field(compare=False)
+
+
+@record
+class Entry(Recorded):
+    """A frame that is or was processed.
+
+    Attributes:
+        place: where it belongs.
+        weight: bytes that its inputs take, nearly.
+    """
+
+    place: Placement
     weight: int
-    packed: list[bytes] = field(default_factory=list, compare=False)
 
     @property
     def message(self) -> schemas.Detections:

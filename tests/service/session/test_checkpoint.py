@@ -237,6 +237,10 @@ def altered(change: Any) -> Checkpoint:
     return decode_checkpoint(seal(msgpack.packb(body)))
 
 
+def _set_profile(body: Any, **changes: Any) -> None:
+    body["parameters"] = msgpack.packb(msgpack.unpackb(body["parameters"]) | changes)
+
+
 def _set(body: Any, column: str, value: float) -> None:
     block = body["head"]["density"][column]
     assert block["data"]
@@ -251,7 +255,7 @@ def _set(body: Any, column: str, value: float) -> None:
         (lambda body: body["head"].update(next_id=0), "next_id"),
         (lambda body: body["head"]["density"].pop("bernoulli.mean"), "bernoulli.mean"),
         (lambda body: body["head"]["density"]["bernoulli.mean"].update(shape=[1, 6]), "bernoulli.mean.data"),
-        (lambda body: body["parameters"].update(nominal_period=-1), "nominal_period"),
+        (lambda body: _set_profile(body, nominal_period=-1), "nominal_period"),
         (lambda body: body["window"][0].update(detections=b"no"), "msgpack"),
         (lambda body: body["window"].append(body["window"][0]), "window"),
         (lambda body: body["epochs"][0].pop(), "epochs"),
@@ -261,7 +265,9 @@ def _set(body: Any, column: str, value: float) -> None:
         (lambda body: body.update(run=2**63 - 1), "run"),
         (lambda body: body.update(quarantine=[["", "x" * 401]]), "quarantine"),
         (lambda body: body.update(cloud_wait_ns=2**62), "cloud_wait_ns"),
-        (lambda body: body["parameters"].update(name="a b"), "profile"),
+        (lambda body: _set_profile(body, name="a b"), "profile"),
+        (lambda body: body.update(parameters=b"\xc1"), "malformed"),
+        (lambda body: body.update(parameters={}), "parameters"),
         (lambda body: body["epochs"].append(body["epochs"][0]), "epochs"),
         (lambda body: body["epochs"][0].__setitem__(3, b"\2"), "epochs"),
         (lambda body: body["head"]["sensors"][0].update(reported=["x" * 65]), "reported"),
