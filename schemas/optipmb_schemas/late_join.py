@@ -10,8 +10,11 @@ new subscription takes over: the cache's answer to it may overtake messages on t
 It takes Zenoh's samples and imports no Zenoh.
 """
 
+import heapq
+import itertools
 import queue
 import threading
+import time
 from collections.abc import Callable, Container
 from dataclasses import dataclass
 from typing import Final, Generic, Protocol, TypeVar
@@ -20,6 +23,10 @@ __all__ = ["ANSWER_S", "CacheQueries", "LateJoin"]
 
 ANSWER_S: Final = 5.0
 """How long to wait for the answer of a cache; a publisher that has just sent a message answers within milliseconds."""
+
+REPEATS_S: Final = (0.5, 1.0, 2.0)
+"""How long nothing is heard of a query before it is sent again: if it was lost on its way, or its answer was, all that
+comes of the publisher would wait for `ANSWER_S`."""
 
 MAX_WAITING: Final = 1024
 """Most messages of one publisher that wait for the answer of its cache."""
@@ -86,6 +93,44 @@ class _Gap(Generic[_S]):
     behind: list[_S]
 
 
+class _Query(Generic[_S]):
+    """A query that is sent again while nothing is heard of it, and ends with the first of these that ends.
+
+    Args:
+        selector: what is asked.
+        reply: called with each answer; where it was sent twice, perhaps with the same one twice.
+        end: called when no more will come, with whether all that were asked have answered.
+    """
+
+    def __init__(self, selector: str, reply: Callable[[_S], None], end: Callable[[bool], None]) -> None:
+        self._selector = selector
+        self._reply = reply
+        self._when_ended = end
+        self._lock = threading.Lock()
+        self._sent = 0
+        self._heard = self._ended = False
+
+    def send(self, query: Callable[[str, Callable[[_S], None], Callable[[bool], None]], object]) -> float | None:
+        """Send it unless something was heard; return after how long (s) it is to be sent again, None: no more."""
+        if self._heard or self._ended:
+            return None
+        self._sent += 1
+        query(self._selector, self._take, self._end)
+        return REPEATS_S[self._sent - 1] if self._sent <= len(REPEATS_S) else None
+
+    def _take(self, sample: _S) -> None:
+        self._heard = True
+        if not self._ended:
+            self._reply(sample)
+
+    def _end(self, complete: bool) -> None:  # noqa: FBT001 - as `CacheQueries` has it called
+        with self._lock:
+            if self._ended:
+                return
+            self._ended = True
+        self._when_ended(complete)
+
+
 class CacheQueries(Generic[_S]):
     """Sends the queries of a subscription on a thread of its own, which begins with the first.
 
@@ -98,15 +143,14 @@ class CacheQueries(Generic[_S]):
 
     def __init__(self, query: Callable[[str, Callable[[_S], None], Callable[[bool], None]], object]) -> None:
         self._query = query
-        self._waiting: queue.SimpleQueue[tuple[str, Callable[[_S], None], Callable[[bool], None]] | None]
-        self._waiting = queue.SimpleQueue()
+        self._waiting: queue.SimpleQueue[_Query[_S] | None] = queue.SimpleQueue()
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
         self._closed = False
 
     def ask(self, selector: str, reply: Callable[[_S], None], end: Callable[[bool], None]) -> None:
-        """Have a query sent soon; never waits."""
-        self._waiting.put((selector, reply, end))
+        """Have a query sent soon, and again while nothing is heard of it; never waits."""
+        self._waiting.put(_Query(selector, reply, end))
         with self._starting:
             if self._thread is None and not self._closed:
                 self._thread = threading.Thread(target=self._send, name="cache-queries", daemon=True)
@@ -121,8 +165,18 @@ class CacheQueries(Generic[_S]):
             self._thread.join(ANSWER_S)
 
     def _send(self) -> None:
-        while (query := self._waiting.get()) is not None and not self._closed:
-            self._query(*query)
+        again: list[tuple[float, int, _Query[_S]]] = []
+        numbers = itertools.count()
+        while True:
+            try:
+                wait_s = max(0.0, again[0][0] - time.monotonic()) if again else None
+                query = self._waiting.get(timeout=wait_s)
+            except queue.Empty:
+                _, _, query = heapq.heappop(again)
+            if query is None or self._closed:
+                return
+            if (after_s := query.send(self._query)) is not None:
+                heapq.heappush(again, (time.monotonic() + after_s, next(numbers), query))
 
 
 class LateJoin(Generic[_S]):
@@ -130,8 +184,9 @@ class LateJoin(Generic[_S]):
 
     Args:
         receive: takes a sample; never called by two threads at once, nor after `close`. It must not raise.
-        ask: queries a selector; calls its second argument with each reply, and its third when no more will come, with
-            whether all that were asked have answered, on any thread but the one that asks (`CacheQueries`).
+        ask: queries a selector; calls its second argument with each reply, perhaps with one twice, and its third when
+            no more will come, with whether all that were asked have answered, on any thread but the one that asks
+            (`CacheQueries`).
         answered: called with the key of a publisher when all has been handed over that its cache held. It must not
             raise.
     """
@@ -241,7 +296,8 @@ class LateJoin(Generic[_S]):
             if self._closed:
                 return
             publisher = self._publishers.get(source)
-            for sample in sorted((one for one in early if one.source_info is not None), key=self._number):
+            numbered = {self._number(one): one for one in early if one.source_info is not None}
+            for _, sample in sorted(numbered.items()):
                 self._hand_over(publisher, sample)
             waits = None if publisher is None else publisher.waiting
             if publisher is not None and waits is gap.behind:

@@ -1,11 +1,14 @@
 """Which samples of a publisher a subscription hands over, and in which order."""
 
+import queue
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import optipmb_schemas.late_join
 import pytest
-from optipmb_schemas.late_join import LateJoin
+from optipmb_schemas.late_join import CacheQueries, LateJoin
 
 
 @dataclass(frozen=True)
@@ -181,3 +184,91 @@ def test_an_answer_lets_go_what_waits_behind_its_own_gap(monkeypatch: pytest.Mon
     assert one.received == [0, 2, 3, 4, 1]
     one.answer(5, 6)
     assert one.received == [0, 2, 3, 4, 1, 5, 6, 7, "a/b"]
+
+
+class LostQueries:
+    """Queries of which the first ones are lost: they end only when their time is up."""
+
+    def __init__(self, lost: int) -> None:
+        self.lost = lost
+        self.sent: list[tuple[Callable[[Sample], None], Callable[[bool], None]]] = []
+        self.queries: CacheQueries[Sample] = CacheQueries(self._send)
+        self.replied: list[Sample] = []
+        self.ended: queue.SimpleQueue[bool] = queue.SimpleQueue()
+
+    def ask(self) -> bool:
+        """Ask, and return how it ended."""
+        self.queries.ask("a/b", self.replied.append, self.ended.put)
+        return self.ended.get(timeout=60)
+
+    def end_first(self) -> None:
+        """End the first one unanswered when it has been sent as often as it is."""
+        while len(self.sent) <= len(optipmb_schemas.late_join.REPEATS_S):
+            time.sleep(0.001)
+        self.sent[0][1](False)
+
+    def _send(self, selector: str, reply: Callable[[Sample], None], end: Callable[[bool], None]) -> None:
+        assert selector == "a/b"
+        self.sent.append((reply, end))
+        if len(self.sent) > self.lost:
+            reply(sample(1))
+            end(True)
+
+
+@pytest.fixture
+def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(optipmb_schemas.late_join, "REPEATS_S", (0.001, 0.001, 0.001))
+
+
+@pytest.mark.usefixtures("_soon")
+@pytest.mark.parametrize("lost", range(4))
+def test_a_query_that_is_lost_is_sent_again(lost: int) -> None:
+    """Up to three times; what an earlier one brings after the end of a later one goes nowhere."""
+    one = LostQueries(lost)
+    assert one.ask()
+    for reply, end in one.sent[:lost]:
+        reply(sample(1))
+        end(False)
+    one.queries.close()
+    assert (one.replied, len(one.sent), one.ended.empty()) == ([sample(1)], lost + 1, True)
+
+
+@pytest.mark.usefixtures("_soon")
+def test_a_query_that_nobody_answers_ends_with_the_first_that_does() -> None:
+    """When the time of the one that was sent first is up, however often it was sent again; nothing is sent any more."""
+    one = LostQueries(9)
+    threading.Thread(target=one.end_first, daemon=True).start()
+    assert not one.ask()
+    one.queries.close()
+    assert one.replied == []
+
+
+@pytest.mark.usefixtures("_soon")
+def test_a_query_that_something_is_heard_of_is_sent_once() -> None:
+    """A cache may take seconds for all that it holds; asked again, it would take longer."""
+    one: CacheQueries[Sample]
+    sent: list[str] = []
+    others, ended = queue.SimpleQueue[bool](), queue.SimpleQueue[bool]()
+
+    def send(selector: str, reply: Callable[[Sample], None], end: Callable[[bool], None]) -> None:
+        sent.append(selector)
+        reply(sample(1))
+        if selector == "other":
+            end(True)
+
+    one = CacheQueries(send)
+    one.ask("slow", lambda _: None, ended.put)
+    for _ in range(20):  # each is due later than the query before it would have been sent again
+        one.ask("other", lambda _: None, others.put)
+        assert others.get(timeout=60)
+        time.sleep(0.001)
+    one.close()
+    assert (sent.count("slow"), ended.empty()) == (1, True)
+
+
+def test_what_a_cache_answers_twice_is_handed_over_once() -> None:
+    """A query that was sent twice may be answered twice."""
+    one = Joined()
+    one.take(3)
+    one.answer(1, 2, 1, 2)
+    assert one.received == [1, 2, 3, "a/b"]
