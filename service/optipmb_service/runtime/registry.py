@@ -49,10 +49,7 @@ RIVAL_LEASES: Final = 3
 """Leases for which the token of an instance may stay whose stream has been taken over."""
 
 KEPT_AT_ONCE: Final = 8
-"""States that are given to the checkpoint writer at once: a frame that comes meanwhile waits for a fraction of its own.
-
-A turn of each stream, asked for by another thread, takes four times as long.
-"""
+"""States that are given to the checkpoint writer before waiting frames have their turn; they take less than a frame."""
 
 MAX_KEYS: Final = 8192
 """Keys whose stream is remembered."""
@@ -296,7 +293,8 @@ class Registry:
     def keep(self) -> None:
         """Have every session that changed give its state to the checkpoint writer."""
         changed = [actor for actor in self._actors.tracking() if actor.changed]  # thousands may be silent
-        self._scheduler.submit(_Keeping(changed))
+        if changed:
+            self._scheduler.submit(_Keeping(changed))
 
     def keep_now(self) -> None:
         """Do the same in the calling thread, when the tracking thread has ended."""

@@ -148,7 +148,7 @@ class Recorded:
 
     Its detections are bytes: few of the frames that are kept are processed again, and those are read once more. What is
     read takes twice the memory, in some forty pieces, and where each frame fills the memory of one long past instead of
-    the one before, a frame of 40 objects takes a twentieth longer.
+    the one before, a frame of 40 objects takes 3 % longer.
 
     Attributes:
         frame_id: which.

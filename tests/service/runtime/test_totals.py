@@ -3,120 +3,28 @@
 from __future__ import annotations
 
 import sys
-import time
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from optipmb_schemas import Detections, Keys, Points, encode, encoding_of
-from optipmb_service.observability.metrics import Metrics
-from optipmb_service.observability.problem_reporter import ProblemReporter
 from optipmb_service.runtime import actor_table, stream_actor, stream_counters
-from optipmb_service.runtime.missed_frames import NoLog
-from optipmb_service.runtime.persistence import NoPersistence
 from optipmb_service.runtime.ports import Packet
-from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.runtime.registry import Registry
 from optipmb_service.session.values import MAX_SENSORS, MessageCounters
-from optipmb_service.settings.model import Settings
+from registries import Around, packet_of, registry_of
 from router import Sensor
-from sessions import chained
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from types import FrameType
 
     import pytest
-    from optipmb_service.session.checkpoint import Checkpoint
 
 SENSOR = Sensor()
 TRACED = {str(Path(module.__file__)) for module in (stream_actor, stream_counters)}
 
 
-class Around(NoPersistence):
-    """Everything around the streams: it grants them all, keeps their states, and runs their actors when told to."""
-
-    strained = False
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._working: list[Any] = []
-        self._kept: dict[str, Checkpoint] = {}
-
-    def submit(self, actor: Any) -> None:
-        """Take an actor that has something to do."""
-        self._working.append(actor)
-
-    def run(self) -> None:
-        """Run the actors until none has anything to do."""
-        while self._working:
-            actor = self._working.pop(0)
-            if actor.work():
-                self._working.append(actor)
-
-    def put(self, checkpoint: Checkpoint, _: int | None, then: Callable[[], None] | None = None) -> None:
-        """Keep a state."""
-        self._kept[checkpoint.stream] = checkpoint
-        if then is not None:
-            then()
-
-    def recall(self, stream: str, restore: Callable[[Checkpoint], Any], then: Callable[[Any], None]) -> None:
-        """Restore what was kept."""
-        then(restore(self._kept[stream]) if stream in self._kept else None)
-
-    def holds(self, _: str) -> bool:
-        """Every stream is tracked here."""
-        return True
-
-    def fence(self, _: str) -> int:
-        """Return the fence of all streams."""
-        return 1
-
-    def may_write(self, *_: object) -> bool:
-        """All may be published."""
-        return True
-
-    def open_publisher(self, _: str) -> Around:
-        """Be the publisher of a stream."""
-        return self
-
-    def look(self) -> None:
-        """Nobody waits for anything."""
-
-    release = look
-
-    def publish(self, _: bytes) -> None:
-        """Tracks go nowhere."""
-
-
-def registry_of(around: Around, **settings: Any) -> Registry:
-    """Return the streams of a process with these around it."""
-    parts: Any = around  # in the place of several
-    return Registry(
-        Settings(instance="test", store="none", step_limit_s=60, **settings),  # kernels may have to be compiled
-        Profiles.read("nuscenes", {}),
-        sink=parts,
-        reporter=ProblemReporter(lambda _: None, lambda *_: None),
-        scheduler=parts,
-        member=parts,
-        persistence=parts,
-        missed=NoLog(),
-        arm=lambda *_: None,
-        metrics=Metrics(),
-        tracker=chained,
-    )
-
-
 def packet(seq: int) -> Packet:
     """Return a frame as it comes."""
     return packet_of(SENSOR.detections(seq))
-
-
-def packet_of(message: Detections | Points) -> Packet:
-    """Return a message as it comes."""
-    payload, keys = encode(message), Keys()
-    key = (keys.detections if isinstance(message, Detections) else keys.points)(message.stream)
-    return Packet(key, payload, len(payload), encoding_of(type(message)), time.time_ns(), time.monotonic_ns())
 
 
 def test_totals_never_fall_and_count_nothing_twice() -> None:
