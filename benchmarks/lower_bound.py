@@ -17,7 +17,7 @@ import numpy as np
 
 from optipmb.association import associate
 from optipmb.class_posterior import UNGROUPED
-from optipmb.density import BernoulliArrays, PoissonArrays, columns_of_components, columns_of_objects
+from optipmb.density import components_in, objects_in
 from optipmb.hypotheses import local_hypotheses
 from optipmb.motion import predict_state
 from optipmb.predict import predict
@@ -105,7 +105,7 @@ def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: o
     measurements, _, _ = preprocess(frame, table)
     old, undetected = predicted.bernoulli, predicted.poisson
     p_d, p_d_poisson = table["detection"][old.label], table["detection"][undetected.label]
-    objects, components = BernoulliArrays(*columns_of_objects(old)), PoissonArrays(*columns_of_components(undetected))
+    objects, components = objects_in(old.words), components_in(undetected.words)
     found = local_hypotheses(
         objects,
         UNGROUPED,

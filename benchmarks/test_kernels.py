@@ -11,7 +11,7 @@ from settled import PARAMETERS, settled
 import optipmb
 from optipmb.association import associate
 from optipmb.class_posterior import UNGROUPED
-from optipmb.density import BernoulliArrays, PoissonArrays, columns_of_components, columns_of_objects
+from optipmb.density import components_in, objects_in
 from optipmb.effort import UNLIMITED
 from optipmb.hypotheses import local_hypotheses
 from optipmb.points import points_in_boxes
@@ -61,7 +61,7 @@ def before_association(objects: int) -> tuple[Any, ...]:
     measurements, _, _ = preprocess(frame, TABLE)
     old, new = density.bernoulli, density.poisson
     p_d = TABLE["detection"][old.label], TABLE["detection"][new.label]
-    known, undetected = BernoulliArrays(*columns_of_objects(old)), PoissonArrays(*columns_of_components(new))
+    known, undetected = objects_in(old.words), components_in(new.words)
     given = known, UNGROUPED, p_d[0], undetected, p_d[1], measurements, TABLE.period, TABLE.period
     return *given, TABLE.confusion, TABLE.classes
 

@@ -8,29 +8,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
-from numba.core.errors import NumbaError, NumbaWarning
 
 from optipmb.compiled import kernel
-from optipmb.density import (
-    NO_FRAME,
-    STATE,
-    BernoulliArrays,
-    Bernoullis,
-    Density,
-    Misses,
-    PoissonArrays,
-    Poissons,
-    columns_of_components,
-    columns_of_objects,
-)
+from optipmb.density import NO_FRAME, Bernoullis, Density, Misses, Poissons, components_in, objects_in
 from optipmb.errors import DensityError
+from optipmb.rows import described
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
-    from optipmb.records import Columns
+    Array = NDArray[np.float64]
 
 CLASSES: Final = "classes.probability"
 """Name of `Density.class_probability` among the columns."""
@@ -42,50 +31,31 @@ _Rows = TypeVar("_Rows", Bernoullis, Misses, Poissons)
 
 
 def fitting(density: Density, classes: int) -> bool:
-    """Tell whether the columns of a density fit together, so that kernels stay within them.
+    """Tell whether the parts of a density fit together and its classes exist, so that kernels stay within its arrays.
 
-    What `density_of` and the tracker make does; somebody else's arrays may not.
+    What `density_of` and the tracker make does; what others put together, or wrote into a column, may not.
     """
     misses, objects, pi = density.misses, density.bernoulli, density.class_probability
-    if pi is not None and not (isinstance(pi, np.ndarray) and pi.shape == (len(objects.label), classes)):
+    if pi is not None and not (isinstance(pi, np.ndarray) and pi.shape == (len(objects), classes)):
         return False
-    columns = columns_of_objects(objects), columns_of_components(density.poisson)
-    try:
-        return (
-            only_arrays(*columns)
-            and bool(columns_fit(*columns, classes))
-            and (misses is None or misses.missed_from_ns.shape == misses.looked_ns.shape == objects.label.shape)
-        )
-    except (AttributeError, TypeError, NumbaError, NumbaWarning):
+    if misses is not None and len(misses) != len(objects):
         return False
-
-
-def only_arrays(objects: Columns, components: Columns) -> bool:
-    """Tell whether all columns are arrays: a kernel would first be compiled for seconds for a list."""
-    return set(map(type, objects + components)) == {np.ndarray}
+    return bool(labels_within(objects.words, density.poisson.words, classes))
 
 
 @kernel
-def columns_fit(objects: Columns, components: Columns, classes: int) -> bool:
-    """Tell whether columns have rows of their shapes, as many as there are labels, and the classes exist."""
-    objects, components = BernoulliArrays(*objects), PoissonArrays(*components)
-    count, others = objects.label.shape[0], components.label.shape[0]
-    good = objects.mean.shape == (count, STATE) and components.mean.shape == (others, STATE)
-    good &= objects.covariance.shape == (count, STATE, STATE) and components.covariance.shape == (others, STATE, STATE)
-    good &= objects.auxiliary.shape == (count, 4) and components.auxiliary.shape == (others, 4)
-    good &= components.weight.shape == components.born_ns.shape == (others,)
-    good &= objects.existence.shape == objects.id.shape == objects.born_ns.shape == objects.seen_ns.shape == (count,)
-    good &= objects.score.shape == objects.evidence.shape == objects.heading_odds.shape == (count,)
-    good &= objects.extracted.shape == objects.confirmed.shape == (count,)
-    for c in objects.label:
+def labels_within(objects: Array, components: Array, classes: int) -> bool:
+    """Tell whether the labels of the arrays of `Bernoullis` and `Poissons` are below a number of classes."""
+    good = True
+    for c in objects_in(objects).label:
         good &= 0 <= c < classes
-    for c in components.label:
+    for c in components_in(components).label:
         good &= 0 <= c < classes
     return bool(good)
 
 
 def check_fitting(density: Density, labels: tuple[str, ...]) -> None:
-    """Refuse a density whose columns do not fit together.
+    """Refuse a density whose parts do not fit together.
 
     Raises:
         DensityError: names the column, with what was expected and received.
@@ -127,8 +97,8 @@ def density_of(
     """
     if not NO_FRAME <= stamp_ns < 2**63:
         raise DensityError("stamp_ns", "a stamp", str(stamp_ns))
-    bernoulli = _rows("bernoulli", Bernoullis, columns, earlier=earlier)
-    poisson = _rows("poisson", Poissons, columns, earlier=earlier)
+    bernoulli = _rows(Bernoullis, columns, earlier=earlier)
+    poisson = _rows(Poissons, columns, earlier=earlier)
     for part, rows in (("bernoulli", bernoulli), ("poisson", poisson)):
         label = rows.label
         if label.size and not (label.min() >= 0 and label.max() < len(labels)):
@@ -154,11 +124,11 @@ def density_of(
         raise DensityError(f"bernoulli.id[{row}]", f"an id above the one before it, {ids[row - 1]}", str(ids[row]))
     if not 0 <= int(ids.max(initial=0)) < next_id < 2**63:
         raise DensityError("next_id", f"an id above {ids.max(initial=0)}", str(next_id))
-    misses = _rows("misses", Misses, columns, earlier=False) if "misses.looked_ns" in columns else None
+    misses = _rows(Misses, columns, earlier=False) if "misses.looked_ns" in columns else None
     if misses is not None:
         for name, since in (("missed_from_ns", misses.missed_from_ns), ("looked_ns", misses.looked_ns)):
             if since.shape != bernoulli.seen_ns.shape:
-                raise DensityError(f"misses.{name}", f"{len(bernoulli)} rows", _shown(since))
+                raise DensityError(f"misses.{name}", f"{len(bernoulli)} rows", described(since))
             wrong = (since < bernoulli.seen_ns) | (since > stamp_ns)
             if wrong.any():
                 row = int(wrong.argmax())
@@ -171,7 +141,7 @@ def density_of(
 def _class_probability(column: Any, count: int, classes: int) -> NDArray[np.float64]:
     """Return the posteriors over the classes, each of which sums to 1."""
     if not isinstance(column, np.ndarray) or column.dtype != np.float64 or column.shape != (count, classes):
-        raise DensityError(CLASSES, f"({count}, {classes}) float64", _shown(column))
+        raise DensityError(CLASSES, f"({count}, {classes}) float64", described(column))
     wrong = ~((column >= 0.0).all(axis=1) & (np.abs(column.sum(axis=1) - 1.0) <= ROUNDING))
     if wrong.any():
         row = int(wrong.argmax())
@@ -179,27 +149,18 @@ def _class_probability(column: Any, count: int, classes: int) -> NDArray[np.floa
     return np.array(column, order="C")
 
 
-def _rows(part: str, kind: type[_Rows], columns: Mapping[str, Any], *, earlier: bool) -> _Rows:
+def _rows(kind: type[_Rows], columns: Mapping[str, Any], *, earlier: bool) -> _Rows:
     found: dict[str, Any] = {}
     count: int | None = None
-    wanted: dict[str, NDArray[Any]] = dict(kind.empty().columns())
-    for name, empty in wanted.items():
-        like: NDArray[Any] = empty
-        path = f"{part}.{name}"
+    for name, one in kind.described.items():
+        path = f"{kind.part}.{name}"
         column: Any = columns.get(path)
         if column is None and earlier and count is not None:
-            column = np.zeros((count, *like.shape[1:]), like.dtype)
-        if not isinstance(column, np.ndarray) or column.dtype != like.dtype or column.shape[1:] != like.shape[1:]:
-            raise DensityError(path, f"(N, {', '.join(map(str, like.shape[1:]))}) {like.dtype}", _shown(column))
-        count = len(column) if count is None else count
-        if column.ndim != like.ndim or len(column) != count:
-            raise DensityError(path, f"{count} rows", _shown(column))
-        if column.dtype.kind == "f" and not np.isfinite(column).all():
+            column = np.zeros((count, *one.shape), one.number)
+        if isinstance(column, np.ndarray) and column.dtype.kind == "f" and not np.isfinite(column).all():
             row = np.argwhere(~np.isfinite(column))[0]
             raise DensityError(f"{path}[{row[0]}]", "finite numbers", str(column[tuple(row)]))
-        found[name] = np.array(column, order="C")  # as kernels are compiled for: in one piece, and not read-only
+        if isinstance(column, np.ndarray) and count is None:
+            count = len(column) if column.ndim else None
+        found[name] = column
     return kind(**found)
-
-
-def _shown(column: object) -> str:
-    return f"{column.shape} {column.dtype}" if isinstance(column, np.ndarray) else type(column).__name__

@@ -1,7 +1,8 @@
 """The PMB density (eq. PMB) as arrays: a Poisson intensity of undetected objects, a multi-Bernoulli of detected ones.
 
 One row per component, structure of arrays, so that kernels run over contiguous memory and a density can be kept,
-compared, hashed and stored as it is. Arrays are never written after the density is made.
+compared, hashed and stored as it is. The columns of a record lie in one array (`optipmb.rows`), which is never written
+after the density is made.
 
 Motion state x_M = [x, y, v, phi, omega, a]: position on the ground plane (m), speed along the heading (m/s, negative
 when reversing), heading (rad, in (-pi, pi]), turn rate (rad/s), acceleration (m/s^2).
@@ -12,19 +13,18 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
-from dataclasses import fields
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.records import INDEX, Columns, record
+from optipmb.records import record
+from optipmb.rows import Column, Rows
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
 
 X: Final = 0
 Y: Final = 1
@@ -39,23 +39,7 @@ NO_FRAME: Final = -1
 """`Density.stamp_ns` before the first frame."""
 
 
-class _Rows:
-    """What Bernoullis and Poissons share: columns of equal length that are filtered together."""
-
-    __slots__ = ()
-
-    def columns(self) -> Iterator[tuple[str, NDArray[np.generic]]]:
-        """Yield the name and the array of each column."""
-        for field in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
-            yield field.name, getattr(self, field.name)
-
-    def take(self, rows: NDArray[np.generic]) -> Self:
-        """Return the rows that an index array or a mask selects."""
-        return type(self)(**{name: column[rows] for name, column in self.columns()})
-
-
-@record
-class Bernoullis(_Rows):
+class Bernoullis(Rows):
     """The detected potential objects.
 
     Attributes:
@@ -74,50 +58,25 @@ class Bernoullis(_Rows):
         confirmed: (N,) bool, whether the track was confirmed when it was last extracted (`optipmb.extract`).
     """
 
-    mean: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    existence: NDArray[np.float64]
-    label: NDArray[np.int64]
-    auxiliary: NDArray[np.float64]
-    id: NDArray[np.int64]
-    born_ns: NDArray[np.int64]
-    seen_ns: NDArray[np.int64]
-    score: NDArray[np.float64]
-    evidence: NDArray[np.float64]
-    heading_odds: NDArray[np.float64]
-    extracted: NDArray[np.bool_]
-    confirmed: NDArray[np.bool_]
+    part = "bernoulli"
+    __slots__ = ()
 
-    def __len__(self) -> int:
-        return len(self.existence)
-
-    @classmethod
-    def empty(cls) -> Bernoullis:
-        """No objects."""
-        return cls(
-            mean=np.zeros((0, STATE)),
-            covariance=np.zeros((0, STATE, STATE)),
-            existence=np.zeros(0),
-            label=np.zeros(0, np.int64),
-            auxiliary=np.zeros((0, 4)),
-            id=np.zeros(0, np.int64),
-            born_ns=np.zeros(0, np.int64),
-            seen_ns=np.zeros(0, np.int64),
-            score=np.zeros(0),
-            evidence=np.zeros(0),
-            heading_odds=np.zeros(0),
-            extracted=np.zeros(0, np.bool_),
-            confirmed=np.zeros(0, np.bool_),
-        )
+    mean = Column(np.float64, STATE)
+    covariance = Column(np.float64, STATE, STATE)
+    existence = Column(np.float64)
+    label = Column(np.int64)
+    auxiliary = Column(np.float64, 4)
+    id = Column(np.int64)
+    born_ns = Column(np.int64)
+    seen_ns = Column(np.int64)
+    score = Column(np.float64)
+    evidence = Column(np.float64)
+    heading_odds = Column(np.float64)
+    extracted = Column(np.bool_)
+    confirmed = Column(np.bool_)
 
 
-def _arrays(rows: type[_Rows], name: str) -> Any:
-    names = [field.name for field in fields(rows)]  # type: ignore[arg-type]  # every subclass is a dataclass
-    return namedtuple(name, names, module=__name__)  # noqa: PYI024 - the fields are those of rows
-
-
-@record
-class Misses(_Rows):
+class Misses(Rows):
     """From when the misses of each detected object count, where sensors have fields of view; a row for each.
 
     Attributes:
@@ -125,20 +84,14 @@ class Misses(_Rows):
         looked_ns: (N,) int64 stamp of the last frame with the object in view.
     """
 
-    missed_from_ns: NDArray[np.int64]
-    looked_ns: NDArray[np.int64]
+    part = "misses"
+    __slots__ = ()
 
-    def __len__(self) -> int:
-        return len(self.looked_ns)
-
-    @classmethod
-    def empty(cls) -> Misses:
-        """Those of no objects."""
-        return cls(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    missed_from_ns = Column(np.int64)
+    looked_ns = Column(np.int64)
 
 
-@record
-class Poissons(_Rows):
+class Poissons(Rows):
     """The Gaussian components of the Poisson intensity of undetected objects (eq. PPP Posterior).
 
     Attributes:
@@ -150,42 +103,67 @@ class Poissons(_Rows):
         born_ns: (N,) int64 stamp of that detection, later by the time in which no sensor looked at the component.
     """
 
-    mean: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    label: NDArray[np.int64]
-    auxiliary: NDArray[np.float64]
-    born_ns: NDArray[np.int64]
+    part = "poisson"
+    __slots__ = ()
 
-    def __len__(self) -> int:
-        return len(self.weight)
-
-    @classmethod
-    def empty(cls) -> Poissons:
-        """No components."""
-        return cls.unfilled(np.zeros(0))
-
-    @classmethod
-    def unfilled(cls, weight: NDArray[np.float64]) -> Poissons:
-        """Components of these weights; what the other columns hold does not matter yet."""
-        count = weight.shape[0]
-        return cls(
-            np.empty((count, STATE)),  # mean
-            np.empty((count, STATE, STATE)),  # covariance
-            weight,
-            np.empty(count, INDEX),  # label
-            np.empty((count, 4)),  # auxiliary
-            np.empty(count, INDEX),  # born_ns
-        )
+    mean = Column(np.float64, STATE)
+    covariance = Column(np.float64, STATE, STATE)
+    weight = Column(np.float64)
+    label = Column(np.int64)
+    auxiliary = Column(np.float64, 4)
+    born_ns = Column(np.int64)
 
 
-BernoulliArrays: Final[Any] = _arrays(Bernoullis, "BernoulliArrays")
-PoissonArrays: Final[Any] = _arrays(Poissons, "PoissonArrays")
-"""The columns of the records by the same names, as kernels know them: they take no dataclass."""
+# Kernels take no records but their arrays, and named tuples of the columns inside them.
+OBJECT: Final = Bernoullis.width
+COMPONENT: Final = Poissons.width
+BernoulliArrays: Final[Any] = namedtuple("BernoulliArrays", [*Bernoullis.described])  # noqa: PYI024 - the columns of another class
+PoissonArrays: Final[Any] = namedtuple("PoissonArrays", [*Poissons.described])  # noqa: PYI024 - likewise
 
-columns_of_objects: Final[Callable[[Bernoullis], Columns]] = attrgetter(*BernoulliArrays._fields)
-columns_of_components: Final[Callable[[Poissons], Columns]] = attrgetter(*PoissonArrays._fields)
-"""Return the columns as kernels take them."""
+
+@kernel
+def objects_in(words: Array) -> Bernoullis:
+    """Return the columns of the array of `Bernoullis`, which are views of it."""
+    n = words.shape[0] // OBJECT
+    whole = words.view(np.int64)
+    return BernoulliArrays(
+        words[: 6 * n].reshape(n, STATE),
+        words[6 * n : 42 * n].reshape(n, STATE, STATE),
+        words[42 * n : 43 * n],  # existence
+        whole[43 * n : 44 * n],  # label
+        words[44 * n : 48 * n].reshape(n, 4),
+        whole[48 * n : 49 * n],  # id
+        whole[49 * n : 50 * n],  # born_ns
+        whole[50 * n : 51 * n],  # seen_ns
+        words[51 * n : 52 * n],  # score
+        words[52 * n : 53 * n],  # evidence
+        words[53 * n : 54 * n],  # heading_odds
+        words[54 * n : 55 * n].view(np.bool_)[:n],  # extracted
+        words[55 * n : 56 * n].view(np.bool_)[:n],  # confirmed
+    )
+
+
+@kernel
+def components_in(words: Array) -> Poissons:
+    """Return the columns of the array of `Poissons`, which are views of it."""
+    n = words.shape[0] // COMPONENT
+    whole = words.view(np.int64)
+    return PoissonArrays(
+        words[: 6 * n].reshape(n, STATE),
+        words[6 * n : 42 * n].reshape(n, STATE, STATE),
+        words[42 * n : 43 * n],  # weight
+        whole[43 * n : 44 * n],  # label
+        words[44 * n : 48 * n].reshape(n, 4),
+        whole[48 * n : 49 * n],  # born_ns
+    )
+
+
+@kernel
+def empty_objects(count: int) -> Array:
+    """Return the array of so many objects; what its columns hold does not matter yet."""
+    words = np.empty(count * OBJECT)
+    words[54 * count :] = 0.0  # of the flags most bytes are never written
+    return words
 
 
 @record

@@ -9,19 +9,7 @@ import numpy as np
 
 from optipmb.calibration import calibrate_rows
 from optipmb.compiled import kernel
-from optipmb.density import (
-    OMEGA,
-    PHI,
-    STATE,
-    A,
-    BernoulliArrays,
-    V,
-    X,
-    Y,
-    columns_of_objects,
-    copy_state,
-    whole_periods,
-)
+from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, copy_state, objects_in, whole_periods
 from optipmb.heading import doubt, sign_probability
 from optipmb.position_noise import PLAIN
 from optipmb.preprocess import Measurements
@@ -112,7 +100,7 @@ def extract(
     """
     return Tracks(
         *extract_tracks(
-            columns_of_objects(bernoulli),
+            bernoulli.words,
             missed_from_ns,
             measurement,
             tuple(measurements),
@@ -126,7 +114,7 @@ def extract(
 
 @kernel
 def extract_tracks(
-    objects: Columns,
+    objects: Array,
     missed_from_ns: Index,
     measurement: Index,
     measurements: Columns,
@@ -139,7 +127,7 @@ def extract_tracks(
 
     Arguments as in `extract`.
     """
-    objects, measurements = BernoulliArrays(*objects), Measurements(*measurements)
+    objects, measurements = objects_in(objects), Measurements(*measurements)
     rows = select_tracks(objects, missed_from_ns, stamp_ns, two_thresholds, period, classes)
     count = rows.shape[0]
     state, covariance = np.empty((count, STATE)), np.empty((count, STATE, STATE))

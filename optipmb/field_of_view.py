@@ -219,7 +219,7 @@ def look(
         return None, poisson
     view = view or FieldOfView()
     if misses is None:
-        misses = Misses(bernoulli.seen_ns, np.full(len(bernoulli), before_ns, np.int64))
+        misses = Misses(missed_from_ns=bernoulli.seen_ns, looked_ns=np.full(len(bernoulli), before_ns, np.int64))
     axes: tuple[Array, Array] = _AXES_OF_WORLD if view.pose is None else (view.pose.rotation, view.pose.translation)
     where = *axes, view.limits
     in_view, poisson_in_view = np.empty(len(bernoulli)), np.empty(len(poisson))
@@ -230,16 +230,9 @@ def look(
     count_looks(in_view, misses.looked_ns, misses.missed_from_ns, *stamps, time, missed_from_ns)
     if len(poisson):
         hidden_ns = np.rint((1.0 - poisson_in_view) * max(0, now_ns - before_ns)).astype(np.int64)
-        poisson = Poissons(
-            poisson.mean,
-            poisson.covariance,
-            poisson.weight,
-            poisson.label,
-            poisson.auxiliary,
-            np.minimum(poisson.born_ns + hidden_ns, now_ns),
-        )
+        poisson = poisson.replaced(born_ns=np.minimum(poisson.born_ns + hidden_ns, now_ns))
     looked_ns = np.where(in_view > 0.0, now_ns, misses.looked_ns)
-    return Looks(in_view, poisson_in_view, time, Misses(missed_from_ns, looked_ns)), poisson
+    return Looks(in_view, poisson_in_view, time, Misses(missed_from_ns=missed_from_ns, looked_ns=looked_ns)), poisson
 
 
 def detection_probability_in_view(p_d: Array, looks: Looks, share: float, table: ClassTable) -> Array:
@@ -294,7 +287,7 @@ def follow_looks(
     kept = table["memory"][label] ** (np.where(hit, 1.0, share) * looks.time[row] / table.period)
     kept[objects.born_ns[:known] == stamp_ns] = 1.0
     objects.evidence[:known] = kept * before.evidence[row] + (1.0 - kept) * latest
-    return Misses(missed_from_ns, looked_ns)
+    return Misses(missed_from_ns=missed_from_ns, looked_ns=looked_ns)
 
 
 @kernel

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from optipmb.density import Bernoullis
     from optipmb.preprocess import Measurements
     from optipmb.prune import Survivors
-    from optipmb.records import Columns
     from optipmb.table import ClassRow
 
     Array = NDArray[np.float64]
@@ -31,8 +30,7 @@ if TYPE_CHECKING:
 def light_weight_filter(
     survivors: Survivors,
     label: Index,
-    mean: Array,
-    covariance: Array,
+    posterior: Bernoullis,
     objects: Bernoullis,
     next_id: int,
     measurements: Measurements,
@@ -40,21 +38,20 @@ def light_weight_filter(
     before_ns: int,
     period: float,
     classes: Sequence[ClassRow],
-) -> Columns:
-    """Update the non-motion states of all objects, new and old, and put the posterior together.
+) -> None:
+    """Update the non-motion states of all objects, new and old.
 
     Detected: ``x_A = (1 - z_s) x_A + z_s z_A``, ``x_cnt = 0``, ``x_s = [1 - exp(-x_len)] z_s`` (eq. Confidence
     Score). Missed: x_A stays, ``x_s = 0``. New: x_A = z_A before, ids from `next_id` on. The counters are kept as
     stamps, so that they mean the same at every frame rate: x_cnt is the number of nominal periods since `seen_ns`,
     x_len is one more than the (real) number since `born_ns`. The evidence follows `optipmb.calibration`, the sign of
-    the heading `optipmb.heading`, which turns the states of `mean` and `covariance` where it changes. `extracted` and
-    `confirmed` stay as they were.
+    the heading `optipmb.heading`, which turns the motion states where it changes. `extracted` and `confirmed` stay as
+    they were.
 
     Args:
         survivors: which objects the posterior has.
         label: (K,) their classes.
-        mean: (K, 6) their posterior means.
-        covariance: (K, 6, 6) their posterior covariances.
+        posterior: the objects, whose motion states are known; receives all other columns.
         objects: the predicted objects.
         next_id: id of the first new object.
         measurements: Z_k.
@@ -64,18 +61,17 @@ def light_weight_filter(
         period: nominal period, s.
         classes: (C,) parameters.
     """
-    count = survivors.row.shape[0]
-    auxiliary, identity = np.empty((count, 4)), np.empty(count, np.int64)
-    born_ns, seen_ns, score = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
-    evidence, heading_odds = np.empty(count), np.empty(count)
-    extracted, confirmed = np.empty(count, np.bool_), np.empty(count, np.bool_)
+    mean, covariance, auxiliary, identity = posterior.mean, posterior.covariance, posterior.auxiliary, posterior.id
+    born_ns, seen_ns, score, evidence = posterior.born_ns, posterior.seen_ns, posterior.score, posterior.evidence
+    heading_odds, extracted, confirmed = posterior.heading_odds, posterior.extracted, posterior.confirmed
     # What the evidence keeps over the time since the frame before; in a first detection over one nominal period.
     periods = (stamp_ns - before_ns) * 1e-9 / period
     memory_of_frame, sign_memory_of_frame = np.empty(len(classes)), np.empty(len(classes))
     for c in range(len(classes)):
         memory_of_frame[c], sign_memory_of_frame[c] = classes[c].memory ** periods, classes[c].sign_memory ** periods
-    for k in range(count):
+    for k in range(survivors.row.shape[0]):
         n, m = survivors.row[k], survivors.measurement[k]
+        posterior.existence[k], posterior.label[k] = survivors.existence[k], label[k]
         if n == NEW:
             identity[k] = next_id
             born_ns[k], extracted[k], confirmed[k] = stamp_ns, False, False
@@ -113,18 +109,3 @@ def light_weight_filter(
                 )
         kept = own.memory if first else memory_of_frame[label[k]]
         evidence[k] = kept * evidence[k] + (1.0 - kept) * latest
-    return (
-        mean,
-        covariance,
-        survivors.existence,
-        label,
-        auxiliary,
-        identity,
-        born_ns,
-        seen_ns,
-        score,
-        evidence,
-        heading_odds,
-        extracted,
-        confirmed,
-    )

@@ -5,21 +5,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numba.core.errors import NumbaError, NumbaWarning
 
 from optipmb.class_posterior import predict_classes
-from optipmb.columns import check_fitting, columns_fit, only_arrays
+from optipmb.columns import check_fitting, labels_within
 from optipmb.compiled import kernel
 from optipmb.density import (
+    COMPONENT,
     NO_FRAME,
     STATE,
-    BernoulliArrays,
     Bernoullis,
     Density,
-    PoissonArrays,
     Poissons,
-    columns_of_components,
-    columns_of_objects,
+    components_in,
+    empty_objects,
+    objects_in,
     whole_periods,
 )
 from optipmb.motion import predict_state
@@ -29,12 +28,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from optipmb.records import Columns
     from optipmb.table import ClassRow, ClassTable
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
-    Predicted = tuple[Index, Array, Array, Array, int]
 
 
 LONGEST_STEP_S: Final = 6.0
@@ -62,161 +59,159 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     Raises:
         DensityError: the columns of the density do not fit together.
     """
-    bernoulli, poisson, misses = density.bernoulli, density.poisson, density.misses
-    before_ns = density.stamp_ns
+    misses, before_ns = density.misses, density.stamp_ns
     dt = 0.0 if before_ns == NO_FRAME else (stamp_ns - before_ns) * 1e-9
-    given, undetected = columns_of_objects(bernoulli), columns_of_components(poisson)
-    if dt == 0.0 or misses is not None or len(table.confusion) or not only_arrays(given, undetected):
+    if dt == 0.0 or misses is not None or len(table.confusion):
         check_fitting(density, density.labels)
     if dt == 0.0:
         pi = predict_classes(density, None, dt, table)
-        return Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses, pi), 0
+        parts = density.bernoulli, density.poisson
+        return Density(stamp_ns, density.next_id, *parts, density.labels, misses, pi), 0
     try:
-        objects, components = predict_density(
-            given,
+        kept, objects, components, repaired = predict_density(
+            density.bernoulli.words,
             density.missed_from_ns,
-            undetected,
+            density.poisson.words,
             dt,
             before_ns,
             stamp_ns,
             table.period,
             table.classes,
         )
-    except (AttributeError, TypeError, ValueError, NumbaError, NumbaWarning):
+    except ValueError:
         check_fitting(density, density.labels)  # names the column
         raise
-    kept, mean, covariance, existence, repaired = objects
     pi = predict_classes(density, kept, dt, table)
-    if kept.shape[0] < bernoulli.existence.shape[0]:
-        bernoulli = bernoulli.take(kept)
-        misses = None if misses is None else misses.take(kept)
-    bernoulli = Bernoullis(
-        mean,
-        covariance,
-        existence,
-        bernoulli.label,
-        bernoulli.auxiliary,
-        bernoulli.id,
-        bernoulli.born_ns,
-        bernoulli.seen_ns,
-        bernoulli.score,
-        bernoulli.evidence,
-        bernoulli.heading_odds,
-        bernoulli.extracted,
-        bernoulli.confirmed,
-    )
-    kept, mean, covariance, weight, repaired_poisson = components
-    if kept.shape[0] < poisson.weight.shape[0]:
-        poisson = poisson.take(kept)
-    poisson = Poissons(mean, covariance, weight, poisson.label, poisson.auxiliary, poisson.born_ns)
-    posterior = Density(stamp_ns, density.next_id, bernoulli, poisson, density.labels, misses, pi)
-    return posterior, repaired + repaired_poisson
+    if misses is not None and kept.shape[0] < len(misses):
+        misses = misses.take(kept)
+    parts = Bernoullis.of(objects), Poissons.of(components)
+    return Density(stamp_ns, density.next_id, *parts, density.labels, misses, pi), repaired
 
 
 @kernel
 def predict_density(
-    objects: Columns,
+    objects: Array,
     missed_from_ns: Index,
-    components: Columns,
+    components: Array,
     dt: float,
     before_ns: int,
     stamp_ns: int,
     period: float,
     classes: Sequence[ClassRow],
-) -> tuple[Predicted, Predicted]:
-    """Predict objects and components: of each the rows that stay, m_+, P_+, r or mu, and the repairs.
-
-    Raises:
-        ValueError: columns do not fit together, and reading them would leave them.
-    """
-    if not columns_fit(objects, components, len(classes)):
-        raise ValueError("columns that do not fit together")
-    objects, components = BernoulliArrays(*objects), PoissonArrays(*components)
-    survival = np.empty(len(classes))
-    for c in range(len(classes)):
-        survival[c] = classes[c].survival ** (dt / period)
-    seen_from_ns = before_ns if dt <= LONGEST_STEP_S else stamp_ns
-    return (
-        predict_components(
-            objects.mean,
-            objects.covariance,
-            objects.label,
-            objects.existence,
-            missed_from_ns,
-            seen_from_ns,
-            False,
-            survival,
-            dt,
-            stamp_ns,
-            period,
-            classes,
-        ),
-        predict_components(
-            components.mean,
-            components.covariance,
-            components.label,
-            components.weight,
-            components.born_ns,
-            before_ns,
-            True,
-            survival,
-            dt,
-            stamp_ns,
-            period,
-            classes,
-        ),
-    )
-
-
-@kernel
-def predict_components(
-    mean: Array,
-    covariance: Array,
-    label: Index,
-    weight: Array,
-    since_ns: Index,
-    seen_from_ns: int,
-    undetected: bool,
-    survival: Array,
-    dt: float,
-    stamp_ns: int,
-    period: float,
-    classes: Sequence[ClassRow],
-) -> Predicted:
-    """Predict the components that are within the limit of their class (eq. PPP_prediction, MB_prediction).
+) -> tuple[Index, Array, Array, int]:
+    """Predict the objects and the components that are within the limit of their class (eq. PPP_prediction, MB_prediction).
 
     Args:
-        mean: (N, 6) posterior means.
-        covariance: (N, 6, 6) posterior covariances.
-        label: (N,) classes.
-        weight: (N,) existence probability r or weight mu.
-        since_ns: (N,) stamp from which periods are counted.
-        seen_from_ns: rows counted from this stamp on stay, whatever the limit.
-        undetected: whether the limit is `poisson_steps`; else `max_misses`.
-        survival: (C,) p_s over dt.
+        objects: array of `Bernoullis`.
+        missed_from_ns: (N,) stamps from which the misses of the objects count.
+        components: array of `Poissons`.
         dt: time to predict over, s, positive.
+        before_ns: stamp of the density.
         stamp_ns: stamp of the new frame.
         period: nominal period, s.
         classes: (C,) parameters.
 
     Returns:
-        The K rows that stay, (K, 6) m_+ and (K, 6, 6) P_+ of those, (K,) ``weight p_s``, and how many covariances had
-        to be repaired.
+        The (K,) objects that stay, the arrays of the predicted objects and components, and how many covariances had to
+        be repaired.
+
+    Raises:
+        ValueError: a label is none, and reading its parameters would leave their array.
     """
-    size = mean.shape[0]
-    kept, carried = np.empty(size, np.int64), np.empty(size)
-    mean_out, covariance_out = np.empty((size, STATE)), np.empty((size, STATE, STATE))
-    root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
-    count, repaired = 0, 0
-    for n in range(mean.shape[0]):
+    if not labels_within(objects, components, len(classes)):
+        raise ValueError("labels of classes that there are not")
+    survival = np.empty(len(classes))
+    for c in range(len(classes)):
+        survival[c] = classes[c].survival ** (dt / period)
+
+    old = objects_in(objects)
+    seen_from_ns = before_ns if dt <= LONGEST_STEP_S else stamp_ns
+    kept = rows_within(old.label, missed_from_ns, seen_from_ns, False, stamp_ns, period, classes)
+    predicted = empty_objects(kept.shape[0])
+    new = objects_in(predicted)
+    repaired = predict_rows(kept, old, old.existence, new, new.existence, survival, dt, classes)
+    for k in range(kept.shape[0]):
+        n = kept[k]
+        new.id[k], new.seen_ns[k] = old.id[n], old.seen_ns[n]
+        new.score[k], new.evidence[k], new.heading_odds[k] = old.score[n], old.evidence[n], old.heading_odds[n]
+        new.extracted[k], new.confirmed[k] = old.extracted[n], old.confirmed[n]
+
+    undetected = components_in(components)
+    chosen = rows_within(undetected.label, undetected.born_ns, before_ns, True, stamp_ns, period, classes)
+    carried = np.empty(chosen.shape[0] * COMPONENT)
+    later = components_in(carried)
+    repaired += predict_rows(chosen, undetected, undetected.weight, later, later.weight, survival, dt, classes)
+    return kept, predicted, carried, repaired
+
+
+@kernel
+def rows_within(
+    label: Index,
+    since_ns: Index,
+    seen_from_ns: int,
+    undetected: bool,
+    stamp_ns: int,
+    period: float,
+    classes: Sequence[ClassRow],
+) -> Index:
+    """Return the rows that are within the limit of their class.
+
+    Args:
+        label: (N,) classes.
+        since_ns: (N,) stamp from which periods are counted.
+        seen_from_ns: rows counted from this stamp on stay, whatever the limit.
+        undetected: whether the limit is `poisson_steps`; else `max_misses`.
+        stamp_ns: stamp of the new frame.
+        period: nominal period, s.
+        classes: (C,) parameters.
+    """
+    kept, count = np.empty(label.shape[0], np.int64), 0
+    for n in range(label.shape[0]):
         own = classes[label[n]]
         limit = own.poisson_steps if undetected else own.max_misses
         # The frame at hand may still bring the detection that is missing, hence one period less.
         if since_ns[n] < seen_from_ns and whole_periods(since_ns[n], stamp_ns, period) - 1 > limit:
             continue
         kept[count] = n
-        carried[count] = weight[n] * survival[label[n]]
-        if predict_state(mean[n], covariance[n], dt, own, root, points, mean_out[count], covariance_out[count]):
-            repaired += 1
         count += 1
-    return kept[:count], mean_out[:count], covariance_out[:count], carried[:count], repaired
+    return kept[:count]
+
+
+@kernel
+def predict_rows(
+    rows: Index,
+    old: Bernoullis | Poissons,
+    weight: Array,
+    new: Bernoullis | Poissons,
+    weight_out: Array,
+    survival: Array,
+    dt: float,
+    classes: Sequence[ClassRow],
+) -> int:
+    """Predict objects or components: m_+, P_+ and ``weight p_s``; what both have beside these stays.
+
+    Args:
+        rows: (K,) which of them.
+        old: their columns.
+        weight: (N,) existence probability r or weight mu.
+        new: receives the columns of the K rows.
+        weight_out: (K,) receives r_+ or mu_+.
+        survival: (C,) p_s over dt.
+        dt: time to predict over, s, positive.
+        classes: (C,) parameters.
+
+    Returns:
+        How many covariances had to be repaired.
+    """
+    root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
+    repaired = 0
+    for k in range(rows.shape[0]):
+        n = rows[k]
+        own = classes[old.label[n]]
+        if predict_state(old.mean[n], old.covariance[n], dt, own, root, points, new.mean[k], new.covariance[k]):
+            repaired += 1
+        weight_out[k] = weight[n] * survival[old.label[n]]
+        new.label[k], new.born_ns[k] = old.label[n], old.born_ns[n]
+        for s in range(4):
+            new.auxiliary[k, s] = old.auxiliary[n, s]
+    return repaired

@@ -12,17 +12,7 @@ from optipmb.birth import first_detected_states
 from optipmb.births_beside import forbid_births
 from optipmb.class_posterior import UNGROUPED, update_classes
 from optipmb.compiled import kernel
-from optipmb.density import (
-    NO_FRAME,
-    STATE,
-    BernoulliArrays,
-    Bernoullis,
-    Density,
-    PoissonArrays,
-    Poissons,
-    columns_of_components,
-    columns_of_objects,
-)
+from optipmb.density import NO_FRAME, Bernoullis, Density, Poissons, components_in, empty_objects, objects_in
 from optipmb.detection_probability import detection_probability, over_time
 from optipmb.effort import UNLIMITED, check_effort
 from optipmb.errors import FrameError
@@ -58,11 +48,11 @@ if TYPE_CHECKING:
 
 @kernel
 def update(
-    objects: Columns,
+    objects: Array,
     class_probability: Array,
     p_d: Array,
     missed_from_ns: Index,
-    components: Columns,
+    components: Array,
     p_d_poisson: Array,
     n_predicted: int,
     measurements: Columns,
@@ -74,15 +64,15 @@ def update(
     period: float,
     confusion: Array,
     classes: Sequence[ClassRow],
-) -> tuple[Columns, Array, Columns, Index, Index, int, int, int]:
+) -> tuple[Array, Array, Array, Index, Index, int, int, int]:
     """Update the prediction with the measurements: the PMB update of Algorithm 1.
 
     Args:
-        objects: predicted objects.
+        objects: array of the predicted objects.
         class_probability: (N, C) their class posteriors, (0, 0) where no classes have a group in common.
         p_d: (N,) their detection probabilities.
         missed_from_ns: (N,) stamps from which their misses count.
-        components: predicted Poisson components, and behind them, without HABM, those of the measurements.
+        components: array of the predicted Poisson components; behind them, without HABM, are those of the measurements.
         p_d_poisson: (J,) their detection probabilities.
         n_predicted: how many of them were predicted.
         measurements: Z_k.
@@ -96,11 +86,11 @@ def update(
         classes: (C,) parameters.
 
     Returns:
-        The columns of the objects, their class posteriors and the columns of the Poisson components; the other fields
-        of `Survivors`; how many covariances had to be repaired.
+        The array of the objects, their class posteriors and the array of the Poisson components; the other fields of
+        `Survivors`; how many covariances had to be repaired.
     """
     z = Measurements(*measurements)
-    objects, components = BernoulliArrays(*objects), PoissonArrays(*components)
+    objects, components = objects_in(objects), components_in(components)
 
     # Local hypotheses: missed, detected, first-time detected; HABM
     hypotheses = local_hypotheses(
@@ -114,8 +104,9 @@ def update(
     kept = surviving_objects(objects, p_d, assigned, hypotheses, z.label, missed_from_ns, stamp_ns, period, classes)
 
     # Motion states: detected and missed objects by the UKF, then the births of first-time detections
-    count, known = kept.row.shape[0], kept.known
-    mean, covariance = np.empty((count, STATE)), np.empty((count, STATE, STATE))
+    known, words = kept.known, empty_objects(kept.row.shape[0])
+    posterior = objects_in(words)
+    mean, covariance = posterior.mean, posterior.covariance
     repaired = ukf_updates(kept.row, kept.measurement, objects.mean, objects.covariance, z, classes, mean, covariance)
     repaired += first_detected_states(
         kept.measurement[known:], hypotheses, components, z, classes, mean[known:], covariance[known:]
@@ -123,15 +114,13 @@ def update(
 
     # Other states: class, light-weight filter
     label, class_probability = update_classes(kept, objects.label, class_probability, z, confusion, classes)
-    posterior = light_weight_filter(
-        kept, label, mean, covariance, objects, next_id, z, stamp_ns, before_ns, period, classes
-    )
+    light_weight_filter(kept, label, posterior, objects, next_id, z, stamp_ns, before_ns, period, classes)
 
     # Undetected objects: PPP update, RPP, and the births of HABM
     undetected = update_undetected(
         components, p_d_poisson, n_predicted, hypotheses, z, stamp_ns, period, classes, adaptive
     )
-    return posterior, class_probability, undetected, kept.row, kept.measurement, known, kept.detected, repaired
+    return words, class_probability, undetected, kept.row, kept.measurement, known, kept.detected, repaired
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,12 +264,12 @@ class Tracker:
         # PMB update: hypotheses, association, states, births
         missed_from_ns = predicted.missed_from_ns if looks is None else looks.misses.missed_from_ns
         pi = predicted.class_probability
-        columns, class_probability, undetected, row, hits, known, detected, repaired_now = update(
-            columns_of_objects(bernoulli),
+        words, class_probability, undetected, row, hits, known, detected, repaired_now = update(
+            bernoulli.words,
             UNGROUPED if pi is None else pi,
             p_d,
             missed_from_ns,
-            columns_of_components(poisson),
+            poisson.words,
             p_d_poisson,
             len(predicted.poisson),
             tuple(measurements),
@@ -293,12 +282,12 @@ class Tracker:
             table.confusion,
             table.classes,
         )
-        objects, misses = Bernoullis(*columns), None
+        objects, misses = Bernoullis.of(words), None
         if looks is not None:
             survivors = Survivors(row, hits, objects.existence, known, detected)
             misses = follow_looks(looks, survivors, bernoulli, objects, measurements, now, table)
         born = len(objects) - known
-        poisson = Poissons(*undetected) if modules.rpp else Poissons.empty()
+        poisson = Poissons.of(undetected) if modules.rpp else Poissons.empty()
         pi = None if pi is None else class_probability
         posterior = Density(now, predicted.next_id + born, objects, poisson, density.labels, misses, pi)
 

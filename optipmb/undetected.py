@@ -12,7 +12,7 @@ import numpy as np
 
 from optipmb.birth import birth_states
 from optipmb.compiled import kernel
-from optipmb.density import STATE, PoissonArrays, Poissons, columns_of_components, copy_state, whole_periods
+from optipmb.density import COMPONENT, Poissons, components_in, copy_state, whole_periods
 from optipmb.hypotheses import CLUTTER
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from optipmb.hypotheses import Hypotheses
     from optipmb.preprocess import Measurements
-    from optipmb.records import Columns
     from optipmb.table import ClassRow, ClassTable
 
     Array = NDArray[np.float64]
@@ -40,8 +39,8 @@ def update_undetected(
     period: float,
     classes: Sequence[ClassRow],
     adaptive: bool,
-) -> Columns:
-    """Select the Poisson components that stay under RPP, and add lambda_b.
+) -> Array:
+    """Return the array of the Poisson components that stay under RPP, and of lambda_b.
 
     Components that took part in any first-time detection hypothesis are marked and go, so that they cannot start a
     second track; the others go after eta_step nominal periods.
@@ -94,8 +93,8 @@ def with_births(
     measurements: Measurements,
     stamp_ns: int,
     classes: Sequence[ClassRow],
-) -> Columns:
-    """Put the components that stay and those that are born together.
+) -> Array:
+    """Return the array of the components that stay and, behind them, of those that are born.
 
     Args:
         components: the components.
@@ -107,8 +106,10 @@ def with_births(
         classes: (C,) parameters.
     """
     old, count = kept.shape[0], weight.shape[0]
-    mean, covariance = np.empty((count, STATE)), np.empty((count, STATE, STATE))
-    label, auxiliary, born_ns = np.empty(count, np.int64), np.empty((count, 4)), np.empty(count, np.int64)
+    words = np.empty(count * COMPONENT)
+    new = components_in(words)
+    mean, covariance, label, auxiliary, born_ns = new.mean, new.covariance, new.label, new.auxiliary, new.born_ns
+    new.weight[:] = weight
     for k in range(old):
         j = kept[k]
         copy_state(components.mean, components.covariance, j, mean, covariance, k)
@@ -121,7 +122,7 @@ def with_births(
         for s in range(4):
             auxiliary[k, s] = measurements.auxiliary[m, s]
         label[k], born_ns[k] = measurements.label[m], stamp_ns
-    return mean, covariance, weight, label, auxiliary, born_ns
+    return words
 
 
 def with_measurement_births(
@@ -130,8 +131,5 @@ def with_measurement_births(
     """Add a component of weight mu_ab for every measurement: GNN-PMB's birth model, the baseline of the ablation."""
     weight = np.concatenate((poisson.weight, table["adaptive_birth_rate"][measurements.label]))
     kept, born = np.arange(len(poisson)), np.arange(measurements.score.shape[0])
-    return Poissons(
-        *with_births(
-            PoissonArrays(*columns_of_components(poisson)), kept, born, weight, measurements, stamp_ns, table.classes
-        )
-    )
+    components = components_in(poisson.words)
+    return Poissons.of(with_births(components, kept, born, weight, measurements, stamp_ns, table.classes))

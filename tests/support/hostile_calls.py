@@ -120,7 +120,7 @@ def odd_densities(seed: int) -> None:
         else:
             column = column + int(rng.integers(-5, 6))
         with suppress(optipmb.OptipmbError):
-            tracker.step(replace(density, **{part: replace(rows, **{name: column})}), frames[-1])
+            tracker.step(replace(density, **{part: rows.replaced(**{name: column})}), frames[-1])
 
 
 def odd_boxes(seed: int) -> None:

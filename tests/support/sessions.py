@@ -123,8 +123,7 @@ class Chained:
         known = density.bernoulli
         # Whatever else a Bernoulli has is one.
         ones = {name: np.ones((1, *column.shape[1:]), column.dtype) for name, column in known.columns()}
-        rows = replace(
-            optipmb.Bernoullis(**ones),
+        rows = optipmb.Bernoullis(**ones).replaced(
             mean=numbers.reshape(8, 6)[:1] / 100.0,
             covariance=np.eye(6)[None],
             label=np.zeros(1, np.int64),

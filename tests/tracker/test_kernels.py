@@ -18,14 +18,23 @@ from optipmb.association import UNASSIGNED
 from optipmb.birth import birth_states, first_detected_states, moment_match
 from optipmb.births_beside import forbid_births
 from optipmb.calibration import SURE, calibrate_rows
-from optipmb.density import BernoulliArrays, Bernoullis, PoissonArrays, Poissons, columns_of_objects, whole_periods
+from optipmb.density import (
+    BernoulliArrays,
+    Bernoullis,
+    PoissonArrays,
+    Poissons,
+    components_in,
+    empty_objects,
+    objects_in,
+    whole_periods,
+)
 from optipmb.extract import extract_tracks, select_tracks
 from optipmb.geometry import bev_iou, box_iou, iou_exceeds
 from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN, Hypotheses
 from optipmb.lightweight import light_weight_filter
 from optipmb.motion import predict_state
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
-from optipmb.predict import predict_components
+from optipmb.predict import predict_density
 from optipmb.preprocess import Measurements, gather, select, sort_canonically
 from optipmb.prune import NEW, Survivors, surviving_objects
 from optipmb.undetected import update_undetected, with_births
@@ -166,30 +175,52 @@ def test_cheap_rejections_change_no_decision(a: Array, b: Array, threshold: floa
     assert overlap == 0.0 or iou_exceeds(a, b, np.nextafter(overlap, 0.0))
 
 
-@pytest.mark.parametrize("undetected", [True, False])
 @SEEDS
-def test_components_within_their_limit_are_predicted(seed: int, *, undetected: bool) -> None:
-    """The rows that numpy keeps, each predicted on its own, with p_s of its class."""
+def test_components_within_their_limit_are_predicted(seed: int) -> None:
+    """The objects and components that numpy keeps, each predicted on its own, with p_s of its class; the rest stays."""
     rng = np.random.default_rng(seed)
     root = rng.normal(0, 0.5, (30, 6, 6))
     mean, covariance = rng.normal(0, 3, (30, 6)), root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6)
     label, weight, since = rng.integers(0, 2, 30), rng.uniform(0, 1, 30), stamps(rng, 30)
-    limit, survival, noise = np.array([3, 6]), np.array([0.9, 0.99]), rng.uniform(0.1, 1, (2, 6))
+    limits, survival, noise = np.array([[3, 6], [5, 2]]), np.array([0.9, 0.99]), rng.uniform(0.1, 1, (2, 6))
     before = NOW - 700_000_000
     classes = class_rows(2, acceleration_time=[np.inf, 0.5], constant_velocity=[False, seed > 2], process_noise=noise)
-    classes["poisson_steps" if undetected else "max_misses"] = limit
-    given = mean, covariance, label, weight, since, before, undetected, survival, 0.2, NOW, PERIOD
-    kept, out, spread, carried, repaired = predict_components(*given, classes)
-    wanted = np.flatnonzero((periods(since) - 1 <= limit[label]) | (since >= before))
+    classes["max_misses"], classes["poisson_steps"] = limits
+    classes["survival"] = survival
+    both = {"mean": mean, "covariance": covariance, "label": label, "auxiliary": rng.uniform(1, 5, (30, 4))}
+    objects = Bernoullis(
+        **both,
+        existence=weight,
+        id=np.arange(30),
+        born_ns=stamps(rng, 30),
+        seen_ns=stamps(rng, 30),
+        **{name: rng.normal(0, 1, 30) for name in ("score", "evidence", "heading_odds")},
+        extracted=rng.random(30) < 0.5,
+        confirmed=rng.random(30) < 0.5,
+    )
+    components = Poissons(**both, weight=weight, born_ns=since)
+    given = objects.words, since, components.words, 0.2, before, NOW, PERIOD
+    kept, *found, repaired = predict_density(*given, classes)
     assert repaired == 0
-    np.testing.assert_array_equal(kept, wanted)
-    np.testing.assert_array_equal(carried, weight[wanted] * survival[label[wanted]])
+    known, undetected = Bernoullis.of(found[0]), Poissons.of(found[1])
     alone, alone_spread = np.empty(6), np.empty((6, 6))
-    for k, n in enumerate(wanted):
-        buffers = np.empty((6, 6)), np.empty((12, 6))
-        predict_state(mean[n], covariance[n], 0.2, classes[label[n]], *buffers, alone, alone_spread)
-        np.testing.assert_array_equal(out[k], alone)
-        np.testing.assert_array_equal(spread[k], alone_spread)
+    for old, new, probability, limit in (
+        (objects, known, known.existence, limits[0]),
+        (components, undetected, undetected.weight, limits[1]),
+    ):
+        wanted = np.flatnonzero((periods(since) - 1 <= limit[label]) | (since >= before))
+        if old is objects:
+            np.testing.assert_array_equal(kept, wanted)
+        np.testing.assert_array_equal(probability, weight[wanted] * (survival ** (0.2 / PERIOD))[label[wanted]])
+        assert len(new) == len(wanted)
+        for k, n in enumerate(wanted):
+            buffers = np.empty((6, 6)), np.empty((12, 6))
+            predict_state(mean[n], covariance[n], 0.2, classes[label[n]], *buffers, alone, alone_spread)
+            np.testing.assert_array_equal(new.mean[k], alone)
+            np.testing.assert_array_equal(new.covariance[k], alone_spread)
+        for name, column in new.columns():
+            if name not in {"mean", "covariance", "existence", "weight"}:
+                np.testing.assert_array_equal(column, getattr(old, name)[wanted])
 
 
 @SEEDS
@@ -267,7 +298,9 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     sign = np.array([[0.0, 0.0, 0.0, 0.0], [0.9, 1.0, 0.7, 0.5], [0.5, 2.0, 0.1, 3.0]])  # lambda, b_d, b_v, v_0
     mean, root = rng.normal(0, 3, (6, 6)), rng.normal(0, 0.5, (6, 6, 6))
     covariance = root @ root.transpose(0, 2, 1)
-    states, spreads = mean.copy(), covariance.copy()
+    after = objects_in(empty_objects(6))
+    states, spreads = after.mean, after.covariance
+    states[:], spreads[:] = mean, covariance
     confirmed = rng.random(6) < 0.5
     objects = objects_of(
         label=label,
@@ -284,11 +317,13 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     classes = class_rows(3, memory=memory, missed_evidence=missed)
     for column, name in zip(sign.T, ("memory", "detection", "motion", "speed"), strict=True):
         classes[f"sign_{name}"] = column
-    survivors = Survivors(row, measurement, np.ones(6), 4, 2)
+    survivors = Survivors(row, measurement, rng.uniform(0, 1, 6), 4, 2)
     new = row == NEW
     named = np.where(new, measured[measurement], label[row])
-    given = survivors, named, states, spreads, objects, 77, measurements, NOW, NOW - 150_000_000, PERIOD, classes
-    *out, weighed, facing, flags, shown = light_weight_filter(*given)[3:]
+    given = survivors, named, after, objects, 77, measurements, NOW, NOW - 150_000_000, PERIOD, classes
+    light_weight_filter(*given)
+    existence, *out, weighed, facing, flags, shown = after[2:]
+    np.testing.assert_array_equal(existence, survivors.existence)
     old = row >= 0
     m, hit = measurement, measurement >= 0
     np.testing.assert_array_equal(out[0], [*label[row[old]], *measured[m[new]]])
@@ -362,12 +397,11 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
     classes["extract_new"] = 2.0  # what was extracted before is again, and nothing else
     classes["extract_misses"] = 1000
     before, extracted = np.arange(9) % 2 == 0, np.isin(np.arange(9), rows)
-    after = before.copy()
-    objects = Bernoullis(
-        mean, covariance, r, label, auxiliary, identity, born, seen, score, evidence, odds, extracted, after
-    )
+    columns = mean, covariance, r, label, auxiliary, identity, born, seen, score, evidence, odds, extracted, before
+    objects = Bernoullis(**dict(zip(Bernoullis.described, columns, strict=True)))
+    after = objects.confirmed
     (ids, labels, center, size, heading_, facing_, velocity, rate, acceleration, *told, age, since, detection, now) = (
-        extract_tracks(columns_of_objects(objects), seen, measurement, tuple(measured), NOW, True, PERIOD, classes)
+        extract_tracks(objects.words, seen, measurement, tuple(measured), NOW, True, PERIOD, classes)
     )
     out = center, size, heading_, facing_, velocity, rate, acceleration, age, since
     wanted_now = told[0] >= np.where(before[rows], low[label[rows]], high[label[rows]])
@@ -463,10 +497,8 @@ def test_what_is_undetected_stays_or_is_born(seed: int, *, adaptive: bool) -> No
     stays = np.flatnonzero((periods(born) <= steps[label]) & ~np.isin(np.arange(25), marked[marked < 15]))
     new = np.flatnonzero((kind == CLUTTER) & (association < 1) & adaptive)
     carried = [*(weight * (1 - p_d))[stays], *rate[measured.label[new]] * (1 - association[new])]
-    for column, wanted in zip(
-        found, with_births(components, stays, new, np.array(carried), measured, NOW, classes), strict=True
-    ):
-        np.testing.assert_array_equal(column, wanted)
+    wanted = with_births(components, stays, new, np.array(carried), measured, NOW, classes)
+    np.testing.assert_array_equal(found, wanted)
 
 
 @SEEDS
@@ -483,7 +515,7 @@ def test_components_that_stay_and_those_that_are_born_stand_in_order(seed: int) 
     kept, rows, weight = np.array([1, 5]), np.array([2, 0, 3]), rng.uniform(0, 1, 5)
     measured = random_measurements(rng, 4)
     classes = class_rows(2, birth_heading_speed=[0.5, 1.5], birth_known=[[0.5], [0.6]], birth_unknown=[[0.7], [0.8]])
-    out = with_births(components, kept, rows, weight, measured, NOW, classes)
+    out = components_in(with_births(components, kept, rows, weight, measured, NOW, classes))
     np.testing.assert_array_equal(out[0][:2], components.mean[kept])
     np.testing.assert_array_equal(out[1][:2], components.covariance[kept])
     state, spread = np.empty((3, 6)), np.empty((3, 6, 6))

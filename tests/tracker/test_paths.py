@@ -193,10 +193,10 @@ def test_tracks_of_another_profile_are_refused() -> None:
     ):
         with pytest.raises(optipmb.FrameError, match=re.escape(text)):
             optipmb.predict_tracks(wrong, [1.0], KITTI)
-    short = replace(density.bernoulli, mean=density.bernoulli.mean[:1])
+    other_class = density.bernoulli.replaced(label=density.bernoulli.label + 7)
     for other, text in (
         (replace(density, labels=("car",)), "density.labels: expected the classes of profile kitti, ('Car',"),
-        (replace(density, bernoulli=short), "bernoulli.covariance: expected 1 rows, received (3, 6, 6) float64"),
+        (replace(density, bernoulli=other_class), "bernoulli.label: expected indices below 3, received 7 to 7"),
     ):
         with pytest.raises(optipmb.DensityError, match=re.escape(text)):
             optipmb.predict_tracks(other, [1.0], KITTI)

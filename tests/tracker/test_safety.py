@@ -14,8 +14,7 @@ import pytest
 from scenes import boxes
 
 import optipmb
-from optipmb.columns import columns_fit, fitting
-from optipmb.density import columns_of_components, columns_of_objects
+from optipmb.columns import fitting, labels_within
 from optipmb.warm import compilations
 
 KITTI, NUSCENES = optipmb.load_profile("kitti"), optipmb.load_profile("nuscenes")
@@ -53,33 +52,28 @@ def test_a_density_whose_columns_do_not_fit_is_refused(part: str) -> None:
     optipmb.warm_up()
     before = compilations()
     for name, column in rows.columns():
-        broken = [np.concatenate([column, column]), column[:0], column.tolist()]
-        if name == "label":
-            broken += [column + 7, column - 1]
-        for values in broken:
-            changed = replace(density, **{part: replace(rows, **{name: values})})
+        for values in (np.concatenate([column, column]), column[:0], column.tolist()):
             with pytest.raises(optipmb.DensityError, match=part):
-                optipmb.Tracker(KITTI).step(changed, boxes(KITTI, 0.1, (0, 0)))
+                rows.replaced(**{name: values})
+    for label in (rows.label + 7, rows.label - 1):
+        changed = replace(density, **{part: rows.replaced(label=label)})
+        with pytest.raises(optipmb.DensityError, match=f"{part}.label"):
+            optipmb.Tracker(KITTI).step(changed, boxes(KITTI, 0.1, (0, 0)))
     assert compilations() == before
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_columns_fit_as_numpy_says(seed: int) -> None:
-    """Shapes of one length in every column, and classes that exist."""
-    rng = np.random.default_rng(seed)
+def test_labels_are_within_the_classes() -> None:
+    """Of objects and of components: none is negative, none as large as the number of classes."""
     density = settled()
-    objects, components = columns_of_objects(density.bernoulli), columns_of_components(density.poisson)
-    assert columns_fit(objects, components, 3)
-    for columns in (objects, components):
-        place = int(rng.integers(0, len(columns)))
-        head, *tail = columns[place].shape
-        for shape in ((head + 1, *tail), (head, *(one + 1 for one in tail))):
-            if shape != columns[place].shape:
-                changed = (*columns[:place], np.zeros(shape, columns[place].dtype), *columns[place + 1 :])
-                assert not columns_fit(*((changed, components) if columns is objects else (objects, changed)), 3)
-    assert not columns_fit(objects, components, int(density.bernoulli.label[0]))
-    density.bernoulli.label[0] = -1
-    assert not columns_fit(objects, components, 3)
+    for rows in (density.bernoulli, density.poisson):
+        given = density.bernoulli.words, density.poisson.words
+        largest = max(density.bernoulli.label[0], density.poisson.label[0])
+        for label in range(-2, 5):
+            before = int(rows.label[0])
+            rows.label[0] = label
+            assert labels_within(*given, 3) == (0 <= label < 3)
+            rows.label[0] = before
+        assert not labels_within(*given, int(largest))
 
 
 def test_what_the_tracker_makes_fits() -> None:

@@ -37,12 +37,10 @@ def spoiled(checkpoint: Checkpoint, spoil: np.random.Generator, weight: float, s
         return root @ root.transpose(0, 2, 1)
 
     bernoulli, poisson = density.bernoulli, density.poisson
-    bernoulli = replace(
-        bernoulli,
-        covariance=covariances(len(bernoulli)),
-        existence=np.full(len(bernoulli), max(weight, 1e-300)),
+    bernoulli = bernoulli.replaced(
+        covariance=covariances(len(bernoulli)), existence=np.full(len(bernoulli), max(weight, 1e-300))
     )
-    poisson = replace(poisson, covariance=covariances(len(poisson)), weight=np.full(len(poisson), weight))
+    poisson = poisson.replaced(covariance=covariances(len(poisson)), weight=np.full(len(poisson), weight))
     state = replace(checkpoint.head, density=replace(density, bernoulli=bernoulli, poisson=poisson))
     return replace(checkpoint, base=state, window=(), head=state)
 
@@ -156,7 +154,7 @@ def test_repairs_are_counted_and_shown() -> None:
     one = Session(SENSOR.stream, NUSCENES)
     feed(one, range(4), SENSOR)
     checkpoint = one.snapshot()
-    bernoulli = replace(checkpoint.head.density.bernoulli, covariance=np.zeros((3, 6, 6)))
+    bernoulli = checkpoint.head.density.bernoulli.replaced(covariance=np.zeros((3, 6, 6)))
     state = replace(checkpoint.head, density=replace(checkpoint.head.density, bernoulli=bernoulli))
     two = Session.restore(replace(checkpoint, base=state, window=(), head=state), 0)
     assert two.state().repaired == 0

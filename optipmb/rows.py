@@ -1,0 +1,138 @@
+"""Records whose columns lie one behind the other in one array: what a density keeps, and kernels take and return.
+
+Each array that a kernel returns is an object of numpy with memory of its own. A session that keeps the states of the
+last second keeps a column long, and to make it and to let it go takes two microseconds: 19 of them would take as long as
+an eighth of what a frame of 40 objects does. So a record is one array, and a column is a view of it, made when somebody
+reads it.
+"""
+
+from __future__ import annotations
+
+from math import prod
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, overload
+
+import numpy as np
+
+from optipmb.errors import DensityError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+_N = TypeVar("_N", bound=np.generic)
+
+
+class Column(Generic[_N]):
+    """A column of a record, (N, *shape): a view of its array.
+
+    A number takes 8 bytes, a flag too: those of N rows are the first N bytes of the 8 N of their column.
+
+    Args:
+        number: float64, int64 or bool.
+        shape: of a row.
+    """
+
+    def __init__(self, number: type[_N], *shape: int) -> None:
+        self.number = np.dtype(number)
+        self.shape = shape
+        self.begin = self.end = 0
+
+    def __set_name__(self, record: type[Rows], name: str) -> None:
+        """Take the place behind the columns before."""
+        self.begin = record.width
+        self.end = record.width = self.begin + prod(self.shape)
+        record.described = {**record.described, name: self}
+
+    @overload
+    def __get__(self, rows: None, record: type[Rows]) -> Self: ...
+
+    @overload
+    def __get__(self, rows: Rows, record: type[Rows]) -> NDArray[_N]: ...
+
+    def __get__(self, rows: Rows | None, record: type[Rows]) -> Self | NDArray[_N]:
+        """Return the view."""
+        if rows is None:
+            return self
+        words, count = rows.words, len(rows)
+        part: NDArray[Any] = words[self.begin * count : self.end * count]
+        if self.number != part.dtype:
+            part = part.view(self.number)[: (self.end - self.begin) * count]
+        return part.reshape(count, *self.shape) if self.shape else part
+
+
+class Rows:
+    """A record of columns of equal length.
+
+    Args:
+        columns: all of them by name, which are copied.
+
+    Raises:
+        DensityError: one is missing, is no array of its number type and shape, or has another length.
+    """
+
+    part: ClassVar[str]
+    """Name of the record in the paths of errors."""
+    width: ClassVar[int] = 0
+    """Words of 8 bytes that a row takes."""
+    described: ClassVar[dict[str, Column[Any]]] = {}
+    """The columns by name, in the order in which they lie in `words`."""
+
+    __slots__ = ("words",)
+
+    words: NDArray[np.float64]
+    """(N * width,) the columns, one behind the other; integers and flags as their bytes."""
+
+    def __init__(self, **columns: NDArray[Any]) -> None:
+        count: int | None = None
+        for name, one in self.described.items():
+            column: object = columns.get(name)
+            path = f"{self.part}.{name}"
+            if not isinstance(column, np.ndarray) or (column.dtype, column.shape[1:]) != (one.number, one.shape):
+                shape = ", ".join(map(str, ("N", *one.shape)))
+                raise DensityError(path, f"({shape}) {one.number}", described(column))
+            count = len(column) if count is None else count
+            if column.shape != (count, *one.shape):
+                raise DensityError(path, f"{count} rows", described(column))
+        if unknown := sorted(columns.keys() - self.described.keys()):
+            raise DensityError(self.part, f"the columns {', '.join(self.described)}", ", ".join(unknown))
+        self.words = np.zeros((count or 0) * self.width)
+        for name, column in columns.items():
+            getattr(self, name)[...] = column
+
+    @classmethod
+    def of(cls, words: NDArray[np.float64]) -> Self:
+        """Return the record of an array that a kernel has made of it."""
+        rows = object.__new__(cls)
+        rows.words = words
+        return rows
+
+    @classmethod
+    def empty(cls) -> Self:
+        """Return a record without rows."""
+        return cls.of(np.zeros(0))
+
+    def __len__(self) -> int:
+        return self.words.shape[0] // self.width
+
+    def columns(self) -> Iterator[tuple[str, NDArray[Any]]]:
+        """Yield the name and the array of each column."""
+        for name in self.described:
+            yield name, getattr(self, name)
+
+    def replaced(self, **columns: NDArray[Any]) -> Self:
+        """Return a record with other columns of these names.
+
+        Raises:
+            DensityError: they do not fit.
+        """
+        return type(self)(**dict(self.columns()) | columns)
+
+    def take(self, rows: NDArray[np.generic]) -> Self:
+        """Return the rows that an index array or a mask selects."""
+        return type(self)(**{name: column[rows] for name, column in self.columns()})
+
+
+def described(column: object) -> str:
+    """Return what a column is, for the message of an error."""
+    return f"{column.shape} {column.dtype}" if isinstance(column, np.ndarray) else type(column).__name__
