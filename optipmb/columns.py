@@ -12,7 +12,7 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.density import NO_FRAME, Bernoullis, Density, Misses, Poissons, components_in, objects_in
 from optipmb.errors import DensityError
-from optipmb.rows import described
+from optipmb.rows import Rows, described
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,7 +27,7 @@ CLASSES: Final = "classes.probability"
 ROUNDING: Final = 1e-6
 """By how much the sum of probabilities may differ from 1."""
 
-_Rows = TypeVar("_Rows", Bernoullis, Misses, Poissons)
+_Rows = TypeVar("_Rows", bound=Rows)
 
 
 def fitting(density: Density, classes: int) -> bool:
@@ -44,12 +44,12 @@ def fitting(density: Density, classes: int) -> bool:
 
 
 @kernel
-def labels_within(objects: Array, components: Array, classes: int) -> bool:
+def labels_within(object_words: Array, component_words: Array, classes: int) -> bool:
     """Tell whether the labels of the arrays of `Bernoullis` and `Poissons` are below a number of classes."""
     good = True
-    for c in objects_in(objects).label:
+    for c in objects_in(object_words).label:
         good &= 0 <= c < classes
-    for c in components_in(components).label:
+    for c in components_in(component_words).label:
         good &= 0 <= c < classes
     return bool(good)
 

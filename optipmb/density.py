@@ -12,14 +12,13 @@ Auxiliary state x_A = [length, width, height, z]: box size and height of the box
 from __future__ import annotations
 
 import math
-from collections import namedtuple
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.records import record
-from optipmb.rows import Column, Rows
+from optipmb.rows import Column, Rows, arrays_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -117,16 +116,16 @@ class Poissons(Rows):
 # Kernels take no records but their arrays, and named tuples of the columns inside them.
 OBJECT: Final = Bernoullis.width
 COMPONENT: Final = Poissons.width
-BernoulliArrays: Final[Any] = namedtuple("BernoulliArrays", [*Bernoullis.described])  # noqa: PYI024 - the columns of another class
-PoissonArrays: Final[Any] = namedtuple("PoissonArrays", [*Poissons.described])  # noqa: PYI024 - likewise
+BernoulliArrays: Final = arrays_of(Bernoullis, "BernoulliArrays", __name__)
+PoissonArrays: Final = arrays_of(Poissons, "PoissonArrays", __name__)
 
 
 @kernel
 def objects_in(words: Array) -> Bernoullis:
-    """Return the columns of the array of `Bernoullis`, which are views of it."""
+    """Return the columns of the array of `Bernoullis`, which are views of it; flags are the integers 0 and 1."""
     n = words.shape[0] // OBJECT
     whole = words.view(np.int64)
-    return BernoulliArrays(
+    columns: Bernoullis = BernoulliArrays(
         words[: 6 * n].reshape(n, STATE),
         words[6 * n : 42 * n].reshape(n, STATE, STATE),
         words[42 * n : 43 * n],  # existence
@@ -138,9 +137,10 @@ def objects_in(words: Array) -> Bernoullis:
         words[51 * n : 52 * n],  # score
         words[52 * n : 53 * n],  # evidence
         words[53 * n : 54 * n],  # heading_odds
-        words[54 * n : 55 * n].view(np.bool_)[:n],  # extracted
-        words[55 * n : 56 * n].view(np.bool_)[:n],  # confirmed
+        whole[54 * n : 55 * n],  # extracted
+        whole[55 * n : 56 * n],  # confirmed
     )
+    return columns
 
 
 @kernel
@@ -148,7 +148,7 @@ def components_in(words: Array) -> Poissons:
     """Return the columns of the array of `Poissons`, which are views of it."""
     n = words.shape[0] // COMPONENT
     whole = words.view(np.int64)
-    return PoissonArrays(
+    columns: Poissons = PoissonArrays(
         words[: 6 * n].reshape(n, STATE),
         words[6 * n : 42 * n].reshape(n, STATE, STATE),
         words[42 * n : 43 * n],  # weight
@@ -156,14 +156,7 @@ def components_in(words: Array) -> Poissons:
         words[44 * n : 48 * n].reshape(n, 4),
         whole[48 * n : 49 * n],  # born_ns
     )
-
-
-@kernel
-def empty_objects(count: int) -> Array:
-    """Return the array of so many objects; what its columns hold does not matter yet."""
-    words = np.empty(count * OBJECT)
-    words[54 * count :] = 0.0  # of the flags most bytes are never written
-    return words
+    return columns
 
 
 @record

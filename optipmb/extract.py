@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from optipmb.calibration import calibrate_rows
 from optipmb.compiled import kernel
 from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, copy_state, objects_in, whole_periods
+from optipmb.errors import FrameError
 from optipmb.heading import doubt, sign_probability
 from optipmb.position_noise import PLAIN
 from optipmb.preprocess import Measurements
-from optipmb.records import record
 from optipmb.reported import follow_box
+from optipmb.rows import Column, Rows, arrays_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,8 +31,7 @@ if TYPE_CHECKING:
     Flags = NDArray[np.bool_]
 
 
-@record
-class Tracks:
+class Tracks(Rows):
     """The extracted tracks of one frame in the world frame, one row per track, ascending ids.
 
     Attributes:
@@ -56,25 +56,56 @@ class Tracks:
             People and planners look at confirmed tracks; the others may be of nothing.
     """
 
-    id: NDArray[np.int64]
-    label: NDArray[np.int64]
-    center: Array
-    size: Array
-    yaw: Array
-    heading_confidence: Array
-    velocity: Array
-    yaw_rate: Array
-    acceleration: Array
-    existence: Array
-    score: Array
-    covariance: Array
-    age: Array
-    time_since_detection: Array
-    detection: NDArray[np.int64]
-    confirmed: NDArray[np.bool_]
+    part = "tracks"
+    refused = FrameError
+    __slots__ = ()
 
-    def __len__(self) -> int:
-        return len(self.id)
+    id = Column(np.int64)
+    label = Column(np.int64)
+    center = Column(np.float64, 3)
+    size = Column(np.float64, 3)
+    yaw = Column(np.float64)
+    heading_confidence = Column(np.float64)
+    velocity = Column(np.float64, 2)
+    yaw_rate = Column(np.float64)
+    acceleration = Column(np.float64)
+    existence = Column(np.float64)
+    score = Column(np.float64)
+    covariance = Column(np.float64, STATE, STATE)
+    age = Column(np.float64)
+    time_since_detection = Column(np.float64)
+    detection = Column(np.int64)
+    confirmed = Column(np.bool_)
+
+
+TRACK: Final = Tracks.width
+TrackArrays: Final = arrays_of(Tracks, "TrackArrays", __name__)
+
+
+@kernel
+def tracks_in(words: Array) -> Tracks:
+    """Return the columns of the array of `Tracks`, which are views of it; flags are the integers 0 and 1."""
+    n = words.shape[0] // TRACK
+    whole = words.view(np.int64)
+    columns: Tracks = TrackArrays(
+        whole[:n],  # id
+        whole[n : 2 * n],  # label
+        words[2 * n : 5 * n].reshape(n, 3),  # center
+        words[5 * n : 8 * n].reshape(n, 3),  # size
+        words[8 * n : 9 * n],  # yaw
+        words[9 * n : 10 * n],  # heading_confidence
+        words[10 * n : 12 * n].reshape(n, 2),  # velocity
+        words[12 * n : 13 * n],  # yaw_rate
+        words[13 * n : 14 * n],  # acceleration
+        words[14 * n : 15 * n],  # existence
+        words[15 * n : 16 * n],  # score
+        words[16 * n : 52 * n].reshape(n, STATE, STATE),
+        words[52 * n : 53 * n],  # age
+        words[53 * n : 54 * n],  # time_since_detection
+        whole[54 * n : 55 * n],  # detection
+        whole[55 * n : 56 * n],  # confirmed
+    )
+    return columns
 
 
 def extract(
@@ -98,8 +129,8 @@ def extract(
         table: parameters as a table.
         two_thresholds: whether OTE is on.
     """
-    return Tracks(
-        *extract_tracks(
+    return Tracks.of(
+        extract_tracks(
             bernoulli.words,
             missed_from_ns,
             measurement,
@@ -114,7 +145,7 @@ def extract(
 
 @kernel
 def extract_tracks(
-    objects: Array,
+    object_words: Array,
     missed_from_ns: Index,
     measurement: Index,
     measurements: Columns,
@@ -122,34 +153,32 @@ def extract_tracks(
     two_thresholds: bool,
     period: float,
     classes: Sequence[ClassRow],
-) -> Columns:
-    """Return the columns of `Tracks`, calibrated where there is a calibration; `extracted` and `confirmed` are written.
+) -> Array:
+    """Return the array of `Tracks`, calibrated where there is a calibration; `extracted` and `confirmed` are written.
 
-    Arguments as in `extract`.
+    Arguments as in `extract`; `object_words` is the array of the posterior.
     """
-    objects, measurements = objects_in(objects), Measurements(*measurements)
+    objects, z = objects_in(object_words), Measurements(*measurements)
     rows = select_tracks(objects, missed_from_ns, stamp_ns, two_thresholds, period, classes)
     count = rows.shape[0]
-    state, covariance = np.empty((count, STATE)), np.empty((count, STATE, STATE))
-    center, size, velocity = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 2))
-    heading_confidence = np.ones(count)
-    age, time_since_detection, detection = np.empty(count), np.empty(count), np.full(count, -1)
+    words, state = np.empty(count * TRACK), np.empty((count, STATE))
+    tracks = tracks_in(words)
+    center, size, velocity, covariance = tracks.center, tracks.size, tracks.velocity, tracks.covariance
     for k in range(count):
         n = rows[k]
         own = classes[objects.label[n]]
         copy_state(objects.mean, objects.covariance, n, state, covariance, k)
         m = measurement[n]
-        if m >= 0:
-            detection[k] = measurements.source[m]
+        tracks.detection[k] = z.source[m] if m >= 0 else -1
         if m >= 0 and own.reported_position + own.reported_heading > 0.0:
-            position = measurements.position[m]
+            position = z.position[m]
             r_x = r_y = own.reported_position
             if position.shape[0] > PLAIN:
                 r_x, r_y = r_x * position[2], r_y * position[4]
             follow_box(
                 position[0],
                 position[1],
-                measurements.yaw[m],
+                z.yaw[m],
                 r_x,
                 r_y,
                 own.reported_heading,
@@ -160,38 +189,20 @@ def extract_tracks(
         center[k, 0], center[k, 1], center[k, 2] = state[k, X], state[k, Y], objects.auxiliary[n, 3]
         for s in range(3):
             size[k, s] = objects.auxiliary[n, s]
+        tracks.heading_confidence[k] = 1.0
         if own.sign_known:
-            heading_confidence[k] = sign_probability(objects.heading_odds[n])
-            covariance[k, PHI, PHI] += doubt(heading_confidence[k])
+            tracks.heading_confidence[k] = sign_probability(objects.heading_odds[n])
+            covariance[k, PHI, PHI] += doubt(tracks.heading_confidence[k])
         velocity[k, 0], velocity[k, 1] = v * math.cos(phi), v * math.sin(phi)
-        age[k] = (stamp_ns - objects.born_ns[n]) * 1e-9
-        time_since_detection[k] = (stamp_ns - objects.seen_ns[n]) * 1e-9
-    label, yaw, existence, score = (
-        objects.label[rows],
-        state[:, PHI].copy(),
-        objects.existence[rows],
-        objects.score[rows],
-    )
-    calibrate_rows(label, objects.evidence[rows], yaw, classes, existence, score, covariance)
-    confirmed = confirm(rows, label, existence, classes, objects.confirmed)
-    return (
-        objects.id[rows],
-        label,
-        center,
-        size,
-        yaw,
-        heading_confidence,
-        velocity,
-        state[:, OMEGA].copy(),  # yaw_rate
-        state[:, A].copy(),  # acceleration
-        existence,
-        score,
-        covariance,
-        age,
-        time_since_detection,
-        detection,
-        confirmed,
-    )
+        tracks.age[k] = (stamp_ns - objects.born_ns[n]) * 1e-9
+        tracks.time_since_detection[k] = (stamp_ns - objects.seen_ns[n]) * 1e-9
+        tracks.id[k], tracks.label[k], tracks.yaw[k] = objects.id[n], objects.label[n], phi
+        tracks.yaw_rate[k], tracks.acceleration[k] = state[k, OMEGA], state[k, A]
+        tracks.existence[k], tracks.score[k] = objects.existence[n], objects.score[n]
+    label, existence = tracks.label, tracks.existence
+    calibrate_rows(label, objects.evidence[rows], tracks.yaw, classes, existence, tracks.score, covariance)
+    confirm(rows, label, existence, classes, objects.confirmed, tracks.confirmed)
+    return words
 
 
 @kernel
@@ -224,7 +235,9 @@ def select_tracks(
 
 
 @kernel
-def confirm(rows: Index, label: Index, existence: Array, classes: Sequence[ClassRow], confirmed: Flags) -> Flags:
+def confirm(
+    rows: Index, label: Index, existence: Array, classes: Sequence[ClassRow], confirmed: Flags, now: Flags
+) -> None:
     """Confirm tracks with hysteresis: from one existence on, and until it falls below another.
 
     Args:
@@ -232,14 +245,10 @@ def confirm(rows: Index, label: Index, existence: Array, classes: Sequence[Class
         label: (K,) their classes.
         existence: (K,) of the tracks, as published.
         classes: (C,) parameters: `confirm_from` and `confirm_until`.
-        confirmed: (N,) whether they were; is written.
-
-    Returns:
-        (K,) whether they are.
+        confirmed: (N,) whether they were, the integers 0 and 1; is written.
+        now: (K,) receives whether they are.
     """
-    now = np.empty(rows.shape[0], np.bool_)
     for k in range(rows.shape[0]):
         own = classes[label[k]]
         now[k] = existence[k] >= (own.confirm_until if confirmed[rows[k]] else own.confirm_from)
         confirmed[rows[k]] = now[k]
-    return now

@@ -12,12 +12,12 @@ from optipmb.compiled import kernel
 from optipmb.density import (
     COMPONENT,
     NO_FRAME,
+    OBJECT,
     STATE,
     Bernoullis,
     Density,
     Poissons,
     components_in,
-    empty_objects,
     objects_in,
     whole_periods,
 )
@@ -65,8 +65,7 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
         check_fitting(density, density.labels)
     if dt == 0.0:
         pi = predict_classes(density, None, dt, table)
-        parts = density.bernoulli, density.poisson
-        return Density(stamp_ns, density.next_id, *parts, density.labels, misses, pi), 0
+        return Density(stamp_ns, density.next_id, density.bernoulli, density.poisson, density.labels, misses, pi), 0
     try:
         kept, objects, components, repaired = predict_density(
             density.bernoulli.words,
@@ -90,21 +89,21 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
 
 @kernel
 def predict_density(
-    objects: Array,
+    object_words: Array,
     missed_from_ns: Index,
-    components: Array,
+    component_words: Array,
     dt: float,
     before_ns: int,
     stamp_ns: int,
     period: float,
     classes: Sequence[ClassRow],
 ) -> tuple[Index, Array, Array, int]:
-    """Predict the objects and the components that are within the limit of their class (eq. PPP_prediction, MB_prediction).
+    """Predict the objects and components that are within the limit of their class (eq. PPP_prediction, MB_prediction).
 
     Args:
-        objects: array of `Bernoullis`.
+        object_words: array of `Bernoullis`.
         missed_from_ns: (N,) stamps from which the misses of the objects count.
-        components: array of `Poissons`.
+        component_words: array of `Poissons`.
         dt: time to predict over, s, positive.
         before_ns: stamp of the density.
         stamp_ns: stamp of the new frame.
@@ -118,16 +117,16 @@ def predict_density(
     Raises:
         ValueError: a label is none, and reading its parameters would leave their array.
     """
-    if not labels_within(objects, components, len(classes)):
+    if not labels_within(object_words, component_words, len(classes)):
         raise ValueError("labels of classes that there are not")
     survival = np.empty(len(classes))
     for c in range(len(classes)):
         survival[c] = classes[c].survival ** (dt / period)
 
-    old = objects_in(objects)
+    old = objects_in(object_words)
     seen_from_ns = before_ns if dt <= LONGEST_STEP_S else stamp_ns
     kept = rows_within(old.label, missed_from_ns, seen_from_ns, False, stamp_ns, period, classes)
-    predicted = empty_objects(kept.shape[0])
+    predicted = np.empty(kept.shape[0] * OBJECT)
     new = objects_in(predicted)
     repaired = predict_rows(kept, old, old.existence, new, new.existence, survival, dt, classes)
     for k in range(kept.shape[0]):
@@ -136,7 +135,7 @@ def predict_density(
         new.score[k], new.evidence[k], new.heading_odds[k] = old.score[n], old.evidence[n], old.heading_odds[n]
         new.extracted[k], new.confirmed[k] = old.extracted[n], old.confirmed[n]
 
-    undetected = components_in(components)
+    undetected = components_in(component_words)
     chosen = rows_within(undetected.label, undetected.born_ns, before_ns, True, stamp_ns, period, classes)
     carried = np.empty(chosen.shape[0] * COMPONENT)
     later = components_in(carried)

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 Columns: TypeAlias = Any
-"""The columns of a record in their order, as a plain tuple: what kernels take and return in its place.
+"""The columns of a named tuple in their order, as a plain tuple: what kernels take and return in its place.
 
-Numba takes no dataclass, and reads all names of a named tuple in every call, which doubles the time of the call. A
-kernel that takes columns names them first, as `BernoulliArrays(*objects)`.
+Numba reads all names of a named tuple in every call, which doubles the time of the call. A kernel that takes columns
+names them first, as `Measurements(*measurements)`.
 """
 
 INDEX: Final = np.dtype(np.int64)

@@ -1,19 +1,21 @@
 """Records whose columns lie one behind the other in one array: what a density keeps, and kernels take and return.
 
 Each array that a kernel returns is an object of numpy with memory of its own. A session that keeps the states of the
-last second keeps a column long, and to make it and to let it go takes two microseconds: 19 of them would take as long as
-an eighth of what a frame of 40 objects does. So a record is one array, and a column is a view of it, made when somebody
-reads it.
+last second keeps a column long, and to make it and to let it go takes two microseconds: the 19 columns of a density
+take as long as an eighth of all else that a frame of 40 objects does. So a record is one array, and a column is a view
+of it, made when somebody reads it.
 """
 
 from __future__ import annotations
 
+import sys
+from collections import namedtuple
 from math import prod
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeVar, overload
 
 import numpy as np
 
-from optipmb.errors import DensityError
+from optipmb.errors import DensityError, OptipmbError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,11 +24,14 @@ if TYPE_CHECKING:
 
 _N = TypeVar("_N", bound=np.generic)
 
+_LOWEST: Final = 0 if sys.byteorder == "little" else 7
+"""Which byte of an integer is that of a flag."""
+
 
 class Column(Generic[_N]):
     """A column of a record, (N, *shape): a view of its array.
 
-    A number takes 8 bytes, a flag too: those of N rows are the first N bytes of the 8 N of their column.
+    A number takes 8 bytes, and a flag is the integer 0 or 1.
 
     Args:
         number: float64, int64 or bool.
@@ -56,8 +61,10 @@ class Column(Generic[_N]):
             return self
         words, count = rows.words, len(rows)
         part: NDArray[Any] = words[self.begin * count : self.end * count]
-        if self.number != part.dtype:
-            part = part.view(self.number)[: (self.end - self.begin) * count]
+        if self.number == np.int64:
+            part = part.view(np.int64)
+        elif self.number == np.bool_:
+            part = part.view(np.bool_)[_LOWEST::8]
         return part.reshape(count, *self.shape) if self.shape else part
 
 
@@ -68,11 +75,13 @@ class Rows:
         columns: all of them by name, which are copied.
 
     Raises:
-        DensityError: one is missing, is no array of its number type and shape, or has another length.
+        OptipmbError: one is missing, is no array of its number type and shape, or has another length.
     """
 
     part: ClassVar[str]
     """Name of the record in the paths of errors."""
+    refused: ClassVar[type[OptipmbError]] = DensityError
+    """Type of these errors."""
     width: ClassVar[int] = 0
     """Words of 8 bytes that a row takes."""
     described: ClassVar[dict[str, Column[Any]]] = {}
@@ -90,12 +99,12 @@ class Rows:
             path = f"{self.part}.{name}"
             if not isinstance(column, np.ndarray) or (column.dtype, column.shape[1:]) != (one.number, one.shape):
                 shape = ", ".join(map(str, ("N", *one.shape)))
-                raise DensityError(path, f"({shape}) {one.number}", described(column))
+                raise self.refused(path, f"({shape}) {one.number}", described(column))
             count = len(column) if count is None else count
             if column.shape != (count, *one.shape):
-                raise DensityError(path, f"{count} rows", described(column))
+                raise self.refused(path, f"{count} rows", described(column))
         if unknown := sorted(columns.keys() - self.described.keys()):
-            raise DensityError(self.part, f"the columns {', '.join(self.described)}", ", ".join(unknown))
+            raise self.refused(self.part, f"the columns {', '.join(self.described)}", ", ".join(unknown))
         self.words = np.zeros((count or 0) * self.width)
         for name, column in columns.items():
             getattr(self, name)[...] = column
@@ -113,7 +122,7 @@ class Rows:
         return cls.of(np.zeros(0))
 
     def __len__(self) -> int:
-        return self.words.shape[0] // self.width
+        return len(self.words) // self.width
 
     def columns(self) -> Iterator[tuple[str, NDArray[Any]]]:
         """Yield the name and the array of each column."""
@@ -124,13 +133,18 @@ class Rows:
         """Return a record with other columns of these names.
 
         Raises:
-            DensityError: they do not fit.
+            OptipmbError: they do not fit.
         """
         return type(self)(**dict(self.columns()) | columns)
 
     def take(self, rows: NDArray[np.generic]) -> Self:
         """Return the rows that an index array or a mask selects."""
         return type(self)(**{name: column[rows] for name, column in self.columns()})
+
+
+def arrays_of(record: type[Rows], name: str, module: str) -> Any:
+    """Return the named tuple in which kernels have the columns of a record, a constant of a module by that name."""
+    return namedtuple(name, [*record.described], module=module)  # noqa: PYI024 - the columns of a class
 
 
 def described(column: object) -> str:

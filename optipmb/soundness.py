@@ -6,14 +6,12 @@ kilometres can grow past every bound, and whoever gives tracks away should know 
 
 from __future__ import annotations
 
-from functools import lru_cache
-from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import STATE
+from optipmb.extract import tracks_in
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,7 +19,6 @@ if TYPE_CHECKING:
     from optipmb.extract import Tracks
 
     Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 MAX_PLACE: Final = 1e9
 """Largest coordinate of a track, m: ten times what a detection may have."""
@@ -35,28 +32,6 @@ MAX_COVARIANCE: Final = 1e30
 MAX_AGE: Final = 1e12
 """Longest age, s."""
 
-
-_SHAPES: Final[tuple[tuple[str, tuple[int, ...]], ...]] = (
-    ("id", ()),
-    ("center", (3,)),
-    ("size", (3,)),
-    ("yaw", ()),
-    ("heading_confidence", ()),
-    ("velocity", (2,)),
-    ("yaw_rate", ()),
-    ("acceleration", ()),
-    ("existence", ()),
-    ("score", ()),
-    ("covariance", (STATE, STATE)),
-    ("age", ()),
-    ("time_since_detection", ()),
-    ("label", ()),
-    ("detection", ()),
-    ("confirmed", ()),
-)
-_UNBOUNDED: Final = 3
-"""How many of them, the last ones, may hold any number."""
-_columns: Final = attrgetter(*(name for name, _ in _SHAPES))
 _BOUNDS: Final[tuple[tuple[str, float, float], ...]] = (
     ("center", -MAX_PLACE, MAX_PLACE),
     ("size", 5e-324, MAX_VALUE),
@@ -74,29 +49,16 @@ _BOUNDS: Final[tuple[tuple[str, float, float], ...]] = (
 
 
 def sound(tracks: Tracks) -> bool:
-    """Tell whether all numbers of the tracks are finite and within bounds, the ids ascend, and the columns fit.
+    """Tell whether all numbers of the tracks are finite and within bounds, and the ids ascend.
 
     Existence, score and heading confidence lie in [0, 1], sizes are positive, ages are not negative, coordinates are at
     most `MAX_PLACE`, covariances `MAX_COVARIANCE`, ages `MAX_AGE`, all others `MAX_VALUE`.
     """
-    columns = _columns(tracks)
-    if [column.shape for column in columns] != _shapes(len(tracks.id)):
-        return False
-    return bool(all_within(*columns[:-_UNBOUNDED]))
-
-
-@lru_cache(256)
-def _shapes(count: int) -> list[tuple[int, ...]]:
-    """Return the shapes of the columns of so many tracks."""
-    return [(count, *shape) for _, shape in _SHAPES]
+    return bool(all_within(tracks.words))
 
 
 def unsound(tracks: Tracks) -> tuple[str, str, str]:
     """Return what is wrong with tracks that are not `sound`: path of the first value, expected, received."""
-    count = tracks.id.shape[0]
-    for (name, _), shape in zip(_SHAPES, _shapes(count), strict=True):
-        if getattr(tracks, name).shape != shape:
-            return f"tracks.{name}", f"shape {shape}", f"shape {getattr(tracks, name).shape}"
     for name, low, high in _BOUNDS:
         values = getattr(tracks, name)
         for place in np.argwhere(~((low <= values) & (values <= high)))[:1]:
@@ -107,39 +69,27 @@ def unsound(tracks: Tracks) -> tuple[str, str, str]:
 
 
 @kernel
-def all_within(
-    identity: Index,
-    center: Array,
-    size: Array,
-    yaw: Array,
-    heading_confidence: Array,
-    velocity: Array,
-    yaw_rate: Array,
-    acceleration: Array,
-    existence: Array,
-    score: Array,
-    covariance: Array,
-    age: Array,
-    time_since_detection: Array,
-) -> bool:
-    """Tell whether the columns of `Tracks` are within the bounds of `sound`; NaN is in none."""
+def all_within(words: Array) -> bool:
+    """Tell whether the columns of the array of `Tracks` are within the bounds of `sound`; NaN is in none."""
+    tracks = tracks_in(words)
+    center, size, velocity, covariance = tracks.center, tracks.size, tracks.velocity, tracks.covariance
     good = True
     before = -1
-    for n in range(identity.shape[0]):
-        good &= identity[n] > before
-        before = identity[n]
+    for n in range(tracks.id.shape[0]):
+        good &= tracks.id[n] > before
+        before = tracks.id[n]
         for s in range(3):
             good &= abs(center[n, s]) <= MAX_PLACE
             good &= 0.0 < size[n, s] <= MAX_VALUE
-        good &= abs(yaw[n]) <= MAX_VALUE
-        good &= 0.0 <= heading_confidence[n] <= 1.0
+        good &= abs(tracks.yaw[n]) <= MAX_VALUE
+        good &= 0.0 <= tracks.heading_confidence[n] <= 1.0
         good &= abs(velocity[n, 0]) <= MAX_VALUE and abs(velocity[n, 1]) <= MAX_VALUE
-        good &= abs(yaw_rate[n]) <= MAX_VALUE
-        good &= abs(acceleration[n]) <= MAX_VALUE
-        good &= 0.0 <= existence[n] <= 1.0
-        good &= 0.0 <= score[n] <= 1.0
-        good &= 0.0 <= age[n] <= MAX_AGE
-        good &= 0.0 <= time_since_detection[n] <= MAX_AGE
+        good &= abs(tracks.yaw_rate[n]) <= MAX_VALUE
+        good &= abs(tracks.acceleration[n]) <= MAX_VALUE
+        good &= 0.0 <= tracks.existence[n] <= 1.0
+        good &= 0.0 <= tracks.score[n] <= 1.0
+        good &= 0.0 <= tracks.age[n] <= MAX_AGE
+        good &= 0.0 <= tracks.time_since_detection[n] <= MAX_AGE
         for s in range(covariance.shape[1]):
             for t in range(covariance.shape[2]):
                 good &= abs(covariance[n, s, t]) <= MAX_COVARIANCE

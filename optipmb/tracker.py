@@ -12,7 +12,7 @@ from optipmb.birth import first_detected_states
 from optipmb.births_beside import forbid_births
 from optipmb.class_posterior import UNGROUPED, update_classes
 from optipmb.compiled import kernel
-from optipmb.density import NO_FRAME, Bernoullis, Density, Poissons, components_in, empty_objects, objects_in
+from optipmb.density import NO_FRAME, OBJECT, Bernoullis, Density, Poissons, components_in, objects_in
 from optipmb.detection_probability import detection_probability, over_time
 from optipmb.effort import UNLIMITED, check_effort
 from optipmb.errors import FrameError
@@ -48,11 +48,11 @@ if TYPE_CHECKING:
 
 @kernel
 def update(
-    objects: Array,
+    object_words: Array,
     class_probability: Array,
     p_d: Array,
     missed_from_ns: Index,
-    components: Array,
+    component_words: Array,
     p_d_poisson: Array,
     n_predicted: int,
     measurements: Columns,
@@ -68,11 +68,12 @@ def update(
     """Update the prediction with the measurements: the PMB update of Algorithm 1.
 
     Args:
-        objects: array of the predicted objects.
+        object_words: array of the predicted objects.
         class_probability: (N, C) their class posteriors, (0, 0) where no classes have a group in common.
         p_d: (N,) their detection probabilities.
         missed_from_ns: (N,) stamps from which their misses count.
-        components: array of the predicted Poisson components; behind them, without HABM, are those of the measurements.
+        component_words: array of the predicted Poisson components; behind them, without HABM, are those of the
+            measurements.
         p_d_poisson: (J,) their detection probabilities.
         n_predicted: how many of them were predicted.
         measurements: Z_k.
@@ -90,7 +91,7 @@ def update(
         `Survivors`; how many covariances had to be repaired.
     """
     z = Measurements(*measurements)
-    objects, components = objects_in(objects), components_in(components)
+    objects, components = objects_in(object_words), components_in(component_words)
 
     # Local hypotheses: missed, detected, first-time detected; HABM
     hypotheses = local_hypotheses(
@@ -104,7 +105,7 @@ def update(
     kept = surviving_objects(objects, p_d, assigned, hypotheses, z.label, missed_from_ns, stamp_ns, period, classes)
 
     # Motion states: detected and missed objects by the UKF, then the births of first-time detections
-    known, words = kept.known, empty_objects(kept.row.shape[0])
+    known, words = kept.known, np.empty(kept.row.shape[0] * OBJECT)
     posterior = objects_in(words)
     mean, covariance = posterior.mean, posterior.covariance
     repaired = ukf_updates(kept.row, kept.measurement, objects.mean, objects.covariance, z, classes, mean, covariance)

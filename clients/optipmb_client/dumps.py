@@ -5,9 +5,9 @@ Like `offline` this imports the tracker, and nothing of the service.
 
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from optipmb_schemas import (
@@ -123,7 +123,7 @@ def _step(
         cloud=None if given.points is None else optipmb.PointCloud(given.points.xyz, _pose(given.points)),
     )
     found = steps.step(density, frame)
-    columns = {column.name: getattr(found.tracks, column.name) for column in fields(found.tracks)}
+    columns: dict[str, Any] = dict(found.tracks.columns())
     if (paths := found.paths) is not None:
         columns |= path_fields(paths.horizons, paths.mean, paths.covariance)
     if found.class_probability is not None:

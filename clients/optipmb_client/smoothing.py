@@ -21,7 +21,6 @@ Size, height, existence and score stay as the tracker tells them.
 """
 
 from collections.abc import Iterator
-from dataclasses import fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -198,13 +197,12 @@ def _states(tracks: Tracks) -> Floats:
 
 
 def _joined(parts: list[Tracks]) -> Tracks:
-    return Tracks(*(np.concatenate([getattr(one, field.name) for one in parts]) for field in fields(Tracks)))
+    return Tracks(**{name: np.concatenate([getattr(one, name) for one in parts]) for name in Tracks.described})
 
 
 def _with_motion(tracks: Tracks, mean: Floats, covariance: Floats, confidence: Floats) -> Tracks:
     yaw, speed = mean[:, PHI], mean[:, V]
-    return replace(
-        tracks,
+    return tracks.replaced(
         center=np.column_stack((mean[:, :2], tracks.center[:, 2])),
         yaw=yaw,
         heading_confidence=confidence,

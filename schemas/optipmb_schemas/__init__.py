@@ -21,7 +21,7 @@ from optipmb_schemas.control import (
     TracksRequest,
 )
 from optipmb_schemas.dump import STORED, Dump, DumpedFrame, decode_dump, encode_dump
-from optipmb_schemas.encoder import encode, encode_json, encoded
+from optipmb_schemas.encoder import encode, encode_columns, encode_json, encoded
 from optipmb_schemas.errors import CODES, Code, MessageError
 from optipmb_schemas.keys import PREFIX, Keys, Query, Topic
 from optipmb_schemas.limits import DEFAULT, Limits
@@ -77,6 +77,7 @@ __all__ = [
     "decode",
     "decode_dump",
     "encode",
+    "encode_columns",
     "encode_dump",
     "encode_json",
     "encoded",

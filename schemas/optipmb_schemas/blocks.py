@@ -7,6 +7,7 @@ optional field `pad`), so that the receiver's view is aligned.
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import accumulate, pairwise
 from math import prod
 from typing import Any, Final
 
@@ -111,10 +112,30 @@ def heads_of(
     return tuple(heads), length
 
 
+@lru_cache(1024)
+def column_heads(
+    kind: type[Message], names: tuple[str, ...], size: int, offset: int
+) -> tuple[tuple[bytes, ...], tuple[slice, ...]]:
+    """Return what stands before the data of each of some arrays, as `heads_of`, and where in these data each one lies.
+
+    Args:
+        kind: type of the message.
+        names: of the arrays, whose numbers have 8 bytes; each has N rows, and no other length but by its description.
+        size: how many numbers all have together.
+        offset: see `heads_of`.
+    """
+    widths = [prod(map(int, kind.arrays[name].shape[1:])) for name in names]
+    count = size // sum(widths)
+    shapes = tuple([(count, *map(int, kind.arrays[name].shape[1:])) for name in names])
+    ends = [8 * count * end for end in accumulate(widths)]
+    places = tuple([slice(begin, end) for begin, end in pairwise([0, *ends])])
+    return heads_of(kind, names, shapes, offset)[0], places
+
+
 def _large_head(name: str, dtype: str, shape: tuple[int, ...], offset: int) -> bytes:
     """Return what stands before the data of a large array, a field that begins at `offset`."""
     pack, size = _msgpack.packb, prod(shape) * DTYPES[dtype]
-    before = pack(name) + b"\x84" + b"".join(map(pack, ("dtype", dtype, "shape", shape, "pad")))
-    after = pack("data") + b"\xc6" + size.to_bytes(4, "big")
+    before: bytes = pack(name) + b"\x84" + b"".join(map(pack, ("dtype", dtype, "shape", shape, "pad")))
+    after: bytes = pack("data") + b"\xc6" + size.to_bytes(4, "big")
     padding = -(offset + len(before) + 2 + len(after)) % ALIGNMENT
     return before + b"\xc4" + bytes((padding, *bytes(padding))) + after

@@ -55,6 +55,11 @@ def bytes_of(array: NDArray[Any]) -> bytes:
     return (array if _LITTLE else array.byteswap()).tobytes()
 
 
+def memory_of(array: NDArray[Any]) -> memoryview:
+    """Return the bytes of an array (N,), little-endian; where it is so already, they are not copied."""
+    return (array if _LITTLE else array.byteswap()).view(np.uint8).data
+
+
 def joined(parts: list[Any]) -> bytes:
     """Return bytes and those of arrays, one behind the other."""
     return b"".join(parts if _LITTLE else [one if type(one) is bytes else bytes_of(one) for one in parts])

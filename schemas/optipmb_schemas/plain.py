@@ -140,6 +140,11 @@ def bytes_of(numbers: Numbers) -> bytes:
     return numbers.tobytes()
 
 
+def memory_of(numbers: Numbers) -> memoryview:
+    """Return the bytes of numbers."""
+    return memoryview(numbers.tobytes())
+
+
 def joined(parts: list[Any]) -> bytes:
     """Return bytes and those of arrays, one behind the other."""
     return b"".join([one if type(one) is bytes else one.tobytes() for one in parts])

@@ -40,8 +40,9 @@ def test_confirmation_has_hysteresis(seed: int) -> None:
     rng = np.random.default_rng(seed)
     label, rows, existence = rng.integers(0, 2, 30), np.flatnonzero(rng.random(30) < 0.6), rng.uniform(0, 1, 30)
     before, upper, lower = rng.random(30) < 0.5, np.array([0.5, 0.8]), np.array([0.2, 0.8])
-    found, classes = before.copy(), class_rows(2, confirm_from=upper, confirm_until=lower)
-    told = confirm(rows, label[rows], existence[: rows.size], classes, found)
+    found, classes = before.astype(np.int64), class_rows(2, confirm_from=upper, confirm_until=lower)
+    told = np.full(rows.size, 7)
+    confirm(rows, label[rows], existence[: rows.size], classes, found, told)
     wanted = existence[: rows.size] >= np.where(before, lower[label], upper[label])[rows]
     np.testing.assert_array_equal(told, wanted)
     np.testing.assert_array_equal(found[rows], wanted)

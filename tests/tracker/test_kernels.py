@@ -19,16 +19,16 @@ from optipmb.birth import birth_states, first_detected_states, moment_match
 from optipmb.births_beside import forbid_births
 from optipmb.calibration import SURE, calibrate_rows
 from optipmb.density import (
+    OBJECT,
     BernoulliArrays,
     Bernoullis,
     PoissonArrays,
     Poissons,
     components_in,
-    empty_objects,
     objects_in,
     whole_periods,
 )
-from optipmb.extract import extract_tracks, select_tracks
+from optipmb.extract import Tracks, extract_tracks, select_tracks
 from optipmb.geometry import bev_iou, box_iou, iou_exceeds
 from optipmb.hypotheses import CLUTTER, FROM_POISSON, NEWBORN, Hypotheses
 from optipmb.lightweight import light_weight_filter
@@ -298,7 +298,7 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     sign = np.array([[0.0, 0.0, 0.0, 0.0], [0.9, 1.0, 0.7, 0.5], [0.5, 2.0, 0.1, 3.0]])  # lambda, b_d, b_v, v_0
     mean, root = rng.normal(0, 3, (6, 6)), rng.normal(0, 0.5, (6, 6, 6))
     covariance = root @ root.transpose(0, 2, 1)
-    after = objects_in(empty_objects(6))
+    after = objects_in(np.zeros(6 * OBJECT))
     states, spreads = after.mean, after.covariance
     states[:], spreads[:] = mean, covariance
     confirmed = rng.random(6) < 0.5
@@ -320,8 +320,7 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     survivors = Survivors(row, measurement, rng.uniform(0, 1, 6), 4, 2)
     new = row == NEW
     named = np.where(new, measured[measurement], label[row])
-    given = survivors, named, after, objects, 77, measurements, NOW, NOW - 150_000_000, PERIOD, classes
-    light_weight_filter(*given)
+    light_weight_filter(survivors, named, after, objects, 77, measurements, NOW, NOW - 150_000_000, PERIOD, classes)
     existence, *out, weighed, facing, flags, shown = after[2:]
     np.testing.assert_array_equal(existence, survivors.existence)
     old = row >= 0
@@ -336,8 +335,7 @@ def test_the_light_weight_filter_is_its_formulas(seed: int) -> None:
     np.testing.assert_array_equal(out[4], np.where(hit, NOW, [*seen[row[old]], 0, 0]))
     confidence = (1 - np.exp(-(1 + (NOW - birth) * 1e-9 / PERIOD))) * score[m]
     np.testing.assert_allclose(out[5], np.where(hit, confidence, 0.0), rtol=1e-15)
-    np.testing.assert_array_equal(flags, [*extracted[row[old]], False, False])
-    np.testing.assert_array_equal(shown, [*confirmed[row[old]], False, False])
+    np.testing.assert_array_equal([flags, shown], [[*one[row[old]], False, False] for one in (extracted, confirmed)])
     with np.errstate(divide="ignore"):
         latest = np.where(hit, np.clip(np.log(score[m] / (1 - score[m])), -SURE, SURE), -missed[out[0]])
     kept = memory[out[0]] ** np.where(birth == NOW, 1.0, 1.5)
@@ -399,15 +397,14 @@ def test_tracks_are_read_off_the_states(*, calibrated: bool) -> None:
     before, extracted = np.arange(9) % 2 == 0, np.isin(np.arange(9), rows)
     columns = mean, covariance, r, label, auxiliary, identity, born, seen, score, evidence, odds, extracted, before
     objects = Bernoullis(**dict(zip(Bernoullis.described, columns, strict=True)))
-    after = objects.confirmed
+    words = extract_tracks(objects.words, seen, measurement, tuple(measured), NOW, True, PERIOD, classes)
     (ids, labels, center, size, heading_, facing_, velocity, rate, acceleration, *told, age, since, detection, now) = (
-        extract_tracks(objects.words, seen, measurement, tuple(measured), NOW, True, PERIOD, classes)
+        column for _, column in Tracks.of(words).columns()
     )
     out = center, size, heading_, facing_, velocity, rate, acceleration, age, since
     wanted_now = told[0] >= np.where(before[rows], low[label[rows]], high[label[rows]])
-    np.testing.assert_array_equal(now, wanted_now)
-    np.testing.assert_array_equal(after, np.where(np.isin(np.arange(9), rows), after, before))
-    np.testing.assert_array_equal(after[rows], wanted_now)
+    np.testing.assert_array_equal([now, objects.confirmed[rows]], [wanted_now, wanted_now])
+    np.testing.assert_array_equal(np.delete(objects.confirmed, rows), np.delete(before, rows))
     x, spread = np.empty((3, 6)), np.empty((3, 6, 6))
     for k, n in enumerate(rows):
         m = measurement[n]

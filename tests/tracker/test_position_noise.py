@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -61,7 +61,7 @@ def bytes_of(results: list[optipmb.StepResult]) -> list[bytes]:
         for one in results
         for column in (
             *optipmb.columns_of(one.density).values(),
-            *(getattr(one.tracks, f.name) for f in fields(one.tracks)),
+            one.tracks.words,
         )
     ]
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final, Protocol
 
-import optipmb_schemas as schemas
 import structlog
 
 from optipmb.records import record
@@ -96,19 +95,17 @@ class TrackPublisher:
         ticket: Arrival = tracked.ticket
         passed_ns = time.monotonic_ns() - ticket.now_ns
         waited_ns = max(0, passed_ns - ticket.decode_ns - tracked.step_ns)
-        delivery = schemas.Delivery.trusted(
-            {
-                "instance": self._instance,
-                "received_ns": ticket.wall_ns,
-                "published_ns": time.time_ns(),
-                "queue_ms": waited_ns / MILLISECOND,
-                "decode_ms": ticket.decode_ns / MILLISECOND,
-                "step_ms": tracked.step_ns / MILLISECOND,
-                "run": tracked.run,
-            }
-        )
-        self._count_tracks(tracked.tracks.id.tobytes())
-        self.waiting.append((schemas.encode(tracked.tracks, delivery=delivery), ticket, waited_ns, tracked.step_ns))
+        delivery = {
+            "instance": self._instance,
+            "received_ns": ticket.wall_ns,
+            "published_ns": time.time_ns(),
+            "queue_ms": waited_ns / MILLISECOND,
+            "decode_ms": ticket.decode_ns / MILLISECOND,
+            "step_ms": tracked.step_ns / MILLISECOND,
+            "run": tracked.run,
+        }
+        self._count_tracks(tracked.made.tracks.id.tobytes())
+        self.waiting.append((tracked.made.encoded(delivery), ticket, waited_ns, tracked.step_ns))
         self.flush()
 
     def flush(self) -> None:

@@ -7,11 +7,10 @@ be viewed.
 
 from __future__ import annotations
 
-from dataclasses import fields
 from functools import lru_cache
-from operator import attrgetter, methodcaller
+from operator import attrgetter
 from struct import unpack
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import numpy as np
 import optipmb_schemas as schemas
@@ -19,17 +18,9 @@ import optipmb_schemas as schemas
 import optipmb
 from optipmb.frame import frame_of_checked
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from optipmb_service.session.timeline import FrameId
-
 IDENTITY = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
 """The pose of arrays that are in the world frame already."""
 
-_COLUMNS: Final = tuple(column.name for column in fields(optipmb.Tracks))
-_seal: Final = methodcaller("setflags", False)
-_columns: Final = attrgetter(*_COLUMNS)
 _intervals: Final = attrgetter("azimuth", "elevation", "range")
 _boxes: Final = attrgetter("label", "center", "size", "yaw", "score", "velocity")
 
@@ -131,52 +122,3 @@ def density_of(
         covariance=poisson.covariance,
         z=poisson.auxiliary[:, 3],
     )
-
-
-def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
-    tracks: optipmb.Tracks,
-    paths: optipmb.PredictedPaths | None,
-    class_probability: NDArray[np.float64] | None = None,
-    *,
-    stream: str,
-    frame_id: FrameId,
-    session: str,
-    revision: int,
-    parameters: optipmb.Parameters,
-    cloud_used: bool,
-    gap: int,
-    ignored: int,
-) -> schemas.Tracks:
-    """Return the message for the tracks of a frame, with paths and classes if there are any, without its delivery part.
-
-    What the tracker made of checked detections needs one look, not the checks of a message from elsewhere; where that
-    look finds something odd, those checks say what it is.
-
-    Raises:
-        schemas.MessageError: the tracks hold numbers that no message may.
-    """
-    sound = optipmb.sound(tracks)
-    columns: dict[str, Any] = dict(zip(_COLUMNS, _columns(tracks), strict=True))
-    columns["confirmed"] = columns["confirmed"].astype(np.int64)
-    for column in columns.values():
-        _seal(column)  # they are the message's now, which so needs no views of them
-    if class_probability is not None:
-        columns |= schemas.class_fields(class_probability)
-    if paths is not None:
-        columns |= schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
-    columns |= {
-        "stream": stream,
-        "sensor": frame_id.sensor or None,
-        "epoch": frame_id.epoch,
-        "seq": frame_id.seq,
-        "stamp_ns": frame_id.stamp_ns,
-        "session": session,
-        "revision": revision,
-        "profile": parameters.name,
-        "cloud_used": cloud_used,
-        "gap": gap,
-        "ignored": ignored,
-        "labels": parameters.labels,
-        "delivery": None,
-    }
-    return schemas.Tracks.trusted(columns) if sound else schemas.Tracks(**columns)

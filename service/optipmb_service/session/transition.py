@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import optipmb
 from optipmb.records import record
 from optipmb_service.session import convert
+from optipmb_service.session.frame_tracks import FrameTracks, tracks_of
 from optipmb_service.session.pose_check import judge
 from optipmb_service.session.state import Contents, Entry, FilterState, FrameCounts, PoseHistory, SensorState
 from optipmb_service.session.timeline import FrameId, Verdict
@@ -62,7 +63,7 @@ class Outcome:
     """
 
     entry: Entry
-    tracks: schemas.Tracks | None
+    tracks: FrameTracks | None
     begins: SessionStart | None
     unknown: dict[str, int]
     effort: optipmb.EffortError | None = None
@@ -175,7 +176,7 @@ class Transition:
         same = sensor.tracked is not None and sensor.tracked[0] == frame_id.epoch
         highest = sensor.tracked[1] if sensor.tracked is not None and same else frame_id.seq - 1
         gap = max(0, frame_id.seq - highest - 1)
-        tracks = convert.tracks_of(
+        tracks = tracks_of(
             result.tracks,
             result.paths,
             result.class_probability,
@@ -202,7 +203,7 @@ class Transition:
             starts=before.starts,
             generation=entry.place.generation,
             last=frame_id,
-            tracks=len(tracks.id),
+            tracks=len(result.tracks),
             counts=_counted(before, entry, tracked=1, gap=gap, used=used, repaired=repaired),
             sensors=_sensors(before, frame_id.sensor, known),
         )

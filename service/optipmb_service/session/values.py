@@ -11,6 +11,7 @@ from optipmb.records import record
 
 if TYPE_CHECKING:
     import optipmb
+    from optipmb_service.session.frame_tracks import FrameTracks
 
 SECOND: Final = 1_000_000_000
 
@@ -108,16 +109,21 @@ class Tracked:
     """Tracks to be published, without their delivery part.
 
     Attributes:
-        tracks: the message.
+        made: the tracks.
         ticket: what the caller gave with the detections.
         step_ns: time that conversion and tracking took.
         run: see `Session.run`.
     """
 
-    tracks: schemas.Tracks
+    made: FrameTracks
     ticket: Any
     step_ns: int
     run: int = 0
+
+    @property
+    def tracks(self) -> schemas.Tracks:
+        """The message, made anew."""
+        return self.made.message
 
 
 @dataclass(frozen=True, slots=True)
