@@ -1,9 +1,9 @@
 """How the arrays of a kernel become those of numpy: as numba has it, without a call of Python for each of them.
 
 numba finds the class `numpy.ndarray` again for every array that a kernel returns, in an interpreted function. A step
-returns about fifty arrays, and a tenth of its time was spent there. Here the class is a constant of the kernel, as the
-type of the numbers is in numba too. numba has no public way to replace one of its own conversions. Where a version
-lacks what is used here, its conversion stays, which makes the same arrays.
+that returned fifty arrays spent a tenth of its time there; it returns twenty. Here the class is a constant of the
+kernel, as the type of the numbers is in numba too. numba has no public way to replace one of its own conversions. Where
+a version lacks what is used here, its conversion stays, which makes the same arrays.
 """
 
 from __future__ import annotations
