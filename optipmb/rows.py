@@ -2,8 +2,8 @@
 
 Each array that a kernel returns is an object of numpy with memory of its own. A session that keeps the states of the
 last second keeps a column long, and to make it and to let it go takes two microseconds: the 19 columns of a density
-take as long as an eighth of all else that a frame of 40 objects does. So a record is one array, and a column is a view
-of it, made when somebody reads it.
+took a tenth of the time of a frame of 40 objects. So a record is one array, and a column is a view of it, made when
+somebody reads it.
 """
 
 from __future__ import annotations

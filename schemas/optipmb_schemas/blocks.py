@@ -84,58 +84,53 @@ def block_of(array: Numeric, dtype: str) -> dict[str, Any]:
     return {"dtype": dtype, "shape": array.shape, "data": numeric.bytes_of(array)}
 
 
+def large_head(name: str, dtype: str, shape: tuple[int, ...], offset: int) -> bytes:
+    """Return all before the data of a large array, a field of a message that lies at `offset`: so they are aligned."""
+    before, after = _large_head(name, dtype, shape)
+    padding = -(offset + len(before) + 2 + len(after)) % ALIGNMENT
+    return before + b"\xc4" + bytes((padding, *bytes(padding))) + after
+
+
 # Messages have the same few shapes over and over.
 
 
-@lru_cache(1024)
-def heads_of(
-    kind: type[Message], names: tuple[str, ...], shapes: tuple[tuple[int, ...], ...], offset: int
-) -> tuple[tuple[bytes, ...], int]:
-    """Return what stands before the data of each of some arrays of a message, and how many bytes all of it takes.
-
-    Args:
-        kind: type of the message.
-        names: of its fields, which lie one behind the other.
-        shapes: of their arrays.
-        offset: where the first one begins, up to multiples of `ALIGNMENT`: so the data of large ones are aligned.
-    """
-    heads, length = [], 0
-    for name, shape in zip(names, shapes, strict=True):
-        dtype = kind.arrays[name].dtype
-        size = prod(shape) * DTYPES[dtype]
-        if size >= LARGE:
-            heads.append(_large_head(name, dtype, shape, offset + length))
-        else:
-            field: bytes = _msgpack.packb({name: {"dtype": dtype, "shape": shape, "data": bytes(size)}})
-            heads.append(field[1 : len(field) - size])
-        length += len(heads[-1]) + size
-    return tuple(heads), length
+@lru_cache(4096)
+def small_head(kind: type[Message], name: str, shape: tuple[int, ...]) -> tuple[bytes, int]:
+    """Return all before the data of an array of a message, nothing if it is large; and how many bytes both have."""
+    dtype = kind.arrays[name].dtype
+    size = prod(shape) * DTYPES[dtype]
+    if size >= LARGE:
+        return b"", size
+    field: bytes = _msgpack.packb({name: {"dtype": dtype, "shape": shape, "data": bytes(size)}})
+    return field[1 : len(field) - size], len(field) - 1
 
 
 @lru_cache(1024)
 def column_heads(
     kind: type[Message], names: tuple[str, ...], size: int, offset: int
 ) -> tuple[tuple[bytes, ...], tuple[slice, ...]]:
-    """Return what stands before the data of each of some arrays, as `heads_of`, and where in these data each one lies.
+    """Return what stands before the data of each of some arrays, and where in these data each one lies, in bytes.
 
     Args:
         kind: type of the message.
         names: of the arrays, whose numbers have 8 bytes; each has N rows, and no other length but by its description.
         size: how many numbers all have together.
-        offset: see `heads_of`.
+        offset: where the first one begins, up to multiples of `ALIGNMENT`.
     """
-    widths = [prod(map(int, kind.arrays[name].shape[1:])) for name in names]
-    count = size // sum(widths)
-    shapes = tuple([(count, *map(int, kind.arrays[name].shape[1:])) for name in names])
-    ends = [8 * count * end for end in accumulate(widths)]
-    places = tuple([slice(begin, end) for begin, end in pairwise([0, *ends])])
-    return heads_of(kind, names, shapes, offset)[0], places
+    rows = [tuple(map(int, kind.arrays[name].shape[1:])) for name in names]
+    count = size // sum(map(prod, rows))
+    places = [slice(begin, end) for begin, end in pairwise([0, *accumulate(8 * count * prod(row) for row in rows)])]
+    heads = []
+    for name, row, place in zip(names, rows, places, strict=True):
+        head, _ = small_head(kind, name, (count, *row))
+        heads.append(head or large_head(name, kind.arrays[name].dtype, (count, *row), offset))
+        offset += len(heads[-1]) + place.stop - place.start
+    return tuple(heads), tuple(places)
 
 
-def _large_head(name: str, dtype: str, shape: tuple[int, ...], offset: int) -> bytes:
-    """Return what stands before the data of a large array, a field that begins at `offset`."""
+@lru_cache(1024)
+def _large_head(name: str, dtype: str, shape: tuple[int, ...]) -> tuple[bytes, bytes]:
+    """Return what stands before the padding of a large array, and what between it and the data."""
     pack, size = _msgpack.packb, prod(shape) * DTYPES[dtype]
-    before: bytes = pack(name) + b"\x84" + b"".join(map(pack, ("dtype", dtype, "shape", shape, "pad")))
-    after: bytes = pack("data") + b"\xc6" + size.to_bytes(4, "big")
-    padding = -(offset + len(before) + 2 + len(after)) % ALIGNMENT
-    return before + b"\xc4" + bytes((padding, *bytes(padding))) + after
+    before = pack(name) + b"\x84" + b"".join(map(pack, ("dtype", dtype, "shape", shape, "pad")))
+    return before, pack("data") + b"\xc6" + size.to_bytes(4, "big")

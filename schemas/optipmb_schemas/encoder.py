@@ -1,15 +1,13 @@
 """Messages to bytes: pure and deterministic, so equal messages give equal bytes. `codec` goes the other way."""
 
 import json
-from functools import lru_cache
 from itertools import chain
-from operator import attrgetter
 from typing import Any, Final
 
 import msgpack
 
 from optipmb_schemas.arrays import ARRAY, Numeric, numeric
-from optipmb_schemas.blocks import ALIGNMENT, block_of, column_heads, heads_of
+from optipmb_schemas.blocks import ALIGNMENT, block_of, column_heads, large_head, small_head
 from optipmb_schemas.model import Message
 
 _SMALL_MAP: Final = 16
@@ -21,7 +19,6 @@ _BUFFER: Final = 2048
 _SCALARS: Final = frozenset({str, bytes, int, float, bool})  # what msgpack takes as it is
 
 _msgpack: Any = msgpack  # its type information is partial
-_shape: Final = attrgetter("shape")
 
 
 def encode(message: Message, **others: Any) -> bytes:
@@ -32,23 +29,26 @@ def encode(message: Message, **others: Any) -> bytes:
         others: values that are known to be valid, in place of those of the message.
     """
     kind, values = type(message), message.__dict__ | others if others else message.__dict__
-    value_of = values.__getitem__
-    count, runs = _runs(kind, tuple(map(type, map(value_of, kind.names))))
+    fields = [(name, value) for name in kind.names if (value := values[name]) is not None]
     packer = _msgpack.Packer(buf_size=_BUFFER)
-    parts: list[Any] = [packer.pack_map_header(count)]
-    offset = len(parts[0])
-    for plain, nested, arrays in runs:
+    parts: list[Any] = [packer.pack_map_header(len(fields))]
+    offset, plain = len(parts[0]), {}
+    for name, value in fields:
+        if type(value) is not ARRAY:
+            plain[name] = value if type(value) in _SCALARS else _plain(value, blocks=True)
+            continue
         if plain:
-            fields = dict(zip(plain, map(value_of, plain), strict=True))
-            for name in nested:
-                fields[name] = _plain(fields[name], blocks=True)
-            parts.append(_without_head(packer.pack(fields), len(fields)))
+            parts.append(_without_head(packer.pack(plain), len(plain)))
             offset += len(parts[-1])
-        if arrays:
-            columns = [*map(value_of, arrays)]
-            heads, length = heads_of(kind, arrays, tuple(map(_shape, columns)), offset % ALIGNMENT)
-            parts += chain.from_iterable(zip(heads, columns, strict=True))
-            offset += length
+            plain = {}
+        head, length = small_head(kind, name, value.shape)
+        if not head:
+            head = large_head(name, kind.arrays[name].dtype, value.shape, offset)
+            length += len(head)
+        parts += head, value
+        offset += length
+    if plain:
+        parts.append(_without_head(packer.pack(plain), len(plain)))
     return numeric.joined(parts)
 
 
@@ -73,26 +73,6 @@ def encode_columns(
     return b"".join(parts)
 
 
-@lru_cache(1024)
-def _runs(
-    kind: type[Message], types: tuple[type, ...]
-) -> tuple[int, tuple[tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]], ...]]:
-    """Return how many fields are there and in which runs, of the types of all values of a message.
-
-    A run: names of fields that are no arrays, those of them that hold others, and names of the arrays behind them.
-    """
-    there = [(name, one) for name, one in zip(kind.names, types, strict=True) if one is not type(None)]
-    runs: list[tuple[list[str], list[str], list[str]]] = []
-    for name, one in there:
-        if not runs or (one is not ARRAY and runs[-1][2]):
-            runs.append(([], [], []))
-        plain, nested, arrays = runs[-1]
-        (arrays if one is ARRAY else plain).append(name)
-        if one is not ARRAY and one not in _SCALARS:
-            nested.append(name)
-    return len(there), tuple([(tuple(plain), tuple(nested), tuple(arrays)) for plain, nested, arrays in runs])
-
-
 def encoded(message: Message) -> bytes:
     """Return what `encode` gives, without making it again where the message came as these bytes."""
     kept: bytes | None = getattr(message, "encoded", None)
@@ -113,11 +93,11 @@ def encode_json(message: Message) -> bytes:
 def _plain(value: Any, *, blocks: bool) -> Any:
     """Return a message as maps, lists and scalars, in a fixed order."""
     if isinstance(value, Message):
-        fields: dict[str, Any] = dict(value.present())
-        if blocks and _SCALARS.issuperset(map(type, fields.values())):
-            return fields
-        for name, field in fields.items():
-            if isinstance(field, ARRAY):
+        fields: dict[str, Any] = {}
+        for name, field in value.present():
+            if type(field) in _SCALARS and blocks:
+                fields[name] = field
+            elif isinstance(field, ARRAY):
                 array = value.arrays[name]
                 fields[name] = block_of(field, array.dtype) if blocks else array.to_lists(field)
             else:
@@ -129,4 +109,6 @@ def _plain(value: Any, *, blocks: bool) -> Any:
         return [_plain(item, blocks=blocks) for item in value]
     if isinstance(value, dict):
         return {key: _plain(value[key], blocks=blocks) for key in sorted(value)}
-    return value.hex() if isinstance(value, bytes) and not blocks else value
+    if isinstance(value, bytes) and not blocks:
+        return value.hex()
+    return value
