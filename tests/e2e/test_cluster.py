@@ -73,7 +73,10 @@ class Cluster:
             tokens = self.node.alive(KEYS.all_owners())
             return len(tokens) == len(SENSORS) == len(self.owners()) and set(self.owners().values()) <= {*instances}
 
-        until(reached, f"every stream is owned by one of {instances}")
+        def owned() -> str:
+            return f"every stream is owned by one of {instances}, but not {sorted(self.node.alive(KEYS.all_owners()))}"
+
+        until(reached, owned)
         return self.owners()
 
     def check(self, frames: int, *instances: str) -> dict[str, SessionState]:

@@ -305,11 +305,11 @@ def _configuration(endpoint: str) -> zenoh.Config:
     return config
 
 
-def until(true: Callable[[], bool], what: str, deadline_s: float = DEADLINE_S) -> None:
-    """Ask again and again, for what sends no message; fails at the deadline."""
+def until(true: Callable[[], bool], what: str | Callable[[], str], deadline_s: float = DEADLINE_S) -> None:
+    """Ask again and again, for what sends no message; fails at the deadline, and says what is not so."""
     ends = time.monotonic() + deadline_s
     pause = threading.Event()
     while not true():
         if time.monotonic() > ends:
-            raise AssertionError(f"{what} within {deadline_s:g} s")
+            raise AssertionError(f"{what if isinstance(what, str) else what()} within {deadline_s:g} s")
         pause.wait(0.03)  # asking costs the processor that is waited for
