@@ -12,7 +12,7 @@ import numpy as np
 from optipmb.compiled import kernel
 from optipmb.density import NO_FRAME, Bernoullis, Density, Misses, Poissons, components_in, objects_in
 from optipmb.errors import DensityError
-from optipmb.rows import Rows, described
+from optipmb.rows import Rows, shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -128,7 +128,7 @@ def density_of(
     if misses is not None:
         for name, since in (("missed_from_ns", misses.missed_from_ns), ("looked_ns", misses.looked_ns)):
             if since.shape != bernoulli.seen_ns.shape:
-                raise DensityError(f"misses.{name}", f"{len(bernoulli)} rows", described(since))
+                raise DensityError(f"misses.{name}", f"{len(bernoulli)} rows", shown(since))
             wrong = (since < bernoulli.seen_ns) | (since > stamp_ns)
             if wrong.any():
                 row = int(wrong.argmax())
@@ -141,7 +141,7 @@ def density_of(
 def _class_probability(column: Any, count: int, classes: int) -> NDArray[np.float64]:
     """Return the posteriors over the classes, each of which sums to 1."""
     if not isinstance(column, np.ndarray) or column.dtype != np.float64 or column.shape != (count, classes):
-        raise DensityError(CLASSES, f"({count}, {classes}) float64", described(column))
+        raise DensityError(CLASSES, f"({count}, {classes}) float64", shown(column))
     wrong = ~((column >= 0.0).all(axis=1) & (np.abs(column.sum(axis=1) - 1.0) <= ROUNDING))
     if wrong.any():
         row = int(wrong.argmax())
@@ -150,17 +150,15 @@ def _class_probability(column: Any, count: int, classes: int) -> NDArray[np.floa
 
 
 def _rows(kind: type[_Rows], columns: Mapping[str, Any], *, earlier: bool) -> _Rows:
-    found: dict[str, Any] = {}
-    count: int | None = None
-    for name, one in kind.described.items():
-        path = f"{kind.part}.{name}"
-        column: Any = columns.get(path)
-        if column is None and earlier and count is not None:
-            column = np.zeros((count, *one.shape), one.number)
-        if isinstance(column, np.ndarray) and column.dtype.kind == "f" and not np.isfinite(column).all():
+    found: dict[str, Any] = {name: columns.get(f"{kind.part}.{name}") for name in kind.described}
+    first = next(iter(found.values()))
+    if earlier and isinstance(first, np.ndarray) and first.ndim:
+        for name, one in kind.described.items():
+            if found[name] is None:
+                found[name] = np.zeros((len(first), *one.shape), one.number)
+    rows = kind(**found)
+    for name, column in rows.columns():
+        if column.dtype.kind == "f" and not np.isfinite(column).all():
             row = np.argwhere(~np.isfinite(column))[0]
-            raise DensityError(f"{path}[{row[0]}]", "finite numbers", str(column[tuple(row)]))
-        if isinstance(column, np.ndarray) and count is None:
-            count = len(column) if column.ndim else None
-        found[name] = column
-    return kind(**found)
+            raise DensityError(f"{kind.part}.{name}[{row[0]}]", "finite numbers", str(column[tuple(row)]))
+    return rows

@@ -57,7 +57,7 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
         The predicted density and how many covariances had to be repaired.
 
     Raises:
-        DensityError: the columns of the density do not fit together.
+        DensityError: the parts of the density do not fit together, or a label is of no class.
     """
     misses, before_ns = density.misses, density.stamp_ns
     dt = 0.0 if before_ns == NO_FRAME else (stamp_ns - before_ns) * 1e-9

@@ -25,8 +25,7 @@ names them first, as `Measurements(*measurements)`.
 """
 
 INDEX: Final = np.dtype(np.int64)
-FLAG: Final = np.dtype(np.bool_)
-"""Types of columns. Given to `np.empty` so, an array takes three quarters of the time that it takes by `np.int64`."""
+"""Type of columns. Given to `np.empty` so, an array takes three quarters of the time that it takes by `np.int64`."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))

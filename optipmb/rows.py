@@ -97,12 +97,13 @@ class Rows:
         for name, one in self.described.items():
             column: object = columns.get(name)
             path = f"{self.part}.{name}"
-            if not isinstance(column, np.ndarray) or (column.dtype, column.shape[1:]) != (one.number, one.shape):
+            wanted = one.number, one.shape, 1 + len(one.shape)
+            if not isinstance(column, np.ndarray) or (column.dtype, column.shape[1:], column.ndim) != wanted:
                 shape = ", ".join(map(str, ("N", *one.shape)))
-                raise self.refused(path, f"({shape}) {one.number}", described(column))
+                raise self.refused(path, f"({shape}) {one.number}", shown(column))
             count = len(column) if count is None else count
-            if column.shape != (count, *one.shape):
-                raise self.refused(path, f"{count} rows", described(column))
+            if len(column) != count:
+                raise self.refused(path, f"{count} rows", shown(column))
         if unknown := sorted(columns.keys() - self.described.keys()):
             raise self.refused(self.part, f"the columns {', '.join(self.described)}", ", ".join(unknown))
         self.words = np.zeros((count or 0) * self.width)
@@ -144,9 +145,9 @@ class Rows:
 
 def arrays_of(record: type[Rows], name: str, module: str) -> Any:
     """Return the named tuple in which kernels have the columns of a record, a constant of a module by that name."""
-    return namedtuple(name, [*record.described], module=module)  # noqa: PYI024 - the columns of a class
+    return namedtuple(name, [*record.described], module=module)  # noqa: PYI024 - its fields are those of a record
 
 
-def described(column: object) -> str:
+def shown(column: object) -> str:
     """Return what a column is, for the message of an error."""
     return f"{column.shape} {column.dtype}" if isinstance(column, np.ndarray) else type(column).__name__

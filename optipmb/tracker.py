@@ -242,7 +242,7 @@ class Tracker:
         Raises:
             FrameError: the stamp of the frame is before that of the density, or the classes of the frame or of the
                 density are not those of the parameters.
-            DensityError: the columns of the density do not fit together.
+            DensityError: the parts of the density do not fit together, or a label is of no class.
             EffortError: the frame needs more than `max_pairs` pairs looked at; nothing costly was done yet.
         """
         self._check(density, frame)

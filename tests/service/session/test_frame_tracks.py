@@ -26,11 +26,11 @@ def sound_tracks(count: int) -> optipmb.Tracks:
     return optipmb.Tracks(**columns | {"id": np.arange(count) * 3})
 
 
-def made(count: int, **fields: Any) -> FrameTracks:
-    """Such tracks of a frame."""
+def made(tracks: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None, **fields: Any) -> FrameTracks:
+    """Tracks of a frame."""
     header: dict[str, Any] = {"stream": "a/b/c", "session": "0" * 32, "revision": 0, "cloud_used": False}
     header |= {"gap": 0, "ignored": 0, "parameters": PARAMETERS, "frame_id": FrameId(b"0" * 16, 1, 2)}
-    return tracks_of(sound_tracks(count), None, **header | fields)
+    return tracks_of(tracks, paths, **header | fields)
 
 
 def delivery(run: int) -> dict[str, Any]:
@@ -59,10 +59,11 @@ def test_the_columns_are_those_of_the_message_in_its_order() -> None:
 @example(count=0, node=1, sensor=False, seq=0, run=0)
 @example(count=14, node=2, sensor=True, seq=1, run=0)
 @example(count=15, node=3, sensor=False, seq=1, run=1)
-def test_bytes_are_those_of_the_message(count: int, node: int, sensor: bool, seq: int, run: int) -> None:  # noqa: FBT001 - drawn
+def test_bytes_are_those_of_the_message(*, count: int, node: int, sensor: bool, seq: int, run: int) -> None:
     """Any number of tracks, at any place in the message, of one sensor or of several."""
     frame_id = FrameId(b"0" * 16, seq, 2**60, "a/b/d" if sensor else "")
-    tracks = made(count, stream=f"site/{'n' * node}/lidar", frame_id=frame_id, gap=run, revision=run)
+    stream = f"site/{'n' * node}/lidar"
+    tracks = made(sound_tracks(count), stream=stream, frame_id=frame_id, gap=run, revision=run)
     values = delivery(run)
     payload = tracks.encoded(values)
     assert payload == schemas.encode(tracks.message, delivery=schemas.Delivery(**values))
@@ -78,9 +79,7 @@ def test_paths_and_classes_are_in_the_bytes() -> None:
     mean, covariance = np.zeros((3, 2, 6)), np.broadcast_to(np.eye(6), (3, 2, 6, 6))
     paths = optipmb.PredictedPaths(one.id, one.label, np.array([0.5, 1.0]), mean, covariance)
     probability = np.full((3, len(PARAMETERS.labels)), 1 / len(PARAMETERS.labels))
-    header: dict[str, Any] = {"stream": "a/b/c", "session": "0" * 32, "revision": 0, "cloud_used": True, "gap": 0}
-    header |= {"ignored": 1, "parameters": PARAMETERS, "frame_id": FrameId(b"0" * 16, 1, 2)}
-    tracks = tracks_of(one, paths, probability, **header)
+    tracks = made(one, paths, class_probability=probability)
     message = schemas.decode(tracks.encoded(delivery(0)), schemas.Tracks)
     assert message.path_position is not None
     assert message.class_probability is not None
