@@ -20,7 +20,7 @@ from typer.main import get_command
 from optipmb_service import __version__
 from optipmb_service.app import health_command, nats, router
 from optipmb_service.app.collector import collector_paused
-from optipmb_service.app.ending import leave
+from optipmb_service.app.ending import leave_or_restart
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import logs
 from optipmb_service.settings.forms import DEFAULT_GRPC, DEFAULT_LISTEN, DEFAULT_NATS, address
@@ -131,7 +131,7 @@ def run_command(**given: Unpack[Options]) -> None:
     settings = _begin(_load(given))
     if settings.cluster:
         _needed("optipmb_service.cluster.jetstream", "cluster")
-    leave(_run_one(settings) if settings.workers == 1 else _run_many(settings))
+    leave_or_restart(_run_one(settings) if settings.workers == 1 else _run_many(settings))
 
 
 def _version(value: bool) -> None:  # noqa: FBT001 - the parser calls it so
@@ -186,7 +186,7 @@ def config_command(
 @_taking(RouterOptions)
 def router_command(**given: Unpack[RouterOptions]) -> None:
     """Run a Zenoh router alone, without tracking. SIGINT and SIGTERM end it."""
-    leave(asyncio.run(router.run(_begin(_load({**given, "router": True})))))
+    leave_or_restart(asyncio.run(router.run(_begin(_load({**given, "router": True})))))
 
 
 @app.command("grpc")
@@ -195,7 +195,7 @@ def grpc_command(**given: Unpack[GatewayOptions]) -> None:
     """Run a gRPC gateway alone, a client of routers. Prints one line, `ready …`; SIGINT and SIGTERM end it."""
     settings = _begin(_load(given, grpc=DEFAULT_GRPC, connect=[DEFAULT_LISTEN]))
     run = _needed("optipmb_service.app.gateway", "grpc").run
-    leave(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+    leave_or_restart(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
 
 
 @app.command("ros2")
@@ -206,7 +206,7 @@ def ros2_command(**given: Unpack[RouterOptions]) -> None:
     if not settings.ros2.streams:
         _wrong("setting ros2.streams: expected a table of streams and their topics in --settings, received none")
     run = _needed("optipmb_service.app.ros2", "ros2").run
-    leave(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+    leave_or_restart(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
 
 
 @app.command("log")
@@ -215,7 +215,7 @@ def log_command(**given: Unpack[LogOptions]) -> None:
     """Put detections and tracks into the log of a cluster, a client of routers. SIGINT and SIGTERM end it."""
     settings = _begin(_load(given, connect=[DEFAULT_LISTEN], cluster=[f"nats://{DEFAULT_NATS}"]))
     run = _needed("optipmb_service.app.log_bridge", "cluster").run
-    leave(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+    leave_or_restart(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
 
 
 @app.command("nats")

@@ -17,7 +17,7 @@ import structlog
 from optipmb_service.app import process
 from optipmb_service.app.edges import grpc_edge
 from optipmb_service.app.kernels import warm_up
-from optipmb_service.app.loops import say_ready, settle, unless
+from optipmb_service.app.loops import say_ready, settle, unless, watch_keys
 from optipmb_service.app.service import Service
 
 if TYPE_CHECKING:
@@ -131,6 +131,7 @@ async def _serve(
     service.start(announce=parent.announces)
     health.report(service)
     settle()
+    watching = loop.create_task(watch_keys(asked, lambda: service.key_numbers, settings.restart_keys))
     with grpc_edge(settings, service.client, health.metrics.add):
         # In this order: who sees the ready line may send at once, and finds this event before those of a session.
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
@@ -140,4 +141,5 @@ async def _serve(
             service.housekeeping()
             parent.beat()
         health.ends()
+    watching.cancel()
     return await asyncio.to_thread(service.stop, asked.bound.left())

@@ -55,6 +55,9 @@ LATE_S: Final = 2.0
 END_HUNG: Final = 1
 """Exit status of a process in which a step of the end hung."""
 
+RESTART: Final = 75
+"""Exit status of a process that has ended in order to begin again (sysexits.h: try again)."""
+
 STDERR: Final = 2
 CALLS: Final = 6
 """Calls that are logged of a thread: the innermost one, and those of this package."""
@@ -174,6 +177,15 @@ class Steps:
         if names:
             log.error("step_hangs", steps=names)
         return bool(names)
+
+
+def leave_or_restart(status: int) -> None:
+    """End the process, or begin it again in its place, with its id and what it was started with."""
+    if status == RESTART:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - what this process was started with
+    leave(status)
 
 
 def leave(status: int) -> None:

@@ -18,9 +18,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from optipmb_service.app.ending import EndBound
+    from optipmb_service.zenoh.key_numbers import NumbersUsed
 
 SWITCH_S: Final = 0.0005
 """By default it is ten times as long, and a frame that meets two other threads waits 10 ms."""
+
+KEYS_S: Final = 1.0
+"""How often it is seen how many keys a process has declared."""
+
+GAINED: Final = 0.1
+"""Share of them that a restart gives back at least."""
 
 log = structlog.get_logger("optipmb_service")
 
@@ -36,6 +43,8 @@ class StopRequest:
 
     def __init__(self, bound: EndBound) -> None:
         self.bound = bound
+        self.restarts = False
+        """Whether the process is to begin again after the end."""
         self._loop = asyncio.get_running_loop()
         self._event = asyncio.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -44,8 +53,15 @@ class StopRequest:
             # begins, also where the loop hangs. Nothing else may be done there: whatever it interrupts may hold locks.
             signal.signal(number, lambda *_: bound.begin())
 
+    def restart(self, reason: str) -> None:
+        """Ask for the end, after which the process is to begin again; unless somebody wants it to end."""
+        if not self.is_set():
+            self.ask(reason)
+            self.restarts = True
+
     def ask(self, reason: str) -> None:
         """Ask for the end."""
+        self.restarts = False
         if not self.bound.begin():  # before anything that may block, as a log that nobody reads
             log.warning("end_unbounded")
         log.info("stop_asked" if not self.is_set() else "stop_asked_again", signal=reason)
@@ -96,6 +112,24 @@ async def beat(health: Heartbeat) -> None:
     while True:
         health.beat()
         await asyncio.sleep(BEAT_S)
+
+
+async def watch_keys(asked: StopRequest, used: Callable[[], NumbersUsed], most: int) -> None:
+    """Have the process begin again before its network session has no number for keys any more.
+
+    It does not where that would give it few: what is open when it ends needs as many again.
+
+    Args:
+        asked: the end.
+        used: returns how many numbers are used.
+        most: how many may be used up.
+    """
+    while not asked.is_set():
+        keys = used()
+        if keys.up >= most and keys.up - keys.now >= GAINED * most:
+            log.warning("keys_used_up", declared=keys.up, open=keys.now)
+            asked.restart("keys_used_up")
+        await asked.wait(KEYS_S)
 
 
 async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:

@@ -10,8 +10,8 @@ import structlog
 
 from optipmb_service import __version__
 from optipmb_service.app.edges import monitoring
-from optipmb_service.app.ending import END_HUNG, EndBound, longest_end_s
-from optipmb_service.app.loops import StopRequest, beat, unless
+from optipmb_service.app.ending import END_HUNG, RESTART, EndBound, longest_end_s
+from optipmb_service.app.loops import StopRequest, beat, unless, watch_keys
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime.ports import EdgeError, TransportError
@@ -36,7 +36,8 @@ async def run(
         about: more for the first line of the log.
 
     Returns:
-        The exit status: 0, or 1 when the network, an address or the store cannot be used, or a step of the end hung.
+        The exit status: 0, or 1 when the network, an address or the store cannot be used, or a step of the end hung;
+        `RESTART` where the process is to begin again.
     """
     asked = StopRequest(EndBound(longest_end_s(settings.grace_s)))
     log.info("starting", instance=settings.instance, version=__version__, **about)
@@ -53,6 +54,8 @@ async def run(
         beating.cancel()
     if ended is not None:
         log.info("stopped", drained=ended)
+    if asked.restarts:
+        return RESTART
     return END_HUNG if ended is False else 0
 
 
@@ -64,9 +67,12 @@ async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHe
         client = await unless(asked, lambda: Client.opened(settings))
         if client is None:
             return None
+        health.metrics.add(lambda: [("declared_keys_total", (), client.key_numbers.up)])
+        watching = asyncio.create_task(watch_keys(asked, lambda: client.key_numbers, settings.restart_keys))
         try:
             await serve(asked, health, client)
         finally:
+            watching.cancel()
             asked.bound.begin()
             await asyncio.to_thread(client.close)
         return True

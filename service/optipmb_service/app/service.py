@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.settings.model import Settings
     from optipmb_service.zenoh.client import Client
+    from optipmb_service.zenoh.key_numbers import NumbersUsed
 
 log = structlog.get_logger("optipmb_service")
 
@@ -195,6 +196,11 @@ class Service:
         return ended and kept and not unfinished
 
     @property
+    def key_numbers(self) -> NumbersUsed:
+        """What is used of the numbers that its network session has for keys."""
+        return self.client().key_numbers
+
+    @property
     def stuck(self) -> bool:
         """Whether the tracking thread has been at one piece of work for too long."""
         return self._scheduler.busy_s > self._settings.stuck_s
@@ -291,6 +297,7 @@ class Service:
             standing_by=self._intake.standing_by,
             now_ns=time.monotonic_ns(),
         )
+        yield "declared_keys_total", (), self.key_numbers.up
         yield from collectors.of_sessions(sessions)
         yield from collectors.of_densities(densities)
         yield from collectors.of_streams(sessions, self._settings.http_streams)

@@ -23,8 +23,8 @@ import structlog
 from optipmb_service import __version__
 from optipmb_service.app.aggregate import QUERIES, AggregateView
 from optipmb_service.app.edges import grpc_edge, monitoring
-from optipmb_service.app.ending import END_HUNG, LATE_S, SLICE_S, EndBound, longest_end_s
-from optipmb_service.app.loops import StopRequest, beat, say_ready, unless
+from optipmb_service.app.ending import END_HUNG, LATE_S, RESTART, SLICE_S, EndBound, longest_end_s
+from optipmb_service.app.loops import StopRequest, beat, say_ready, unless, watch_keys
 from optipmb_service.app.private_folder import private_folder
 from optipmb_service.app.worker_process import WorkerProcess
 from optipmb_service.observability.health import BEAT_S
@@ -52,7 +52,7 @@ WORKERS_S: Final = 2.0
 OWN_END_S: Final = 0.5
 """How long a parent may take to end without workers: what is left of them before is killed."""
 
-ORDERLY: Final = frozenset({0, -signal.SIGINT, -signal.SIGTERM})
+ORDERLY: Final = frozenset({0, RESTART, -signal.SIGINT, -signal.SIGTERM})
 """Statuses of a worker that has ended as it was asked to; by these signals before it could listen to them."""
 
 State = Literal["starting", "ready", "down"]
@@ -165,6 +165,10 @@ class Supervisor:
             began = time.monotonic()
             status = await child.run(settings, self._private)
             lived_s = time.monotonic() - began
+            if status == RESTART and not self._over:
+                log.info("worker_restarts", worker=index)
+                self._set(index, "down")
+                continue
             never_ready = not self._was_ready[index]
             self._set(index, "down")
             if self._asked.is_set():
@@ -197,7 +201,7 @@ async def supervise(settings: Settings) -> int:
 
     Returns:
         The exit status: 0, 1 when the network could not be used or an end hung, or that of a worker which could not
-        start.
+        start; `RESTART` where this process is to begin again.
     """
     asked = StopRequest(EndBound(longest_end_s(settings.grace_s) + WORKERS_S))
     log.info("starting", instance=settings.instance, version=__version__, workers=settings.workers)
@@ -227,6 +231,8 @@ async def _supervised(
     supervisor = Supervisor(workers, asked, private)
     view = AggregateView(settings, supervisor, transport)
     beating = asyncio.create_task(beat(view))
+    client = transport.client()
+    watching = asyncio.create_task(watch_keys(asked, lambda: client.key_numbers, settings.restart_keys))
     ended = True
     try:
         with monitoring(settings, view):
@@ -244,9 +250,12 @@ async def _supervised(
     finally:
         asked.bound.begin()  # also where nobody asked
         beating.cancel()
+        watching.cancel()
         with contextlib.suppress(Exception):
             await asyncio.to_thread(transport.close)
     log.info("stopped", drained=ended)
+    if asked.restarts and not supervisor.failed:
+        return RESTART
     return supervisor.failed or (0 if ended else END_HUNG)
 
 

@@ -21,6 +21,7 @@ EVENTS: Final = {
     "connecting": "Waits for a router. If this lasts, check `connect`.",
     "http": "Health, metrics and the live page are served at `address`.",
     "ready": "Streams and queries are served.",
+    "keys_used_up": "The process has declared `restart_keys` keys: it ends in order, and begins again in its place.",
     "grpc": "gRPC is served at `address`.",
     "grpc_call": "A call has ended (level debug).",
     "grpc_connections": "The limit of open files allows fewer connections than the setting.",
@@ -72,6 +73,7 @@ EVENTS: Final = {
     "worker_started": "The parent has started a worker.",
     "worker_ended": "A worker has ended by itself, with this status (below 0: by this signal). It is restarted"
     " after `again_s`; until then the state is `degraded`.",
+    "worker_restarts": "A worker has declared `restart_keys` keys and ended in order; it is started again at once.",
     "worker_stuck": "A worker has not responded for `silent_s`; it is killed and restarted.",
     "worker_killed": "A worker did not end or respond in time and was killed.",
     "metrics_unreadable": "The metrics of a worker cannot be read and are left out.",

@@ -72,6 +72,9 @@ SERVICE_METRICS: Final = {
     "sessions_restored_total": MetricFamily("counter", (), "Sessions restored from a checkpoint."),
     "checkpoints_total": MetricFamily("counter", (), "Checkpoints written."),
     "checkpoint_age_seconds": MetricFamily("gauge", (), "Age of the state that a crash now would go back to."),
+    "declared_keys_total": MetricFamily(
+        "counter", (), "Keys declared on the network; the process restarts at `restart_keys`."
+    ),
     "queue_frames": MetricFamily("gauge", (), "Frames waiting."),
     "oldest_data_seconds": MetricFamily("gauge", (), "Time since the last frame of the longest silent stream."),
     "tracks": MetricFamily("gauge", (), "Tracks in the newest frames."),

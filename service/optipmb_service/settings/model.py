@@ -155,7 +155,7 @@ class Settings(BaseSettings):
         " recently used sessions closed",
     )
     max_sessions: int = Field(
-        default=1000, ge=1, le=100_000, description="streams tracked at once; further ones are refused"
+        default=1000, ge=1, le=10_000, description="streams tracked at once; further ones are refused"
     )
     node_sessions: int = Field(
         default=64, ge=0, le=100_000, description="the same of one node (`site/node`); 0: no limit"
@@ -233,6 +233,13 @@ class Settings(BaseSettings):
         le=600,
         description="a thread busy with one task, or a worker silent, for this long is stuck: the process is not"
         " healthy, the worker is replaced",
+    )
+    restart_keys: int = Field(
+        default=50_000,
+        ge=100,
+        le=60_000,
+        description="keys declared on the network after which a process restarts, its sessions continue from the store:"
+        " Zenoh has 65,535 for the life of a process, and each stream that opens takes up to 5",
     )
     grace_s: float = Field(default=1.0, ge=0, le=60, description="at shutdown, time for frames already received")
     http: Address = Field(

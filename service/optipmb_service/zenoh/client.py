@@ -14,6 +14,7 @@ import zenoh
 import zenoh.ext
 
 from optipmb_service.runtime.ports import TransportError
+from optipmb_service.zenoh import key_numbers
 from optipmb_service.zenoh.connection import close, line, opened
 from optipmb_service.zenoh.handles import Publisher, Replies, cached_publisher, publish_problem
 from optipmb_service.zenoh.subscription import Subscription
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.settings.model import Settings
     from optipmb_service.zenoh.handles import Putting
+    from optipmb_service.zenoh.key_numbers import NumbersUsed
 
 
 class _Matching(Protocol):
@@ -52,7 +54,7 @@ class Outgoing:
         wanted: called on any thread, and only to pass it on, when it has changed whether anybody takes clouds.
 
     Raises:
-        TransportError: the session is closed.
+        TransportError: the session is closed, or has declared all keys that it can.
     """
 
     def __init__(
@@ -65,14 +67,18 @@ class Outgoing:
         wanted: Callable[[], None],
     ) -> None:
         self._matching: _Matching | None = None
-        self._detections = Publisher(cached_publisher(session, keys.detections(stream), schemas.Detections, cache))
+        taken = key_numbers.take(session, key_numbers.CACHED)
+        cached = cached_publisher(session, keys.detections(stream), schemas.Detections, cache)
+        self._detections = Publisher(cached, (taken,))
         if cache_clouds:
+            taken = key_numbers.take(session, key_numbers.CACHED)
             low = zenoh.Priority.DATA_LOW
             cached = cached_publisher(
                 session, keys.points(stream), schemas.Points, cache_clouds, priority=low, express=False
             )
-            self._points = Publisher(cached)
+            self._points = Publisher(cached, (taken,))
             return
+        taken = key_numbers.take(session, key_numbers.PLAIN)
         try:
             plain = session.declare_publisher(
                 keys.points(stream),
@@ -80,7 +86,7 @@ class Outgoing:
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.DATA_LOW,
             )
-            self._points, self._matching = Publisher(cast("Putting", plain)), cast("_Matching", plain)
+            self._points, self._matching = Publisher(cast("Putting", plain), (taken,)), cast("_Matching", plain)
             plain.declare_matching_listener(lambda _status: wanted())
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
@@ -144,6 +150,11 @@ class Client:
     def linked(self) -> bool:
         """Whether the session has a router, or is one."""
         return self._router or bool(self._session.info.routers_zid())
+
+    @property
+    def key_numbers(self) -> NumbersUsed:
+        """What is used of the numbers that the session has for keys."""
+        return key_numbers.used(self._session)
 
     def publish(self, stream: str, cache: int, cache_clouds: int, wanted: Callable[[], None]) -> Outgoing:
         """Open the publishers of a stream; arguments and errors are those of `Outgoing`."""

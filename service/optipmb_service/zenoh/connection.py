@@ -16,9 +16,11 @@ import re
 from typing import TYPE_CHECKING, Final, Protocol, cast
 
 import optipmb_schemas as schemas
+import structlog
 import zenoh
 
 from optipmb_service.runtime.ports import TransportError
+from optipmb_service.zenoh import key_numbers
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,6 +49,9 @@ sent has a thread of its own, so a callback that waits for the lock of the inter
 
 MESSAGE_HEADROOM: Final = 4
 """A message up to this many times the limit is received and answered by a problem; a larger one is dropped by Zenoh."""
+
+
+log = structlog.get_logger("optipmb_service")
 
 
 class _Closed(Protocol):
@@ -82,6 +87,7 @@ def opened(settings: Settings) -> zenoh.Session:
 
 def close(session: zenoh.Session) -> None:
     """Close a session, also one that is closed."""
+    key_numbers.forget(session)
     with contextlib.suppress(zenoh.ZError):
         cast("_Closed", session).close()
 
@@ -90,6 +96,14 @@ def line(error: zenoh.ZError) -> str:
     """Return Zenoh's words without the places in its sources."""
     text = re.sub(r" at /\S+?:\d+\.?", "", str(error))
     return " ".join(text.split()).rstrip(".")[:300]
+
+
+def log_link(event: zenoh.TransportEvent) -> None:
+    """Log that a node or a router has linked to the session, or has gone."""
+    came = event.kind == zenoh.SampleKind.PUT
+    log.info(
+        "peer_connected" if came else "peer_lost", peer=str(event.transport.zid), kind=str(event.transport.whatami)
+    )
 
 
 class Router:

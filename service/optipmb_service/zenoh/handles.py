@@ -19,7 +19,7 @@ from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh.connection import line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
 FULL_S: Final = 0.005
 """How long the thread of the network waits before it looks again for room in a channel."""
@@ -208,6 +208,8 @@ def cached_publisher(
 ) -> Putting:
     """Declare a publisher that keeps its newest messages for subscribers that lost some or come late.
 
+    It needs `key_numbers.CACHED` numbers, which are to be taken before.
+
     Args:
         session: to publish on.
         key: of what is published.
@@ -251,7 +253,7 @@ def publish_problem(session: zenoh.Session, keys: schemas.Keys, problem: schemas
 
 
 class Publisher:
-    """A publisher of Zenoh's own, and the token that goes with it.
+    """A publisher of Zenoh's own, and what else is declared while it is there.
 
     It is withdrawn by letting go of it: what Zenoh calls `undeclare` waits for the heartbeats to end with the lock of
     the interpreter held. While the thread that sends them waits for that lock, the whole process would be blocked
@@ -261,11 +263,11 @@ class Publisher:
     def __init__(
         self,
         publisher: Putting,
-        token: Undeclared | None = None,
+        others: Sequence[Undeclared] = (),
         forget: Callable[[Publisher], None] = lambda _: None,
     ) -> None:
         self._publisher: Putting | None = publisher
-        self._token = token
+        self._others = others
         self._forget = forget
 
     def publish(self, payload: bytes) -> None:
@@ -283,9 +285,9 @@ class Publisher:
             raise TransportError(line(error)) from error
 
     def release(self) -> None:
-        """Withdraw both."""
-        if self._token is not None:
-            undeclare(self._token)
+        """Withdraw all of it."""
+        for other in self._others:
+            undeclare(other)
         self._publisher = None
         self._forget(self)
 

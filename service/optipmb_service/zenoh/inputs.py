@@ -23,6 +23,7 @@ from optipmb_schemas.late_join import CacheQueries, LateJoin
 
 from optipmb_service.runtime.intake import ALL
 from optipmb_service.runtime.ports import TransportError
+from optipmb_service.zenoh import key_numbers
 from optipmb_service.zenoh.connection import line
 from optipmb_service.zenoh.handles import directly, undeclare
 from optipmb_service.zenoh.subscription import ask_cache
@@ -71,7 +72,7 @@ class Topic:
         self._turn = threading.Lock()
         self._closed = False
         self._drained = threading.Event()
-        self._subscribers: dict[str, tuple[str, Undeclared]] = {}
+        self._subscribers: dict[str, tuple[str, Undeclared, Undeclared]] = {}
         self._queries: CacheQueries[zenoh.Sample] = CacheQueries(lambda *query: ask_cache(session, *query))
         self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._hand_over, self._queries.ask, answered)
 
@@ -88,11 +89,13 @@ class Topic:
                 and longer the more is declared already.
 
         Raises:
-            TransportError: the session is closed.
+            TransportError: the session is closed, or has declared all keys that it can.
         """
+        recovers = passing is None and cached
+        taken = key_numbers.take(self._session, key_numbers.CACHED if recovers else key_numbers.PLAIN)
         handler = directly(partial(self._take, self._late_join.take if passing is None else passing))
         try:
-            if passing is None and cached:
+            if recovers:
                 subscriber: Undeclared = zenoh.ext.declare_advanced_subscriber(
                     self._session, key, handler, history=NEWEST, recovery=RECOVERY
                 )
@@ -100,7 +103,7 @@ class Topic:
                 subscriber = self._session.declare_subscriber(key, handler)
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
-        self._subscribers[name] = key, subscriber
+        self._subscribers[name] = key, subscriber, taken
 
     def leave(self, names: Iterable[str]) -> None:
         """Withdraw subscriptions; what came before is handed over. Caches are asked again when their keys come again.
@@ -108,10 +111,11 @@ class Topic:
         While all streams are received, none has gone.
         """
         left = [self._subscribers.pop(name) for name in names]
-        for _, subscriber in left:
+        for _, subscriber, taken in left:
             undeclare(subscriber)
+            undeclare(taken)
         if left and ALL not in self._subscribers:
-            kept = frozenset(key for key, _ in self._subscribers.values())
+            kept = frozenset(key for key, *_ in self._subscribers.values())
             # After what has come, which would be known again.
             self._in_turn(self._late_join.keep, kept)
 
@@ -124,8 +128,9 @@ class Topic:
         # One that does not return is left behind with its thread; whoever closes again goes on with the others.
         with contextlib.suppress(KeyError):
             while True:
-                _, (_, subscriber) = self._subscribers.popitem()
+                _, (_, subscriber, taken) = self._subscribers.popitem()
                 undeclare(subscriber)
+                undeclare(taken)
         self._in_turn(self._end)
         self._drained.wait(timeout)
         self._end()

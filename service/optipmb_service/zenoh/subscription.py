@@ -11,6 +11,7 @@ import zenoh.ext
 from optipmb_schemas.late_join import ANSWER_S, CacheQueries, LateJoin
 
 from optipmb_service.runtime.ports import TransportError
+from optipmb_service.zenoh import key_numbers
 from optipmb_service.zenoh.connection import line
 from optipmb_service.zenoh.handles import Channel, Readers
 
@@ -34,7 +35,7 @@ class Subscription:
         receive: called for each sample, one after the other.
 
     Raises:
-        TransportError: the session is closed.
+        TransportError: the session is closed, or has declared all keys that it can.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class Subscription:
         self._queries: CacheQueries[zenoh.Sample] = CacheQueries(partial(ask_cache, session))
         self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._hand_over, self._queries.ask)
         waiting: Channel[zenoh.Sample] = Channel(CHANNEL)
+        self._taken = key_numbers.take(session, key_numbers.CACHED)
         try:
             subscriber = zenoh.ext.declare_advanced_subscriber(
                 session,
@@ -63,6 +65,7 @@ class Subscription:
     def close(self, timeout: float = CLOSE_S) -> None:
         """End it; what came before is handed over within `timeout` seconds, and nothing afterwards."""
         self._readers.stop(timeout)
+        self._taken.undeclare()
         self._queries.close()
         self._late_join.close()
 

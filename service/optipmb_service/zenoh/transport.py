@@ -9,14 +9,14 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
 
 import optipmb_schemas as schemas
-import structlog
 import zenoh
 import zenoh.ext
 
 from optipmb_service.runtime.ports import Packet, TransportError
+from optipmb_service.zenoh import key_numbers
 from optipmb_service.zenoh.announcements import Announcements
 from optipmb_service.zenoh.client import Client
-from optipmb_service.zenoh.connection import close, line, opened
+from optipmb_service.zenoh.connection import close, line, log_link, opened
 from optipmb_service.zenoh.handles import (
     Channel,
     Publisher,
@@ -49,8 +49,6 @@ TRACKS_CACHE: Final = 50
 
 CACHES_S: Final = 1.0
 """How long the caches may take to answer."""
-
-log = structlog.get_logger("optipmb_service")
 
 
 class Transport:
@@ -241,6 +239,7 @@ class Transport:
 
     def _serve(self, key: str, answer: Callable[[Request], None]) -> None:
         queries = OpenQueries(self._instance)
+        key_numbers.take(self._session, key_numbers.PLAIN)
         queryable = self._session.declare_queryable(key, queries.handler)
         self._readers.add("queries", queryable, queries, answer)
 
@@ -253,7 +252,7 @@ class Transport:
         Raises:
             TransportError: the session is closed.
         """
-        taps: list[Undeclared] = []
+        taps: list[Undeclared] = [key_numbers.take(self._session, 2 * key_numbers.PLAIN)]
 
         def follow(topic: Literal["tracks", "detections"]) -> None:
             def hand_over(samples: Iterable[zenoh.Sample]) -> None:
@@ -267,8 +266,8 @@ class Transport:
             threading.Thread(target=hand_over, args=(subscriber.handler,), name=f"viewer-{topic}", daemon=True).start()
 
         def release() -> None:
-            for subscriber in taps:
-                undeclare(subscriber)
+            for one in taps:
+                undeclare(one)
 
         try:
             follow("tracks")
@@ -294,7 +293,7 @@ class Transport:
         """Log the nodes and routers that this session is linked to, as they come and go."""
         channel: Channel[zenoh.TransportEvent] = Channel(CHANNEL // 16)
         listener = self._session.info.declare_transport_events_listener(channel.handler, history=True)
-        self._readers.add("links", listener, channel, _log_link)
+        self._readers.add("links", listener, channel, log_link)
 
     def _receive(self, sample: zenoh.Sample, key: str, receive: Callable[[Packet], None]) -> None:
         wall_ns, now_ns = time.time_ns(), time.monotonic_ns()
@@ -313,10 +312,11 @@ class Transport:
         """Open the publisher of a stream's tracks and say that this instance tracks it.
 
         Raises:
-            TransportError: the session is closed.
+            TransportError: the session is closed, or has declared all keys that it can.
         """
         # Who subscribes asks the caches, and hears by heartbeats of what it missed: nobody needs a token for that, and
         # each costs the router more the more there are.
+        taken = key_numbers.take(self._session, key_numbers.CACHED)
         publisher = cached_publisher(
             self._session, self._keys.tracks(stream), schemas.Tracks, TRACKS_CACHE, detected=False
         )
@@ -324,10 +324,10 @@ class Transport:
             token = self._session.liveliness().declare_token(self._keys.owner(stream, self._instance))
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
-        with_token = Publisher(publisher, token, self._forget)
+        whole = Publisher(publisher, (token, taken), self._forget)
         with self._lock:
-            self._publishers.add(with_token)
-        return with_token
+            self._publishers.add(whole)
+        return whole
 
     def publish_problem(self, problem: schemas.Problem) -> None:
         """Send a problem on its stream's key; one without a stream has no key and is not sent."""
@@ -390,10 +390,3 @@ class Transport:
 def _name(stream: str, *, cached: bool) -> str:
     """Return the name of a subscription; for a moment there may be one with recovery and one without."""
     return stream if cached else f"{stream} plain"
-
-
-def _log_link(event: zenoh.TransportEvent) -> None:
-    came = event.kind == zenoh.SampleKind.PUT
-    log.info(
-        "peer_connected" if came else "peer_lost", peer=str(event.transport.zid), kind=str(event.transport.whatami)
-    )

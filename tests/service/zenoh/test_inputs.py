@@ -210,6 +210,7 @@ def test_a_topic_is_closed_again_while_a_subscription_does_not_return() -> None:
 
         return SimpleNamespace(undeclare=undeclare)
 
-    topic._subscribers = {name: ("key", subscriber(name)) for name in ("a", "b", "c")}
+    taken: Any = SimpleNamespace(undeclare=lambda: None)
+    topic._subscribers = {name: ("key", subscriber(name), taken) for name in ("a", "b", "c")}
     topic.close(CLOSE_S)
     assert sorted(withdrawn) == ["a", "b", "c"]

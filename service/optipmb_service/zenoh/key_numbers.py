@@ -1,0 +1,78 @@
+"""How many numbers for keys a Zenoh session has used up, of the 65,535 that it has in its life.
+
+Zenoh numbers the keys that a session declares by 16 bits, and gives none of them back. After the last one it begins
+again with the first, whatever that stands for: what the publishers with these numbers send from then on is lost, and
+nobody is told. So whoever declares takes the numbers here first. Long before the last one the process restarts
+(`restart_keys`), and beyond it nothing is declared. Tokens, queries and what only listens to tokens need no number.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from optipmb_service.runtime.ports import TransportError
+
+if TYPE_CHECKING:
+    import zenoh
+
+MOST: Final = 0xFFFF
+
+PLAIN: Final = 1
+"""What a publisher, a subscriber or a queryable takes."""
+CACHED: Final = 2
+"""What a publisher with a cache takes, and a subscriber that recovers what it lost: they also declare `@adv` keys."""
+
+_lock = threading.Lock()
+_used: dict[str, NumbersUsed] = {}
+"""By the id of the session."""
+
+
+@dataclass
+class NumbersUsed:
+    """Numbers of a session: how many are used up, and how many of these stand for something that is there still."""
+
+    up: int = 0
+    now: int = 0
+
+
+class Taken:
+    """Numbers that are in use until `undeclare`, which goes with that of what they were taken for."""
+
+    def __init__(self, used: NumbersUsed, count: int) -> None:
+        self._used = used
+        self._count = count
+
+    def undeclare(self) -> None:
+        """They are in use no longer; again without effect."""
+        with _lock:
+            self._used.now -= self._count
+            self._count = 0
+
+
+def take(session: zenoh.Session, count: int) -> Taken:
+    """Take numbers for what is going to be declared.
+
+    Raises:
+        TransportError: the session has none left.
+    """
+    with _lock:
+        used = _used.setdefault(str(session.zid()), NumbersUsed())
+        if used.up + count > MOST:
+            raise TransportError(f"the network session has declared {MOST} keys, and cannot declare more")
+        used.up += count
+        used.now += count
+    return Taken(used, count)
+
+
+def used(session: zenoh.Session) -> NumbersUsed:
+    """Return how many numbers are used, as of now."""
+    with _lock:
+        return replace(_used.get(str(session.zid()), NumbersUsed()))
+
+
+def forget(session: zenoh.Session) -> None:
+    """Forget a session that is closed."""
+    with _lock:
+        _used.pop(str(session.zid()), None)

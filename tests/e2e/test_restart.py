@@ -1,0 +1,75 @@
+"""A process restarts before its network session runs out of numbers for keys, and its sessions continue."""
+
+from __future__ import annotations
+
+import signal
+from typing import TYPE_CHECKING
+
+import pytest
+from optipmb_schemas import Keys, ResetRequest
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Tracked
+from router import Node, Sensor, plain
+from service_process import ServiceProcess
+
+import optipmb
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+KEYS = Keys()
+NUMBERS = 200
+"""Those of about 50 streams of one process."""
+TOGETHER, MOST = 20, 15
+"""Streams that are open at once, and how often others follow them."""
+FRAMES = 8
+END_S = 60.0
+
+
+def alone(sensor: Sensor, frames: int) -> list[bytes]:
+    """What a session alone makes of the frames."""
+    session = Session(sensor.stream, optipmb.load_profile("generic"))
+    outputs = [output for seq in range(frames) for output in session.on_detections(sensor.detections(seq), 0)]
+    return [plain(output.tracks) for output in outputs if isinstance(output, Tracked)]
+
+
+def come_and_go(endpoint: str, site: int) -> None:
+    """Streams are tracked, and freed; their publisher leaves."""
+    sensors = [Sensor(stream=f"{site}/passing/{number}") for number in range(TOGETHER)]
+    with Node(endpoint) as node:
+        node.send(*(sensor.detections(0) for sensor in sensors))
+        for sensor in sensors:
+            node.tracks(sensor.stream, 1)
+            node.query(KEYS.query(sensor.stream, "reset"), ResetRequest(close=True))
+
+
+@pytest.mark.parametrize(
+    ("options", "event"), [((), "keys_used_up"), (("--workers", "2"), "worker_restarts")], ids=["alone", "workers"]
+)
+def test_streams_that_come_and_go_without_end_have_a_process_restart(
+    tmp_path: Path, options: tuple[str, ...], event: str
+) -> None:
+    """The one that tracks begins again, once: with its id and its endpoint, and with the bytes of one that did not.
+
+    Of several workers it is one that has used up its numbers.
+    """
+    environment = {"OPTIPMB_STORE": str(tmp_path), "OPTIPMB_RESTART_KEYS": str(NUMBERS)}
+    sensor = Sensor(stream="yard/steady/lidar")
+    with ServiceProcess("--instance", "one", *options, environment=environment, fresh=True) as service:
+        ready = service.wait_ready()
+        with Node(service.endpoint) as node:
+            node.send(*(sensor.detections(seq) for seq in range(FRAMES)))
+            node.tracks(sensor.stream, FRAMES)
+            for site in range(MOST):
+                if event in service.errors:
+                    break
+                come_and_go(service.endpoint, site)
+            service.wait_log(event)
+            if not options:
+                assert service.wait_ready() == ready
+            node.send(*(sensor.detections(seq) for seq in range(FRAMES, 2 * FRAMES)))
+            tracks = [plain(one) for one in node.tracks(sensor.stream, 2 * FRAMES)]
+            assert tracks == alone(sensor, 2 * FRAMES)
+        assert service.end(signal.SIGTERM, deadline_s=END_S)[0] == 0
+        assert options or service.errors.count(" keys_used_up ") == 1
+        assert service.output == []
