@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MOST: Final = 0xFFFF
 
 PLAIN: Final = 1
-"""What a publisher, a subscriber or a queryable takes."""
+"""What a publisher, a subscriber, a queryable or a declared key takes."""
 CACHED: Final = 2
 """What a publisher with a cache takes, and a subscriber that recovers what it lost: they also declare `@adv` keys."""
 
@@ -76,3 +76,32 @@ def forget(session: zenoh.Session) -> None:
     """Forget a session that is closed."""
     with _lock:
         _used.pop(str(session.zid()), None)
+
+
+class DeclaredKey:
+    """A key of a stream that is received by a subscription to a pattern.
+
+    Zenoh hands over the messages of a declared key without comparing it with all subscriptions for each of them.
+
+    Args:
+        session: that receives them.
+        key: of the stream.
+
+    Raises:
+        TransportError: the session has no numbers left.
+        zenoh.ZError: it is closed.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._taken = take(session, PLAIN)
+        self._session = session
+        self._key = session.declare_keyexpr(key)
+
+    def undeclare(self) -> None:
+        """Let Zenoh forget the key.
+
+        Raises:
+            zenoh.ZError: the session is closed.
+        """
+        self._taken.undeclare()
+        self._session.undeclare(self._key)

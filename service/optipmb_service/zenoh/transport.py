@@ -309,7 +309,7 @@ class Transport:
         self._alive = self._session.liveliness().declare_token(self._keys.alive(self._instance))
 
     def open_publisher(self, stream: str) -> Publisher:
-        """Open the publisher of a stream's tracks and say that this instance tracks it.
+        """Open the publisher of a stream's tracks, say that this instance tracks it, and declare its inputs' keys.
 
         Raises:
             TransportError: the session is closed, or has declared all keys that it can.
@@ -322,9 +322,11 @@ class Transport:
         )
         try:
             token = self._session.liveliness().declare_token(self._keys.owner(stream, self._instance))
+            keys = (self._keys.detections(stream), self._keys.points(stream)) if self._all else ()
+            inputs = [key_numbers.DeclaredKey(self._session, key) for key in keys]
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
-        whole = Publisher(publisher, (token, taken), self._forget)
+        whole = Publisher(publisher, (token, taken, *inputs), self._forget)
         with self._lock:
             self._publishers.add(whole)
         return whole

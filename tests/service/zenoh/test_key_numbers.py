@@ -12,7 +12,7 @@ from optipmb_service.zenoh import key_numbers
 from optipmb_service.zenoh.connection import close
 from optipmb_service.zenoh.handles import Publisher, cached_publisher, directly
 from optipmb_service.zenoh.inputs import Topic
-from optipmb_service.zenoh.key_numbers import CACHED, MOST, PLAIN
+from optipmb_service.zenoh.key_numbers import CACHED, MOST, PLAIN, DeclaredKey
 from optipmb_service.zenoh.subscription import Subscription
 
 if TYPE_CHECKING:
@@ -48,7 +48,11 @@ def _received_plainly(session: zenoh.Session, key: str) -> Callable[[], object]:
     return lambda: topic.leave([key])
 
 
-@pytest.mark.parametrize("declare", [_published, _received, _received_plainly])
+def _known(session: zenoh.Session, key: str) -> Callable[[], object]:
+    return DeclaredKey(session, key).undeclare
+
+
+@pytest.mark.parametrize("declare", [_published, _received, _received_plainly, _known])
 def test_no_number_is_given_twice(
     session: zenoh.Session, declare: Callable[[zenoh.Session, str], Callable[[], object]]
 ) -> None:
