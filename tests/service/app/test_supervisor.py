@@ -45,7 +45,7 @@ async def test_a_worker_that_ends_in_its_first_start_ends_the_command(
 
 
 @pytest.mark.parametrize(
-    ("status", "orderly"), [(0, True), (-15, True), (-2, True), (1, False), (-9, False), (-11, False)]
+    ("status", "orderly"), [(0, True), (75, True), (-15, True), (-2, True), (1, False), (-9, False), (-11, False)]
 )
 async def test_a_worker_that_is_killed_in_its_end_is_no_orderly_end(
     monkeypatch: pytest.MonkeyPatch, status: int, *, orderly: bool

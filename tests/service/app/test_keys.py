@@ -1,0 +1,43 @@
+"""When a process restarts for the keys that it has declared, and when it does not."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from optipmb_service.app.loops import StopRequest, watch_keys
+from optipmb_service.zenoh.key_numbers import NumbersUsed
+
+NO_BOUND: Any = SimpleNamespace(begin=lambda: True, left=lambda: 60.0)
+"""A real one would end the process of the tests."""
+
+MOST = 1000
+TURNS = 20
+"""Of the loop: more than it takes to look once."""
+
+
+@pytest.mark.parametrize(
+    ("up", "now", "restarts"), [(999, 0, False), (1000, 0, True), (1000, 900, True), (1000, 901, False)]
+)
+async def test_a_process_restarts_where_that_gives_it_numbers(up: int, now: int, *, restarts: bool) -> None:
+    """When enough are used up, and not where what is open would need more than nine of ten of them again."""
+    asked = StopRequest(NO_BOUND)
+    watching = asyncio.create_task(watch_keys(asked, lambda: NumbersUsed(up, now), MOST))
+    for _ in range(TURNS):
+        await asyncio.sleep(0)
+    assert (asked.is_set(), asked.restarts) == (restarts, restarts)
+    watching.cancel()
+
+
+async def test_who_wants_the_end_gets_it() -> None:
+    """A process that was told to end does not restart, whichever of the two came first."""
+    earlier, later = StopRequest(NO_BOUND), StopRequest(NO_BOUND)
+    earlier.ask("SIGTERM")
+    earlier.restart("keys_used_up")
+    later.restart("keys_used_up")
+    assert later.restarts
+    later.ask("SIGTERM")
+    assert not earlier.restarts
+    assert not later.restarts
