@@ -145,7 +145,7 @@ class Rows:
 
 def arrays_of(record: type[Rows], name: str, module: str) -> Any:
     """Return the named tuple in which kernels have the columns of a record, a constant of a module by that name."""
-    return namedtuple(name, [*record.described], module=module)  # noqa: PYI024 - its fields are those of a record
+    return namedtuple(name, [*record.described], module=module)  # noqa: PYI024 - a class would list the columns of the record again
 
 
 def shown(column: object) -> str:

@@ -6,13 +6,10 @@ import signal
 from typing import TYPE_CHECKING
 
 import pytest
+from alone import tracked_alone
 from optipmb_schemas import Keys, ResetRequest
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Tracked
 from router import Node, Sensor, plain
 from service_process import ServiceProcess
-
-import optipmb
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,13 +21,6 @@ TOGETHER, MOST = 20, 15
 """Streams that are open at once, and how often others follow them."""
 FRAMES = 8
 END_S = 60.0
-
-
-def alone(sensor: Sensor, frames: int) -> list[bytes]:
-    """What a session alone makes of the frames."""
-    session = Session(sensor.stream, optipmb.load_profile("generic"))
-    outputs = [output for seq in range(frames) for output in session.on_detections(sensor.detections(seq), 0)]
-    return [plain(output.tracks) for output in outputs if isinstance(output, Tracked)]
 
 
 def come_and_go(endpoint: str, site: int) -> None:
@@ -69,7 +59,7 @@ def test_streams_that_come_and_go_without_end_have_a_process_restart(
                 assert service.wait_ready() == ready
             node.send(*(sensor.detections(seq) for seq in range(FRAMES, 2 * FRAMES)))
             tracks = [plain(one) for one in node.tracks(sensor.stream, 2 * FRAMES)]
-            assert tracks == alone(sensor, 2 * FRAMES)
+            assert tracks == tracked_alone(sensor, 2 * FRAMES)
         assert service.end(signal.SIGTERM, deadline_s=END_S)[0] == 0
         assert options or service.errors.count(" keys_used_up ") == 1
         assert service.output == []

@@ -8,21 +8,17 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
+from alone import tracked_alone
 from commands import run_here
 from optipmb_schemas import Keys, MoveRequest, ServiceStatus, Tracks, decode
-from optipmb_service.session.session import Session
-from optipmb_service.session.values import Tracked
 from processes import descendants, wait_until_ended
 from router import Node, Sensor, plain, until
 from service_process import ServiceProcess
-
-import optipmb
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 KEYS = Keys()
-DEFAULT = optipmb.load_profile("generic")
 STREAMS = [f"yard/node-{number}/lidar" for number in range(6)]
 FRAMES = 12
 DEADLINE_S = 60.0
@@ -80,13 +76,6 @@ def pid_of(service: ServiceProcess, worker: int) -> int:
     return int(line.partition("pid=")[2].split()[0])
 
 
-def alone(sensor: Sensor, frames: int) -> list[bytes]:
-    """What a session alone makes of the frames."""
-    session = Session(sensor.stream, DEFAULT)
-    outputs = [output for seq in range(frames) for output in session.on_detections(sensor.detections(seq), 0)]
-    return [plain(output.tracks) for output in outputs if isinstance(output, Tracked)]
-
-
 def test_workers_share_the_streams(service: ServiceProcess) -> None:
     """Every stream is tracked by one worker, with the bytes that one process would give.
 
@@ -99,7 +88,7 @@ def test_workers_share_the_streams(service: ServiceProcess) -> None:
         for seq in range(FRAMES):
             node.send(*(sensor.detections(seq) for sensor in sensors))
         for sensor in sensors:
-            assert [plain(message) for message in node.tracks(sensor.stream, FRAMES)] == alone(sensor, FRAMES)
+            assert [plain(message) for message in node.tracks(sensor.stream, FRAMES)] == tracked_alone(sensor, FRAMES)
         status = status_when(node, lambda status: status.frames >= FRAMES * len(STREAMS))
         assert status.state == "ready"
         parts = [node.ask(KEYS.status(f"pair-w{index}"), ServiceStatus) for index in range(2)]
@@ -133,7 +122,7 @@ def goes_on(node: Node, sensor: Sensor, seq: int) -> None:
     node.send(sensor.detections(seq))
     arrived(node, sensor.stream, seq)
     newest = [plain(message) for message in node.tracks(sensor.stream, seq + 1) if message.seq == seq]
-    assert newest[-1] == alone(sensor, seq + 1)[seq]
+    assert newest[-1] == tracked_alone(sensor, seq + 1)[seq]
 
 
 def test_the_streams_of_a_killed_worker_go_on(service: ServiceProcess) -> None:
@@ -178,7 +167,7 @@ def test_a_stream_can_be_moved(service: ServiceProcess) -> None:
             node.send(*(sensor.detections(seq) for seq in range(number * FRAMES, (number + 1) * FRAMES)))
             status_when(node, lambda status: workers_of(status).get(sensor.stream) == target)  # noqa: B023 - called here
         received = node.tracks(sensor.stream, 3 * FRAMES)
-        assert [plain(message) for message in received] == alone(sensor, 3 * FRAMES)
+        assert [plain(message) for message in received] == tracked_alone(sensor, 3 * FRAMES)
         problem = node.refused(KEYS.move("pair"), MoveRequest(stream=sensor.stream, worker=2))
         assert (problem.path, problem.received) == ("worker", "2")
 

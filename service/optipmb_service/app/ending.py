@@ -184,7 +184,7 @@ def leave_or_restart(status: int) -> None:
     if status == RESTART:
         sys.stdout.flush()
         sys.stderr.flush()
-        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - what this process was started with
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - the command line of this process itself
     leave(status)
 
 

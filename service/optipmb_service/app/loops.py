@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from optipmb_service.app.ending import EndBound
-    from optipmb_service.zenoh.key_numbers import NumbersUsed
+    from optipmb_service.zenoh.key_numbers import KeyCount
 
 SWITCH_S: Final = 0.0005
 """By default it is ten times as long, and a frame that meets two other threads waits 10 ms."""
@@ -114,7 +114,7 @@ async def beat(health: Heartbeat) -> None:
         await asyncio.sleep(BEAT_S)
 
 
-async def watch_keys(asked: StopRequest, used: Callable[[], NumbersUsed], most: int) -> None:
+async def watch_keys(asked: StopRequest, used: Callable[[], KeyCount], most: int) -> None:
     """Have the process begin again before its network session has no number for keys any more.
 
     It does not where that would give it few: what is open when it ends needs as many again.
@@ -126,8 +126,8 @@ async def watch_keys(asked: StopRequest, used: Callable[[], NumbersUsed], most: 
     """
     while not asked.is_set():
         keys = used()
-        if keys.up >= most and keys.up - keys.now >= GAINED * most:
-            log.warning("keys_used_up", declared=keys.up, open=keys.now)
+        if keys.declared >= most and keys.declared - keys.open >= GAINED * most:
+            log.warning("keys_used_up", declared=keys.declared, open=keys.open)
             asked.restart("keys_used_up")
         await asked.wait(KEYS_S)
 

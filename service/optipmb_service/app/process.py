@@ -67,7 +67,7 @@ async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHe
         client = await unless(asked, lambda: Client.opened(settings))
         if client is None:
             return None
-        health.metrics.add(lambda: [("declared_keys_total", (), client.key_numbers.up)])
+        health.metrics.add(lambda: [("declared_keys_total", (), client.key_numbers.declared)])
         watching = asyncio.create_task(watch_keys(asked, lambda: client.key_numbers, settings.restart_keys))
         try:
             await serve(asked, health, client)

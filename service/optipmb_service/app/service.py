@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.settings.model import Settings
     from optipmb_service.zenoh.client import Client
-    from optipmb_service.zenoh.key_numbers import NumbersUsed
+    from optipmb_service.zenoh.key_numbers import KeyCount
 
 log = structlog.get_logger("optipmb_service")
 
@@ -196,7 +196,7 @@ class Service:
         return ended and kept and not unfinished
 
     @property
-    def key_numbers(self) -> NumbersUsed:
+    def key_numbers(self) -> KeyCount:
         """What is used of the numbers that its network session has for keys."""
         return self.client().key_numbers
 
@@ -297,7 +297,7 @@ class Service:
             standing_by=self._intake.standing_by,
             now_ns=time.monotonic_ns(),
         )
-        yield "declared_keys_total", (), self.key_numbers.up
+        yield "declared_keys_total", (), self.key_numbers.declared
         yield from collectors.of_sessions(sessions)
         yield from collectors.of_densities(densities)
         yield from collectors.of_streams(sessions, self._settings.http_streams)

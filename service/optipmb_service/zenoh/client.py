@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.settings.model import Settings
     from optipmb_service.zenoh.handles import Putting
-    from optipmb_service.zenoh.key_numbers import NumbersUsed
+    from optipmb_service.zenoh.key_numbers import KeyCount
 
 
 class _Matching(Protocol):
@@ -152,7 +152,7 @@ class Client:
         return self._router or bool(self._session.info.routers_zid())
 
     @property
-    def key_numbers(self) -> NumbersUsed:
+    def key_numbers(self) -> KeyCount:
         """What is used of the numbers that the session has for keys."""
         return key_numbers.used(self._session)
 

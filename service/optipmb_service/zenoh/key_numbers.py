@@ -25,29 +25,29 @@ CACHED: Final = 2
 """What a publisher with a cache takes, and a subscriber that recovers what it lost: they also declare `@adv` keys."""
 
 _lock = threading.Lock()
-_used: dict[str, NumbersUsed] = {}
+_used: dict[str, KeyCount] = {}
 """By the id of the session."""
 
 
 @dataclass
-class NumbersUsed:
-    """Numbers of a session: how many are used up, and how many of these stand for something that is there still."""
+class KeyCount:
+    """How many keys a session has declared in its life, and how many of these are declared still."""
 
-    up: int = 0
-    now: int = 0
+    declared: int = 0
+    open: int = 0
 
 
 class Taken:
     """Numbers that are in use until `undeclare`, which goes with that of what they were taken for."""
 
-    def __init__(self, used: NumbersUsed, count: int) -> None:
+    def __init__(self, used: KeyCount, count: int) -> None:
         self._used = used
         self._count = count
 
     def undeclare(self) -> None:
-        """They are in use no longer; again without effect."""
+        """Count them as used up and no longer in use; calling it again has no effect."""
         with _lock:
-            self._used.now -= self._count
+            self._used.open -= self._count
             self._count = 0
 
 
@@ -58,18 +58,18 @@ def take(session: zenoh.Session, count: int) -> Taken:
         TransportError: the session has none left.
     """
     with _lock:
-        used = _used.setdefault(str(session.zid()), NumbersUsed())
-        if used.up + count > MOST:
+        used = _used.setdefault(str(session.zid()), KeyCount())
+        if used.declared + count > MOST:
             raise TransportError(f"the network session has declared {MOST} keys, and cannot declare more")
-        used.up += count
-        used.now += count
+        used.declared += count
+        used.open += count
     return Taken(used, count)
 
 
-def used(session: zenoh.Session) -> NumbersUsed:
-    """Return how many numbers are used, as of now."""
+def used(session: zenoh.Session) -> KeyCount:
+    """Return how many keys the session has declared, as of now."""
     with _lock:
-        return replace(_used.get(str(session.zid()), NumbersUsed()))
+        return replace(_used.get(str(session.zid()), KeyCount()))
 
 
 def forget(session: zenoh.Session) -> None:

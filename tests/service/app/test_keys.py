@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from optipmb_service.app.loops import StopRequest, watch_keys
-from optipmb_service.zenoh.key_numbers import NumbersUsed
-
-NO_BOUND: Any = SimpleNamespace(begin=lambda: True, left=lambda: 60.0)
-"""A real one would end the process of the tests."""
+from optipmb_service.zenoh.key_numbers import KeyCount
+from unbounded import NO_BOUND
 
 MOST = 1000
 TURNS = 20
@@ -19,12 +15,18 @@ TURNS = 20
 
 
 @pytest.mark.parametrize(
-    ("up", "now", "restarts"), [(999, 0, False), (1000, 0, True), (1000, 900, True), (1000, 901, False)]
+    ("keys", "restarts"),
+    [
+        (KeyCount(999, 0), False),
+        (KeyCount(1000, 0), True),
+        (KeyCount(1000, 900), True),
+        (KeyCount(1000, 901), False),
+    ],
 )
-async def test_a_process_restarts_where_that_gives_it_numbers(up: int, now: int, *, restarts: bool) -> None:
+async def test_a_process_restarts_where_that_gives_it_numbers(keys: KeyCount, *, restarts: bool) -> None:
     """When enough are used up, and not where what is open would need more than nine of ten of them again."""
     asked = StopRequest(NO_BOUND)
-    watching = asyncio.create_task(watch_keys(asked, lambda: NumbersUsed(up, now), MOST))
+    watching = asyncio.create_task(watch_keys(asked, lambda: keys, MOST))
     for _ in range(TURNS):
         await asyncio.sleep(0)
     assert (asked.is_set(), asked.restarts) == (restarts, restarts)

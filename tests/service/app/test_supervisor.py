@@ -15,12 +15,10 @@ from optipmb_service.app.ending import EndBound
 from optipmb_service.app.loops import StopRequest
 from optipmb_service.app.supervisor import Supervisor, _supervised
 from optipmb_service.settings.loading import load
+from unbounded import NO_BOUND
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-
-NO_BOUND: Any = SimpleNamespace(begin=lambda: True, left=lambda: 60.0)
-"""A real one would end the process of the tests."""
 
 
 @pytest.mark.parametrize(("status", "failed"), [(-9, 1), (0, 1), (3, 3)])

@@ -28,7 +28,7 @@ def session() -> Iterator[zenoh.Session]:
     session = zenoh.open(config)
     yield session
     close(session)
-    assert key_numbers.used(session).up == 0
+    assert key_numbers.used(session).declared == 0
 
 
 def _published(session: zenoh.Session, key: str) -> Callable[[], object]:
@@ -75,8 +75,8 @@ def test_no_number_is_given_twice(
     with pytest.raises(TransportError, match="65535 keys"):
         come_and_go()
     used = key_numbers.used(session)
-    assert MOST - CACHED < used.up <= MOST
-    assert used.now == PLAIN + CACHED
+    assert MOST - CACHED < used.declared <= MOST
+    assert used.open == PLAIN + CACHED
     early.put(b"late")
     assert received == [b"late"]
     del subscriber
@@ -86,9 +86,9 @@ def test_numbers_are_in_use_until_what_has_them_is_withdrawn(session: zenoh.Sess
     """Withdrawn again, nothing is given back twice; those that are used up stay so."""
     subscription = Subscription(session, "some/**", lambda _: None)
     key = key_numbers.take(session, PLAIN)
-    assert (key_numbers.used(session).up, key_numbers.used(session).now) == (CACHED + PLAIN, CACHED + PLAIN)
+    assert (key_numbers.used(session).declared, key_numbers.used(session).open) == (CACHED + PLAIN, CACHED + PLAIN)
     key.undeclare()
     key.undeclare()
-    assert key_numbers.used(session).now == CACHED
+    assert key_numbers.used(session).open == CACHED
     subscription.close()
-    assert (key_numbers.used(session).up, key_numbers.used(session).now) == (CACHED + PLAIN, 0)
+    assert (key_numbers.used(session).declared, key_numbers.used(session).open) == (CACHED + PLAIN, 0)
