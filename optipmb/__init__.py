@@ -20,7 +20,7 @@ Pure computation: no files but the profiles, no network, no state outside the de
 """
 
 from optipmb.class_names import class_indices, common_name
-from optipmb.columns import columns_of, density_of
+from optipmb.columns import bytes_of, columns_in, columns_of, density_of
 from optipmb.density import Bernoullis, Density, Poissons
 from optipmb.errors import DensityError, EffortError, FrameError, OptipmbError, ParameterError
 from optipmb.extract import Tracks
@@ -75,7 +75,9 @@ __all__ = [
     "Tracker",
     "Tracks",
     "bev_iou",
+    "bytes_of",
     "class_indices",
+    "columns_in",
     "columns_of",
     "common_name",
     "density_of",

@@ -1,4 +1,4 @@
-"""A density as named arrays and back, so that it can be stored; what is read back is checked.
+"""A density as named arrays or as bytes, and back, so that it can be stored; what is read back is checked.
 
 Names are `bernoulli.mean`, `poisson.weight` and so on; the two scalars of a density are kept beside them.
 """
@@ -80,6 +80,53 @@ def columns_of(density: Density) -> dict[str, NDArray[Any]]:
     return columns if density.class_probability is None else columns | {CLASSES: density.class_probability}
 
 
+def bytes_of(density: Density) -> dict[str, bytes]:
+    """Return the arrays of a density as bytes, one string for each part; `columns_in` reads them.
+
+    A number takes 8 bytes, the least significant first. The columns of a part lie one behind the other in the order of
+    `columns_of`, and a flag is the integer 0 or 1. Equal densities give equal bytes.
+    """
+    parts = {"bernoulli": density.bernoulli.words, "poisson": density.poisson.words}
+    if density.misses is not None:
+        parts["misses"] = density.misses.words
+    if density.class_probability is not None:
+        parts["classes"] = density.class_probability
+    return {part: words.astype("<f8", copy=False).tobytes() for part, words in parts.items()}
+
+
+def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[Any]]:
+    """Return the named arrays that bytes hold: what `columns_of` gives for the density of which `bytes_of` made them.
+
+    Args:
+        parts: `bernoulli` and `poisson`, and `misses` and `classes` where the density has them.
+        classes: of the parameters that the density belongs to.
+
+    Raises:
+        DensityError: a part is missing, is not whole rows, or has a flag that is neither 0 nor 1.
+    """
+    columns: dict[str, NDArray[Any]] = {}
+    for kind in (Bernoullis, Poissons, Misses):
+        if kind is not Misses or kind.part in parts:
+            rows = kind.of(_words(parts, kind.part, kind.width))
+            columns |= {f"{kind.part}.{name}": column for name, column in rows.columns()}
+            for name, one in kind.described.items():
+                flags = rows.words.view(np.int64)[one.begin * len(rows) : one.end * len(rows)]
+                if one.number == np.bool_ and not ((flags == 0) | (flags == 1)).all():
+                    raise DensityError(f"{kind.part}.{name}", "flags, 0 or 1", "another number")
+    if "classes" in parts:
+        columns[CLASSES] = _words(parts, "classes", classes).reshape(-1, classes)
+    return columns
+
+
+def _words(parts: Mapping[str, bytes], part: str, width: int) -> Array:
+    """Return the numbers of a part, of which each row has `width`."""
+    data = parts.get(part)
+    if not isinstance(data, bytes) or len(data) % (8 * width):
+        received = f"{len(data)} bytes" if isinstance(data, bytes) else type(data).__name__
+        raise DensityError(part, f"bytes, {8 * width} for each row", received)
+    return np.frombuffer(data, "<f8").astype(np.float64, copy=False)
+
+
 def density_of(
     stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: tuple[str, ...], *, earlier: bool = False
 ) -> Density:
@@ -88,7 +135,7 @@ def density_of(
     Args:
         stamp_ns: stamp of its last frame.
         next_id: id of the next new track.
-        columns: what `columns_of` gave.
+        columns: what `columns_of` or `columns_in` gave.
         labels: names of the classes of the parameters that it belongs to.
         earlier: whether an earlier version may have stored it; columns that it lacks are then filled with zeros.
 

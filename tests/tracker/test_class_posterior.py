@@ -183,10 +183,12 @@ def test_labels_are_forgotten() -> None:
 
 
 def test_a_density_is_stored_with_its_posterior() -> None:
-    """Columns make the same density again; wrong ones are refused by name; without groups there is no such column."""
+    """Bytes make the same density again; wrong columns are refused by name; without groups there is no such column."""
     parameters = motor()
     density = run(parameters, [seen(parameters, 0.0, ("bus", 20.0, 0.9), ("car", 60.0, 0.7))])[0].density
-    columns = optipmb.columns_of(density)
+    columns = optipmb.columns_in(optipmb.bytes_of(density), len(LABELS))
+    for name, column in optipmb.columns_of(density).items():
+        np.testing.assert_array_equal(columns[name], column, err_msg=name)
     again = optipmb.density_of(density.stamp_ns, density.next_id, columns, LABELS)
     np.testing.assert_array_equal(again.class_probability, density.class_probability)
     good = columns["classes.probability"]

@@ -349,7 +349,7 @@ def test_misses_are_stored_with_the_density() -> None:
     density = tracker.step(tracker.initial(), boxes(KITTI, 0.0, (20, 0))).density
     assert density.misses is None
     density = tracker.step(density, boxes(KITTI, 0.1, field_of_view=BACKWARD)).density
-    columns = optipmb.columns_of(density)
+    columns = optipmb.columns_in(optipmb.bytes_of(density), len(density.labels))
     again = optipmb.density_of(density.stamp_ns, density.next_id, columns, density.labels)
     assert again.misses is not None
     assert (again.misses.missed_from_ns.tolist(), again.misses.looked_ns.tolist()) == ([100_000_000], [0])

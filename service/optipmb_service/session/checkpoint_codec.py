@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
     from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, Recorded, SensorState
 
-VERSION: Final = 4
+VERSION: Final = 5
 MAGIC: Final = b"OPTIPMB\0"
 DIGEST: Final = 16
 HEAD: Final = len(MAGIC) + 2 + DIGEST
@@ -166,7 +166,7 @@ def _state(state: FilterState) -> dict[str, Any]:
     return {
         "stamp_ns": density.stamp_ns,
         "next_id": density.next_id,
-        "density": schemas.pack_columns(optipmb.columns_of(density)),
+        "density": optipmb.bytes_of(density),
         "session": state.session,
         "starts": state.starts,
         "generation": state.generation,

@@ -29,6 +29,8 @@ FUSED: Final = 3
 """The version since which a session may have several sensors."""
 PACKED: Final = 4
 """The version since which a profile is bytes, which sessions with the same one need not make again."""
+WORDS: Final = 5
+"""The version since which a density is the bytes of its arrays; before it had a block for each column."""
 MAX_LABEL: Final = 64
 """Characters of a class name, as messages take it."""
 
@@ -58,7 +60,12 @@ def _read_3(body: Document) -> Checkpoint:
 
 
 def _read_4(body: Document) -> Checkpoint:
+    """Read version 4, whose densities have a block for each column."""
     return _read(body, 4)
+
+
+def _read_5(body: Document) -> Checkpoint:
+    return _read(body, 5)
 
 
 def _read(body: Document, version_: int) -> Checkpoint:
@@ -143,9 +150,10 @@ def _read_recorded(one: Document, stream: str | None, parameters: optipmb.Parame
 
 
 def _read_state(one: Document, stream: str, parameters: optipmb.Parameters, version_: int) -> FilterState:
-    columns = schemas.read_columns(one.map("density"))
+    stored, labels = one.map("density"), parameters.labels
+    columns = optipmb.columns_in(stored, len(labels)) if version_ >= WORDS else schemas.read_columns(stored)
     stamp_ns, next_id = one.whole("stamp_ns", low=-1), one.whole("next_id", high=MAX_COUNT)
-    density = optipmb.density_of(stamp_ns, next_id, columns, parameters.labels, earlier=version_ == 1)
+    density = optipmb.density_of(stamp_ns, next_id, columns, labels, earlier=version_ == 1)
     session = one.identity("session")
     convert.density_of(density, stream=stream, session=session, parameters=parameters)  # it can be asked for
     if version_ < FUSED:
@@ -197,5 +205,11 @@ def _read_sensor_state(one: Document) -> SensorState:
     )
 
 
-READERS: Final[dict[int, Callable[[Document], Checkpoint]]] = {1: _read_1, 2: _read_2, 3: _read_3, 4: _read_4}
+READERS: Final[dict[int, Callable[[Document], Checkpoint]]] = {
+    1: _read_1,
+    2: _read_2,
+    3: _read_3,
+    4: _read_4,
+    5: _read_5,
+}
 """What reads the body of each version."""

@@ -241,10 +241,18 @@ def _set_profile(body: Any, **changes: Any) -> None:
     body["parameters"] = msgpack.packb(msgpack.unpackb(body["parameters"]) | changes)
 
 
-def _set(body: Any, column: str, value: float) -> None:
-    block = body["head"]["density"][column]
-    assert block["data"]
-    block["data"] = struct.pack("<d", value) + block["data"][8:]
+def _set(body: Any, column: str, number: bytes) -> None:
+    """Write the first number of a column of the objects."""
+    density = body["head"]["density"]
+    objects = bytearray(density["bernoulli"])
+    at = optipmb.Bernoullis.described[column].begin * len(objects) // optipmb.Bernoullis.width
+    assert objects
+    objects[at : at + 8] = number
+    density["bernoulli"] = bytes(objects)
+
+
+def _set_real(body: Any, column: str, value: float) -> None:
+    _set(body, column, struct.pack("<d", value))
 
 
 @pytest.mark.parametrize(
@@ -253,8 +261,13 @@ def _set(body: Any, column: str, value: float) -> None:
         (lambda body: body.pop("base"), "base"),
         (lambda body: body.update(stream="nowhere"), "stream"),
         (lambda body: body["head"].update(next_id=0), "next_id"),
-        (lambda body: body["head"]["density"].pop("bernoulli.mean"), "bernoulli.mean"),
-        (lambda body: body["head"]["density"]["bernoulli.mean"].update(shape=[1, 6]), "bernoulli.mean.data"),
+        (lambda body: body["head"]["density"].pop("bernoulli"), "bernoulli: expected bytes, 448 for each row"),
+        (lambda body: body["head"]["density"].update(bernoulli=[]), "bernoulli: expected bytes, 448 for each row"),
+        (lambda body: body["head"]["density"].update(poisson=b"0" * 391), "poisson: expected bytes, 392 for each row"),
+        (lambda body: body["head"]["density"].update(misses=b"0" * 16), "misses"),
+        (lambda body: body["head"]["density"].update(classes=b"0" * 8), "classes"),
+        (lambda body: _set(body, "extracted", (2).to_bytes(8, "little")), "bernoulli.extracted: expected flags"),
+        (lambda body: _set(body, "confirmed", (256).to_bytes(8, "little")), "bernoulli.confirmed: expected flags"),
         (lambda body: _set_profile(body, nominal_period=-1), "nominal_period"),
         (lambda body: body["window"][0].update(detections=b"no"), "msgpack"),
         (lambda body: body["window"].append(body["window"][0]), "window"),
@@ -275,8 +288,8 @@ def _set(body: Any, column: str, value: float) -> None:
         (lambda body: body.update(fused=True), "sensors"),
         (lambda body: body["head"].update(sensors=body["head"]["sensors"] * 65), "sensors"),
         (lambda body: body["head"].update(stamp_ns=0), "born_ns"),
-        (lambda body: _set(body, "bernoulli.existence", -0.5), "bernoulli.existence"),
-        (lambda body: _set(body, "bernoulli.score", 1.5), "bernoulli.score"),
+        (lambda body: _set_real(body, "existence", -0.5), "bernoulli.existence"),
+        (lambda body: _set_real(body, "score", 1.5), "bernoulli.score"),
         (lambda body: body.update(stream="another/node/lidar"), "a frame of another/node/lidar"),
     ],
 )
