@@ -37,6 +37,9 @@ STATE: Final = 6
 NO_FRAME: Final = -1
 """`Density.stamp_ns` before the first frame."""
 
+FROM_LAST_DETECTION: Final = np.zeros(0, np.int64)
+"""In place of stamps from which misses count, where every frame looks at all objects."""
+
 
 class Bernoullis(Rows):
     """The detected potential objects.
@@ -144,6 +147,17 @@ def objects_in(words: Array) -> Bernoullis:
 
 
 @kernel
+def misses_counted_from(objects: Bernoullis, missed_from_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the stamps (N,) from which the misses of objects count; x_cnt is their distance to now.
+
+    Args:
+        objects: the columns of the objects.
+        missed_from_ns: `Density.missed_from_ns`.
+    """
+    return missed_from_ns if missed_from_ns.shape[0] > 0 else objects.seen_ns
+
+
+@kernel
 def components_in(words: Array) -> Poissons:
     """Return the columns of the array of `Poissons`, which are views of it."""
     n = words.shape[0] // COMPONENT
@@ -184,8 +198,8 @@ class Density:
 
     @property
     def missed_from_ns(self) -> NDArray[np.int64]:
-        """Stamps (N,) from which the misses of the objects count; x_cnt is their distance to now."""
-        return self.bernoulli.seen_ns if self.misses is None else self.misses.missed_from_ns
+        """Stamps (N,) from which the misses of the objects count; (0,) where that is their last detection."""
+        return FROM_LAST_DETECTION if self.misses is None else self.misses.missed_from_ns
 
     @classmethod
     def empty(cls, labels: tuple[str, ...], next_id: int = 1) -> Density:

@@ -9,7 +9,19 @@ import numpy as np
 
 from optipmb.calibration import calibrate_rows
 from optipmb.compiled import kernel
-from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, copy_state, objects_in, whole_periods
+from optipmb.density import (
+    OMEGA,
+    PHI,
+    STATE,
+    A,
+    V,
+    X,
+    Y,
+    copy_state,
+    misses_counted_from,
+    objects_in,
+    whole_periods,
+)
 from optipmb.errors import FrameError
 from optipmb.heading import doubt, sign_probability
 from optipmb.position_noise import PLAIN
@@ -122,7 +134,7 @@ def extract(
 
     Args:
         bernoulli: the posterior, not yet given away.
-        missed_from_ns: (N,) stamps from which misses count.
+        missed_from_ns: `Density.missed_from_ns` of the posterior.
         measurement: (N,) measurement of each object, negative where missed.
         measurements: Z_k.
         stamp_ns: stamp of the frame.
@@ -159,7 +171,9 @@ def extract_tracks(
     Arguments as in `extract`; `object_words` is the array of the posterior.
     """
     objects, z = objects_in(object_words), Measurements(*measurements)
-    rows = select_tracks(objects, missed_from_ns, stamp_ns, two_thresholds, period, classes)
+    rows = select_tracks(
+        objects, misses_counted_from(objects, missed_from_ns), stamp_ns, two_thresholds, period, classes
+    )
     count = rows.shape[0]
     words, state = np.empty(count * TRACK), np.empty((count, STATE))
     tracks = tracks_in(words)

@@ -280,14 +280,13 @@ def frame_of_checked(
         heading = heading @ rotation[:2, :2].T
         yaw = np.arctan2(heading[:, 1], heading[:, 0])
         velocity = velocity @ rotation[:2, :2].T
-
     spread = None if position_covariance is None else horizontal_covariance(position_covariance, rotation)
-
     names = parameters.labels
     known = class_indices(labels, names)[label]
     score = calibrate_scores(parameters, known, score)
-    source = ((known >= 0) & (score > 0.0)).nonzero()[0]
-    if source.shape[0] < m:
+    source = _every_row(m)
+    if m and (known[known.argmin()] < 0 or not score[score.argmin()] > 0.0):
+        source = ((known >= 0) & (score > 0.0)).nonzero()[0]
         center, size, yaw, velocity = center[source], size[source], yaw[source], velocity[source]
         score, known = score[source], known[source]
         spread = None if spread is None else spread[source]
@@ -304,6 +303,12 @@ def frame_of_checked(
     frame = object.__new__(Frame)
     frame.__dict__.update(zip(Frame.__dataclass_fields__, (stamp_ns, *columns, *rest), strict=True))
     return frame, m - source.shape[0]
+
+
+@lru_cache(64)
+def _every_row(count: int) -> NDArray[np.int64]:
+    """Return the rows of so many objects of which none is left out."""
+    return read_only(np.arange(count))
 
 
 @lru_cache(64)

@@ -18,6 +18,7 @@ from optipmb.density import (
     Density,
     Poissons,
     components_in,
+    misses_counted_from,
     objects_in,
     whole_periods,
 )
@@ -102,7 +103,7 @@ def predict_density(
 
     Args:
         object_words: array of `Bernoullis`.
-        missed_from_ns: (N,) stamps from which the misses of the objects count.
+        missed_from_ns: `Density.missed_from_ns`.
         component_words: array of `Poissons`.
         dt: time to predict over, s, positive.
         before_ns: stamp of the density.
@@ -125,7 +126,8 @@ def predict_density(
 
     old = objects_in(object_words)
     seen_from_ns = before_ns if dt <= LONGEST_STEP_S else stamp_ns
-    kept = rows_within(old.label, missed_from_ns, seen_from_ns, False, stamp_ns, period, classes)
+    since_ns = misses_counted_from(old, missed_from_ns)
+    kept = rows_within(old.label, since_ns, seen_from_ns, False, stamp_ns, period, classes)
     predicted = np.empty(kept.shape[0] * OBJECT)
     new = objects_in(predicted)
     repaired = predict_rows(kept, old, old.existence, new, new.existence, survival, dt, classes)

@@ -12,7 +12,16 @@ from optipmb.birth import first_detected_states
 from optipmb.births_beside import forbid_births
 from optipmb.class_posterior import UNGROUPED, update_classes
 from optipmb.compiled import kernel
-from optipmb.density import NO_FRAME, OBJECT, Bernoullis, Density, Poissons, components_in, objects_in
+from optipmb.density import (
+    NO_FRAME,
+    OBJECT,
+    Bernoullis,
+    Density,
+    Poissons,
+    components_in,
+    misses_counted_from,
+    objects_in,
+)
 from optipmb.detection_probability import detection_probability, over_time
 from optipmb.effort import UNLIMITED, check_effort
 from optipmb.errors import FrameError
@@ -50,10 +59,10 @@ if TYPE_CHECKING:
 def update(
     object_words: Array,
     class_probability: Array,
-    p_d: Array,
+    detection: Array,
+    by_class: bool,
     missed_from_ns: Index,
     component_words: Array,
-    p_d_poisson: Array,
     n_predicted: int,
     measurements: Columns,
     dt: float,
@@ -70,11 +79,11 @@ def update(
     Args:
         object_words: array of the predicted objects.
         class_probability: (N, C) their class posteriors, (0, 0) where no classes have a group in common.
-        p_d: (N,) their detection probabilities.
-        missed_from_ns: (N,) stamps from which their misses count.
+        detection: (N + J,) detection probabilities of the objects and, behind them, of the components.
+        by_class: whether it has those of the classes instead, (C,).
+        missed_from_ns: `Density.missed_from_ns` of the prediction.
         component_words: array of the predicted Poisson components; behind them, without HABM, are those of the
             measurements.
-        p_d_poisson: (J,) their detection probabilities.
         n_predicted: how many of them were predicted.
         measurements: Z_k.
         dt: s since the frame before.
@@ -92,6 +101,10 @@ def update(
     """
     z = Measurements(*measurements)
     objects, components = objects_in(object_words), components_in(component_words)
+    since_ns, count = misses_counted_from(objects, missed_from_ns), objects.label.shape[0]
+    p_d, p_d_poisson = detection[:count], detection[count:]
+    if by_class:
+        p_d, p_d_poisson = detection[objects.label], detection[components.label]
 
     # Local hypotheses: missed, detected, first-time detected; HABM
     hypotheses = local_hypotheses(
@@ -101,8 +114,8 @@ def update(
     # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
     row, measurement, cost = hypotheses.row, hypotheses.measurement, hypotheses.detection_cost
     assigned = associate(row, measurement, cost, hypotheses.first_cost, p_d.shape[0])
-    forbid_births(objects, assigned, hypotheses, z, missed_from_ns, stamp_ns, period, classes)
-    kept = surviving_objects(objects, p_d, assigned, hypotheses, z.label, missed_from_ns, stamp_ns, period, classes)
+    forbid_births(objects, assigned, hypotheses, z, since_ns, stamp_ns, period, classes)
+    kept = surviving_objects(objects, p_d, assigned, hypotheses, z.label, since_ns, stamp_ns, period, classes)
 
     # Motion states: detected and missed objects by the UKF, then the births of first-time detections
     known, words = kept.known, np.empty(kept.row.shape[0] * OBJECT)
@@ -223,6 +236,7 @@ class Tracker:
         self.modules = modules if modules is not None else Modules()
         self._labels = parameters.labels
         self._table = ClassTable.of(parameters)
+        self._detection = self._table["detection"].copy()
         self._horizons = np.array(parameters.horizons, np.float64)
 
     def initial(self, next_id: int = 1) -> Density:
@@ -260,7 +274,8 @@ class Tracker:
             poisson = with_measurement_births(poisson, measurements, now, table)
         looks, poisson = look(frame.field_of_view, predicted, poisson, density.stamp_ns, table)
         cloud = frame.cloud if modules.adp else None
-        p_d, p_d_poisson = self._detection_probabilities(bernoulli, poisson, cloud, looks, dt)
+        by_class = cloud is None and looks is None
+        p_d = self._detection_probabilities(bernoulli, poisson, cloud, looks, dt)
 
         # PMB update: hypotheses, association, states, births
         missed_from_ns = predicted.missed_from_ns if looks is None else looks.misses.missed_from_ns
@@ -269,9 +284,9 @@ class Tracker:
             bernoulli.words,
             UNGROUPED if pi is None else pi,
             p_d,
+            by_class,
             missed_from_ns,
             poisson.words,
-            p_d_poisson,
             len(predicted.poisson),
             tuple(measurements),
             dt,
@@ -293,8 +308,7 @@ class Tracker:
         posterior = Density(now, predicted.next_id + born, objects, poisson, density.labels, misses, pi)
 
         # Track extraction
-        since_ns = posterior.missed_from_ns
-        tracks = extract(objects, since_ns, hits, measurements, now, table, two_thresholds=modules.ote)
+        tracks = extract(objects, posterior.missed_from_ns, hits, measurements, now, table, two_thresholds=modules.ote)
         paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None
 
         diagnostics = Diagnostics(
@@ -320,12 +334,14 @@ class Tracker:
 
     def _detection_probabilities(
         self, bernoulli: Bernoullis, poisson: Poissons, cloud: PointCloud | None, looks: Looks | None, dt: float
-    ) -> tuple[Array, Array]:
-        """Compute p_d(x_+) of objects and of Poisson components, in one pass over the cloud if there is one."""
+    ) -> Array:
+        """Compute p_d(x_+) of objects and, behind them, of Poisson components, in one pass over the cloud.
+
+        Without a cloud and a field of view it is that of the class: then of each class.
+        """
         share = dt / self._table.period if self._table.detection_over_time else 1.0
         if cloud is None and looks is None:
-            p_d0 = over_time(self._table["detection"], share)
-            return p_d0[bernoulli.label], p_d0[poisson.label]
+            return over_time(self._detection, share)
         p_d = detection_probability(
             np.concatenate((bernoulli.mean, poisson.mean)),
             np.concatenate((bernoulli.auxiliary, poisson.auxiliary)),
@@ -333,5 +349,6 @@ class Tracker:
             cloud,
             self._table,
         )
-        p_d = over_time(p_d, share) if looks is None else detection_probability_in_view(p_d, looks, share, self._table)
-        return p_d[: len(bernoulli)], p_d[len(bernoulli) :]
+        if looks is None:
+            return over_time(p_d, share)
+        return detection_probability_in_view(p_d, looks, share, self._table)

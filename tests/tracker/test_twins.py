@@ -15,7 +15,15 @@ from read_only import read_only
 
 from optipmb.calibration import SURE, calibrate_rows, log_odds
 from optipmb.class_posterior import UNGROUPED
-from optipmb.density import BernoulliArrays, Bernoullis, PoissonArrays, Poissons
+from optipmb.density import (
+    FROM_LAST_DETECTION,
+    BernoulliArrays,
+    Bernoullis,
+    PoissonArrays,
+    Poissons,
+    misses_counted_from,
+    objects_in,
+)
 from optipmb.errors import FrameError
 from optipmb.frame import MAX_COORDINATE, MAX_SPEED, _refuse, allowed
 from optipmb.gating import gate, gate_radii
@@ -39,6 +47,7 @@ TWINS = {
     "columns.labels_within": "test_safety.test_labels_are_within_the_classes",
     "density.components_in": "test_rows.test_kernels_read_the_columns_that_numpy_does",
     "density.objects_in": "test_rows.test_kernels_read_the_columns_that_numpy_does",
+    "density.misses_counted_from": "test_twins.test_misses_count_from_the_last_detection_without_fields_of_view",
     "density.copy_state": "test_update.test_states_without_a_measurement_stay_as_predicted",
     "density.whole_periods": "test_kernels.test_periods_are_counted_to_the_nearest",
     "extract.confirm": "test_confirmed.test_confirmation_has_hysteresis",
@@ -124,6 +133,18 @@ def test_every_kernel_has_a_twin() -> None:
         body = ast.parse(path.read_text(encoding="utf-8")).body
         tests |= {f"{path.stem}.{node.name}" for node in body if isinstance(node, ast.FunctionDef)}
     assert set(TWINS.values()) <= tests
+
+
+def test_misses_count_from_the_last_detection_without_fields_of_view() -> None:
+    """Stamps that are given hold; else they are those of the last detections, as many as there are objects."""
+    stamps, width = np.arange(3), {"mean": (3, 6), "covariance": (3, 6, 6), "auxiliary": (3, 4)}
+    columns = {name: np.zeros(width.get(name, 3), column.number) for name, column in Bernoullis.described.items()} | {
+        "seen_ns": 10 + stamps
+    }
+    objects = objects_in(Bernoullis(**columns).words)
+    np.testing.assert_array_equal(misses_counted_from(objects, stamps), stamps)
+    np.testing.assert_array_equal(misses_counted_from(objects, FROM_LAST_DETECTION), 10 + stamps)
+    assert misses_counted_from(objects_in(Bernoullis.empty().words), FROM_LAST_DETECTION).size == 0
 
 
 COORDINATES = st.sampled_from(
