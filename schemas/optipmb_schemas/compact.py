@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from math import prod
+from operator import itemgetter
 from struct import unpack
 from typing import Any, Final, TypeVar
 
@@ -67,6 +68,7 @@ MOST_CACHED: Final = 512
 """Detections up to which the bounds of all their numbers are remembered, by their number; for so many 80 kilobytes."""
 
 T = TypeVar("T", Pose, FieldOfView)
+_Taken = Callable[[dict[str, Any]], tuple[bytes, ...]]
 _msgpack: Any = msgpack  # its type information is partial
 
 
@@ -291,30 +293,34 @@ def _read_columns(fields: dict[str, Any], count: int) -> None:
     _need(int(label[label.argmax()]) < len(fields["labels"]))  # a negative one is larger than any
     fields["label"] = label.view(np.int64)
     columns_of = _columns if count <= MOST_CACHED else _columns.__wrapped__
-    columns, low, high = columns_of(count, velocity=fields.get("velocity") is not None)
-    numbers = np.frombuffer(b"".join([fields[name] for name, _, _ in columns]))
+    taken, columns, low, high = columns_of(count, velocity=fields.get("velocity") is not None)
+    numbers = np.frombuffer(b"".join(taken(fields)))
     good = (numbers >= low) & (numbers <= high)
     if not good[good.argmin()]:
         known = 8 * count  # numbers of other columns than the velocity, of which a row may be NaN
         unknown = np.isnan(numbers[known:].reshape(-1, 2)).all(axis=1, keepdims=True)
         _need(bool(good[:known].all() and (good[known:].reshape(-1, 2) | unknown).all()))
-    for name, place, shape in columns:
-        fields[name] = numbers[place].reshape(shape)
+    for name, place, width in columns:
+        fields[name] = numbers[place] if width == 1 else numbers[place].reshape(count, width)
 
 
 @lru_cache(64)
 def _columns(
     count: int, *, velocity: bool
-) -> tuple[tuple[tuple[str, slice, tuple[int, ...]], ...], NDArray[np.float64], NDArray[np.float64]]:
-    """Return name, place and shape of the columns of so many detections in one buffer, and what each number may be."""
+) -> tuple[_Taken, tuple[tuple[str, slice, int], ...], NDArray[np.float64], NDArray[np.float64]]:
+    """Return how the columns of so many detections lie in one buffer, and what each number may be.
+
+    First is what takes them out of the fields, then the name, the place and the width of each, then the bounds.
+    """
     columns, begin, low, high = [], 0, [], []
     for name, width in _COLUMNS if velocity else _COLUMNS[:-1]:
         size, one = count * width, Detections.arrays[name]
-        columns.append((name, slice(begin, begin + size), (count, width) if width > 1 else (count,)))
+        columns.append((name, slice(begin, begin + size), width))
         begin += size
         low.append(np.full(size, np.nextafter(one.low, np.inf) if one.above else one.low))
         high.append(np.full(size, one.high))
-    return tuple(columns), np.concatenate(low), np.concatenate(high)
+    taken: _Taken = itemgetter(*(name for name, _, _ in columns))
+    return taken, tuple(columns), np.concatenate(low), np.concatenate(high)
 
 
 def _part(pairs: Any, kind: type[T]) -> T:

@@ -153,7 +153,8 @@ class Member:
 
     def may_write(self, stream: str, fence: int | None) -> bool:
         """Whether what was made under a fence may be published and saved now."""
-        return fence is not None and fence == self.fence(stream) and self._write_lease.valid(self._clock())
+        held = self._table.held.get(partition_of(stream))
+        return fence is not None and fence == held and self._write_lease.valid(self._clock())
 
     def look(self) -> None:
         """Have the member look soon: a state is kept."""

@@ -29,7 +29,8 @@ class StepLimit:
     """
 
     def __init__(self, limit_ns: int, outputs: StreamOutputs) -> None:
-        self._limit_ns = limit_ns
+        self.limit_ns = limit_ns
+        """Processor time that one message may take."""
         self._outputs = outputs
         self.until_ns: dict[str, int] = {}
         """By stream, until when its messages are refused (monotonic); looked up for every message."""
@@ -41,7 +42,7 @@ class StepLimit:
             stream: that of the message.
             took_ns: processor time that the message took.
         """
-        if took_ns <= self._limit_ns:
+        if took_ns <= self.limit_ns:
             return
         now_ns = time.monotonic_ns()
         self.until_ns = {name: until for name, until in self.until_ns.items() if until > now_ns}
@@ -58,5 +59,5 @@ class StepLimit:
         return any(now_ns < until for until in tuple(self.until_ns.values()))
 
     def _report(self, stream: str, received: str) -> None:
-        expected = f"at most {self._limit_ns / 1e9:g} s of processor time for a message"
+        expected = f"at most {self.limit_ns / 1e9:g} s of processor time for a message"
         self._outputs.report("overload", "", expected, received, stream=stream)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     from optipmb_service.session.fused_timeline import FusedTimeline
-    from optipmb_service.session.pending import Held
+    from optipmb_service.session.pending import Held, PendingFrames
     from optipmb_service.session.processed import ProcessedFrames
     from optipmb_service.session.recovery import Recovery
     from optipmb_service.session.reporting import SessionReporting
@@ -62,6 +62,21 @@ class FrameSteps:
         """Whether `advance` has left frames that may be ready."""
         self.run = run
         """See `Session.run`."""
+
+    def take(self, frame: Held, pending: PendingFrames, now_ns: int) -> list[Output]:
+        """Take a frame that arrived; returns what became ready by it.
+
+        Args:
+            frame: the frame.
+            pending: what is held of its sensor.
+            now_ns: monotonic time.
+        """
+        if self._sensors.passes(frame, pending):  # mostly
+            self._recovery.now_ns = now_ns
+            self.has_ready = False
+            return self._process(frame)
+        pending.add(frame)
+        return self.advance(now_ns)
 
     def advance(self, now_ns: int | None) -> list[Output]:
         """Process the frames that are ready, in order, `Policy.at_once` of them at most.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Container, Sequence
 
     from optipmb_service.session.state import Contents, FilterState
-    from optipmb_service.session.timeline import Decision, FrameId, Order, Timeline
+    from optipmb_service.session.timeline import Decision, FrameId, Timeline
     from optipmb_service.session.values import Policy
 
     Judged = tuple[Timeline | FusedTimeline, Decision, Timeline | FusedTimeline]
@@ -43,7 +43,6 @@ class Held:
     Attributes:
         entry: the frame, without its cloud until its turn has come, where it belonged when it arrived.
         contents: what was read of it.
-        order: where that was among the others.
         deadline_ns: until when it waits for its cloud (monotonic); None: it does not.
         ticket: what the caller gave with it.
         judged: the timeline that it was judged by, and the decision and the timeline that came of it.
@@ -51,7 +50,6 @@ class Held:
 
     entry: Entry
     contents: Contents
-    order: Order
     deadline_ns: int | None
     ticket: Any
     judged: Judged
@@ -62,7 +60,7 @@ class Held:
         return self.entry.weight + len(self.entry.detections)
 
 
-_order: Final = attrgetter("order")
+_order: Final = attrgetter("entry.order")
 
 
 class PendingFrames:
@@ -102,15 +100,15 @@ class PendingFrames:
     def timeline(self, timeline: Timeline | FusedTimeline) -> None:
         self._timeline, self._behind = timeline, False
 
-    def add(
+    def arrived(
         self,
         contents: Contents,
         frame_id: FrameId,
         arrived_ns: int,
         ticket: Any,
         judged: Judged,
-    ) -> None:
-        """Put a frame where it belongs; the arguments are of `Entry` and `Held`, and when it arrived (monotonic)."""
+    ) -> Held:
+        """Return a frame that arrived; the arguments are of `Entry` and `Held`, and when that was (monotonic)."""
         deadline_ns = hold_until(
             has_points=contents.message.has_points,
             stamp_ns=frame_id.stamp_ns,
@@ -121,12 +119,18 @@ class PendingFrames:
         )
         place, detections = judged[1].place, schemas.encoded(contents.message)
         entry = Entry(frame_id, detections, None, False, 0, [], place, size_of(detections))
-        held = Held(entry, contents, place.order(frame_id), deadline_ns, ticket, judged)
-        self.held_bytes += held.size
-        if self.held:
-            insort(self.held, held, key=_order)
-        else:
-            self.held.append(held)
+        return Held(entry, contents, deadline_ns, ticket, judged)
+
+    def passes(self, frame: Held) -> bool:
+        """Whether a frame that arrived need not be held: nothing is, and it waits for neither a cloud nor frames."""
+        return (
+            not self.held and frame.deadline_ns is None and self.recovery_ns is None and self.clouds.newest_ns is None
+        )
+
+    def add(self, frame: Held) -> None:
+        """Hold a frame, where it belongs."""
+        self.held_bytes += frame.size
+        insort(self.held, frame, key=_order)
 
     def follow(self, past: Timeline | FusedTimeline, base: FilterState, gone: Sequence[FrameId]) -> None:
         """Take over where the past is now.

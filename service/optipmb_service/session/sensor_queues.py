@@ -52,6 +52,10 @@ class SensorQueues:
             pending.recovery_ns = self.recovery_ns
         return pending
 
+    def passes(self, frame: Held, pending: PendingFrames) -> bool:
+        """Whether a frame that arrived, of a sensor of which so much is held, need not wait: it is the next one."""
+        return len(self.pending) == 1 and pending.passes(frame)
+
     def take(self, now_ns: int | None, complete: Callable[[FrameId], bool]) -> Held | None:
         """Take the earliest of the frames that are ready; None while none is.
 
