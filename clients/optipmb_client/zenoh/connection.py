@@ -1,6 +1,7 @@
 """A Zenoh session: what is opened on it, what is asked over it, and how all of it is closed."""
 
 import contextlib
+import threading
 import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,6 +21,15 @@ __all__ = ["Connection"]
 
 NO_BOUND = 2**31 - 1  # of the replies to a query, in effect: they are all kept anyhow, and its timeout ends them
 
+MOST_KEYS = 0xFFFF
+"""Keys that a Zenoh session can declare in its life: it numbers them by 16 bits and gives no number back. Beyond, it
+would use numbers again that are in use, and what is sent with these would be lost without an error."""
+
+PLAIN = 1
+"""Keys that a publisher declares."""
+CACHED = 2
+"""Keys that a publisher with a cache declares, and a subscriber that asks caches for what was lost."""
+
 _Opened = TypeVar("_Opened", Sender, Subscription)
 
 
@@ -29,6 +39,9 @@ class _ZenohSession(Protocol):
 
 class Connection:
     """A Zenoh session. Publishers and subscribers may share one; whoever opens it closes it.
+
+    In its life it opens 32,767 publishers and subscribers, those that were closed included; what a program opens beyond
+    is refused with `ConnectionFailed`.
 
     Args:
         connect: Endpoint or endpoints of routers (or of a service with its own router), such as ``tcp/10.0.0.1:7447``;
@@ -62,6 +75,8 @@ class Connection:
                 timeout=timeout,
             ) from error
         self._opened: weakref.WeakSet[Sender | Subscription] = weakref.WeakSet()
+        self._lock = threading.Lock()
+        self._keys = 0
         # For programs that forget to close: messages that still stand in a batch would be lost at their end, and a
         # draining thread that wakes after the interpreter has ended would abort the process.
         self._finalizer = weakref.finalize(self, _close_all, self._opened, self._session)
@@ -85,11 +100,13 @@ class Connection:
 
     def cached_sender(self, key: str, encoding: str, *, cache: int) -> Sender:
         """Open a publisher for small messages that must not get lost: it keeps the newest `cache` for recovery."""
+        self._declare(CACHED)
         with _usable():
             return self._keep(cached_sender(self._session, key, encoding, cache))
 
     def plain_sender(self, key: str, encoding: str, *, cache: int = 0) -> Sender:
         """Open a publisher for large messages: lower priority than the small ones; with `cache` it keeps the newest."""
+        self._declare(CACHED if cache else PLAIN)
         with _usable():
             return self._keep(plain_sender(self._session, key, encoding, cache))
 
@@ -99,6 +116,7 @@ class Connection:
         What those caches hold from before the subscription comes first. (Recovery would bring it anyhow, at the first
         heartbeat of a publisher: for it a late subscriber is one that has lost everything so far.)
         """
+        self._declare(CACHED)
         with _usable():
             return self._keep(subscribe(self._session, pattern, inbox))
 
@@ -141,6 +159,15 @@ class Connection:
         with _usable():
             replies = self._session.liveliness().get(pattern, zenoh.handlers.FifoChannel(NO_BOUND), timeout=timeout)
             return tuple(sorted({str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None}))
+
+    def _declare(self, keys: int) -> None:
+        """Count keys that are going to be declared."""
+        with self._lock:
+            if self._keys + keys > MOST_KEYS:
+                raise ConnectionFailed(
+                    f"this connection has declared {self._keys} keys and cannot declare more: open another one"
+                )
+            self._keys += keys
 
     def _keep(self, opened: _Opened) -> _Opened:
         self._opened.add(opened)
