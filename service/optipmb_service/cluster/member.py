@@ -330,14 +330,15 @@ class Member:
     def _settle(self) -> None:
         """Tell what has changed."""
         held, leaving = dict(self._table.held), set(self._table.leaving)
-        lost = {partition for partition, fence in self._reported.items() if held.get(partition) != fence}
         reported, self._reported = self._reported, held
-        for partition in lost:
-            self._recalled.discard(partition)
-            self._changed(partition, Change.LOST)
-        for partition in held:
-            if partition not in reported or partition in lost:
-                self._changed(partition, Change.HELD)
+        if held != reported:
+            lost = {partition for partition, fence in reported.items() if held.get(partition) != fence}
+            for partition in lost:
+                self._recalled.discard(partition)
+                self._changed(partition, Change.LOST)
+            for partition in held:
+                if partition not in reported or partition in lost:
+                    self._changed(partition, Change.HELD)
         for partition in leaving - self._recalled:
             self._recalled.add(partition)
             self._changed(partition, Change.RECALLED)
