@@ -1,7 +1,7 @@
 """What can go wrong in the client; each error's text is one line that can be shown to a person as it is.
 
 - `ClientError`: something outside this program; the command ends with status 1.
-    - `ConnectionFailed`: no router or service could be reached within the timeout.
+    - `ConnectionFailed`: no router or service could be reached within the timeout, or the connection is used up.
     - `ServiceUnavailable`: the network is there, but no service answers.
     - `ServiceRefused`: a service answered, and said no.
 - `UsageError`: a wrong option or path; the command ends with status 2.
@@ -15,7 +15,9 @@ class ClientError(Exception):
 
 
 class ConnectionFailed(ClientError):  # noqa: N818  the name says what happened, as ConnectionRefusedError's siblings do
-    """No Zenoh router could be reached, or the endpoint or configuration file is none.
+    """No Zenoh router could be reached, the endpoint or configuration file is none, or the connection is used up.
+
+    A connection is used up when it is closed, or has declared all the keys that it can in its life.
 
     Attributes:
         endpoints: What was tried.

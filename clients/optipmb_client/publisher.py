@@ -52,7 +52,7 @@ class Publisher:
         prefix: First part of all keys, as configured in the service.
 
     Raises:
-        ConnectionFailed: No router, or gateway, within `timeout`.
+        ConnectionFailed: No router, or gateway, within `timeout`, or `connection` is used up.
         MessageError: `stream` is no stream name.
     """
 

@@ -74,7 +74,7 @@ class Subscriber:
         prefix: First part of all keys, as configured in the service.
 
     Raises:
-        ConnectionFailed: No router, or gateway, within `connect_timeout`.
+        ConnectionFailed: No router, or gateway, within `connect_timeout`, or `connection` is used up.
         MessageError: `pattern` is neither the name of a stream nor such a pattern.
     """
 

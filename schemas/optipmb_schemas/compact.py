@@ -68,7 +68,7 @@ MOST_CACHED: Final = 512
 """Detections up to which the bounds of all their numbers are remembered, by their number; for so many 80 kilobytes."""
 
 T = TypeVar("T", Pose, FieldOfView)
-_Taken = Callable[[dict[str, Any]], tuple[bytes, ...]]
+_BytesOf = Callable[[dict[str, Any]], tuple[bytes, ...]]
 _msgpack: Any = msgpack  # its type information is partial
 
 
@@ -293,8 +293,8 @@ def _read_columns(fields: dict[str, Any], count: int) -> None:
     _need(int(label[label.argmax()]) < len(fields["labels"]))  # a negative one is larger than any
     fields["label"] = label.view(np.int64)
     columns_of = _columns if count <= MOST_CACHED else _columns.__wrapped__
-    taken, columns, low, high = columns_of(count, velocity=fields.get("velocity") is not None)
-    numbers = np.frombuffer(b"".join(taken(fields)))
+    bytes_of, columns, low, high = columns_of(count, velocity=fields.get("velocity") is not None)
+    numbers = np.frombuffer(b"".join(bytes_of(fields)))
     good = (numbers >= low) & (numbers <= high)
     if not good[good.argmin()]:
         known = 8 * count  # numbers of other columns than the velocity, of which a row may be NaN
@@ -307,7 +307,7 @@ def _read_columns(fields: dict[str, Any], count: int) -> None:
 @lru_cache(64)
 def _columns(
     count: int, *, velocity: bool
-) -> tuple[_Taken, tuple[tuple[str, slice, int], ...], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[_BytesOf, tuple[tuple[str, slice, int], ...], NDArray[np.float64], NDArray[np.float64]]:
     """Return how the columns of so many detections lie in one buffer, and what each number may be.
 
     First is what takes them out of the fields, then the name, the place and the width of each, then the bounds.
@@ -319,8 +319,8 @@ def _columns(
         begin += size
         low.append(np.full(size, np.nextafter(one.low, np.inf) if one.above else one.low))
         high.append(np.full(size, one.high))
-    taken: _Taken = itemgetter(*(name for name, _, _ in columns))
-    return taken, tuple(columns), np.concatenate(low), np.concatenate(high)
+    bytes_of: _BytesOf = itemgetter(*(name for name, _, _ in columns))
+    return bytes_of, tuple(columns), np.concatenate(low), np.concatenate(high)
 
 
 def _part(pairs: Any, kind: type[T]) -> T:

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import pytest
+from optipmb_client import Publisher, Subscriber
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Inbox
 from optipmb_client.zenoh import Connection
 from optipmb_client.zenoh.connection import MOST_KEYS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from optipmb_client.zenoh.sender import Sender
     from optipmb_client.zenoh.subscription import Subscription
 
-ALONE = '{mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: []}}'
+ALONE: Final = '{mode: "peer", scouting: {multicast: {enabled: false}}, listen: {endpoints: []}}'
 
 
 def _cached(connection: Connection, key: str) -> Sender:
@@ -36,31 +37,48 @@ def _subscribed(connection: Connection, key: str) -> Subscription:
     return connection.subscribe(key, Inbox(1))
 
 
+@pytest.fixture
+def connection(tmp_path: Path) -> Iterator[Connection]:
+    """A connection alone."""
+    file = tmp_path / "alone.json5"
+    file.write_text(ALONE, encoding="utf-8")
+    with Connection(config=file) as connection:
+        yield connection
+
+
 @pytest.mark.parametrize("opened", [_cached, _plain, _plain_cached, _subscribed])
 def test_what_was_opened_early_is_heard_to_the_last(
-    tmp_path: Path, opened: Callable[[Connection, str], Sender | Subscription]
+    connection: Connection, opened: Callable[[Connection, str], Sender | Subscription]
 ) -> None:
     """When a connection has declared all keys that it can, the next publisher is refused, and early ones go on.
 
     Zenoh alone uses numbers again that are in use, and what their publishers send is lost without an error.
     """
-    file = tmp_path / "alone.json5"
-    file.write_text(ALONE, encoding="utf-8")
-    with Connection(config=file) as connection:
-        inbox = Inbox(8)
-        subscription = connection.subscribe("early", inbox)
-        early = connection.cached_sender("early", "", cache=1)
+    inbox = Inbox(8)
+    subscription = connection.subscribe("early", inbox)
+    early = connection.cached_sender("early", "", cache=1)
 
-        def come_and_go() -> None:
-            for number in range(MOST_KEYS):
-                opened(connection, f"passing/{number}").close()
+    def come_and_go() -> None:
+        for number in range(MOST_KEYS):
+            opened(connection, f"passing/{number}").close()
 
-        with pytest.raises(ConnectionFailed, match="open another one"):
-            come_and_go()
-        with pytest.raises(ConnectionFailed, match=r"declared 6553[45] keys"):
-            connection.subscribe("late", inbox)
-        early.put(b"late")
-        arrival = inbox.get(timeout=5.0)
-        assert arrival is not None
-        assert arrival.payload == b"late"
-        subscription.close()
+    with pytest.raises(ConnectionFailed, match="open another one"):
+        come_and_go()
+    with pytest.raises(ConnectionFailed, match=r"declared 6553[45] keys"):
+        connection.subscribe("late", inbox)
+    early.put(b"late")
+    arrival = inbox.get(timeout=5.0)
+    assert arrival is not None
+    assert arrival.payload == b"late"
+    subscription.close()
+
+
+def test_what_needs_more_keys_than_are_left_opens_none(connection: Connection) -> None:
+    """A publisher and a subscriber that declare several keys are refused before the first of them is taken."""
+    for number in range(MOST_KEYS - 2):
+        _plain(connection, f"passing/{number}").close()
+    with pytest.raises(ConnectionFailed, match="declared 65533 keys"):
+        Subscriber("*/*/*", connection=connection, on_problem=lambda _: None)
+    with pytest.raises(ConnectionFailed, match="declared 65533 keys"):
+        Publisher("site/node/lidar", connection=connection)
+    Subscriber("*/*/*", connection=connection).close()

@@ -40,8 +40,9 @@ class _ZenohSession(Protocol):
 class Connection:
     """A Zenoh session. Publishers and subscribers may share one; whoever opens it closes it.
 
-    In its life it opens 32,767 publishers and subscribers, those that were closed included; what a program opens beyond
-    is refused with `ConnectionFailed`.
+    It can declare 65,535 keys in its life, and closing gives none back: a `Publisher` declares three, with a cache of
+    clouds four, and a `Subscriber` two, with `on_problem` four. What a program opens beyond is refused with
+    `ConnectionFailed`; another connection can open it.
 
     Args:
         connect: Endpoint or endpoints of routers (or of a service with its own router), such as ``tcp/10.0.0.1:7447``;
@@ -100,13 +101,13 @@ class Connection:
 
     def cached_sender(self, key: str, encoding: str, *, cache: int) -> Sender:
         """Open a publisher for small messages that must not get lost: it keeps the newest `cache` for recovery."""
-        self._declare(CACHED)
+        self._count(CACHED)
         with _usable():
             return self._keep(cached_sender(self._session, key, encoding, cache))
 
     def plain_sender(self, key: str, encoding: str, *, cache: int = 0) -> Sender:
         """Open a publisher for large messages: lower priority than the small ones; with `cache` it keeps the newest."""
-        self._declare(CACHED if cache else PLAIN)
+        self._count(CACHED if cache else PLAIN)
         with _usable():
             return self._keep(plain_sender(self._session, key, encoding, cache))
 
@@ -116,22 +117,23 @@ class Connection:
         What those caches hold from before the subscription comes first. (Recovery would bring it anyhow, at the first
         heartbeat of a publisher: for it a late subscriber is one that has lost everything so far.)
         """
-        self._declare(CACHED)
-        with _usable():
-            return self._keep(subscribe(self._session, pattern, inbox))
+        (subscription,) = self._subscribe([pattern], inbox)
+        return subscription
 
     def senders(self, stream: str, *, prefix: str, cache: int, cache_clouds: int) -> tuple[Sender, Sender]:
         """Open what sends the detections and the clouds of a stream, each keeping the newest for recovery."""
-        keys = Keys(prefix)
-        return (
-            self.cached_sender(keys.detections(stream), encoding_of(Detections), cache=cache),
-            self.plain_sender(keys.points(stream), encoding_of(Points), cache=cache_clouds),
-        )
+        session, keys = self._session, Keys(prefix)
+        self._count(CACHED + (CACHED if cache_clouds else PLAIN))
+        with _usable():
+            return (
+                self._keep(cached_sender(session, keys.detections(stream), encoding_of(Detections), cache)),
+                self._keep(plain_sender(session, keys.points(stream), encoding_of(Points), cache_clouds)),
+            )
 
     def subscribe_tracks(self, pattern: str, inbox: Inbox, *, prefix: str, problems: bool) -> Subscriptions:
         """Move the tracks of a pattern into an inbox, its problems too where that is asked for."""
         topics: tuple[Topic, ...] = ("tracks", "problems") if problems else ("tracks",)
-        return Subscriptions([self.subscribe(Keys(prefix).matching(pattern, topic), inbox) for topic in topics])
+        return Subscriptions(self._subscribe([Keys(prefix).matching(pattern, topic) for topic in topics], inbox))
 
     def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:
         """Ask everybody who answers at `key`; an empty result means that nobody did within `timeout` seconds."""
@@ -160,8 +162,18 @@ class Connection:
             replies = self._session.liveliness().get(pattern, zenoh.handlers.FifoChannel(NO_BOUND), timeout=timeout)
             return tuple(sorted({str(sample.key_expr) for reply in replies if (sample := reply.ok) is not None}))
 
-    def _declare(self, keys: int) -> None:
-        """Count keys that are going to be declared."""
+    def _subscribe(self, patterns: Sequence[str], inbox: Inbox) -> list[Subscription]:
+        """Open a subscription to each pattern, or none of them."""
+        self._count(CACHED * len(patterns))
+        with _usable():
+            return [self._keep(subscribe(self._session, pattern, inbox)) for pattern in patterns]
+
+    def _count(self, keys: int) -> None:
+        """Count keys that are going to be declared.
+
+        Raises:
+            ConnectionFailed: they are more than are left.
+        """
         with self._lock:
             if self._keys + keys > MOST_KEYS:
                 raise ConnectionFailed(

@@ -64,7 +64,7 @@ class StreamTracking:
         try:
             self._track(session, packet, began_ns, frame=frame)
         finally:
-            # What took no longer than its limit took no more of the processor; to ask for that is a call of the system.
+            # Its processor time, for which a system call asks, is no longer than the time that it took.
             if time.perf_counter_ns() - began_ns > self.limit.limit_ns:
                 self.limit.charge(stream, time.thread_time_ns() - processor_ns)
 

@@ -59,7 +59,7 @@ class FrameSteps:
         self._reporting = reporting
         self._clock = clock
         self.has_ready = False
-        """Whether `advance` has left frames that may be ready."""
+        """Whether frames that may be ready were left."""
         self.run = run
         """See `Session.run`."""
 

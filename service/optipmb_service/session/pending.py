@@ -122,7 +122,7 @@ class PendingFrames:
         return Held(entry, contents, deadline_ns, ticket, judged)
 
     def passes(self, frame: Held) -> bool:
-        """Whether a frame that arrived need not be held: nothing is, and it waits for neither a cloud nor frames."""
+        """Whether a frame that arrived need not be held: nothing is, no frames are awaited, and no cloud ever came."""
         return (
             not self.held and frame.deadline_ns is None and self.recovery_ns is None and self.clouds.newest_ns is None
         )

@@ -53,7 +53,7 @@ class SensorQueues:
         return pending
 
     def passes(self, frame: Held, pending: PendingFrames) -> bool:
-        """Whether a frame that arrived, of a sensor of which so much is held, need not wait: it is the next one."""
+        """Whether a frame that arrived need not be held: there is one sensor, whose frames wait for nothing."""
         return len(self.pending) == 1 and pending.passes(frame)
 
     def take(self, now_ns: int | None, complete: Callable[[FrameId], bool]) -> Held | None:
