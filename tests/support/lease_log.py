@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,8 @@ class Shared:
     records: dict[str, Record] = field(default_factory=dict)
     checkpoints: dict[str, list[bytes]] = field(default_factory=dict)
     revision: int = 0
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    """Of those who write at the same time, one is accepted."""
 
 
 class MemoryLeases:
@@ -57,11 +60,12 @@ class MemoryLeases:
     def put(self, write: Write) -> int | None:
         """Write over a revision."""
         self._reach(after=False)
-        now = self.shared.records.get(write.key)
         revision = None
-        if (now.revision if now else 0) == write.over:
-            revision = self.shared.revision = self.shared.revision + 1
-            self.shared.records[write.key] = Record(write.key, write.value, revision)
+        with self.shared.lock:
+            now = self.shared.records.get(write.key)
+            if (now.revision if now else 0) == write.over:
+                revision = self.shared.revision = self.shared.revision + 1
+                self.shared.records[write.key] = Record(write.key, write.value, revision)
         self._reach()
         return revision
 
