@@ -18,6 +18,7 @@ from optipmb_service.app.kernels import warm_up
 from optipmb_service.app.loops import settle
 from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session import convert
+from optipmb_service.session.frame_tracks import tracks_of
 from optipmb_service.session.timeline import FrameId
 from optipmb_service.settings.model import Settings
 from optipmb_service.zenoh.connection import opened
@@ -47,9 +48,8 @@ class Frames:
         self._tracker = optipmb.Tracker(self._parameters)
         self._densities: dict[str, optipmb.Density] = {}
         self._publishers: dict[str, Putting] = {}
-        self._delivery = schemas.Delivery(
-            instance="bare", received_ns=0, published_ns=0, queue_ms=0.0, decode_ms=0.0, step_ms=0.0
-        )
+        times = {"queue_ms": 0.0, "decode_ms": 0.0, "step_ms": 0.0}
+        self._delivery = {"instance": "bare", "received_ns": 0, "published_ns": 0, **times, "run": 0}
         self._waiting: deque[bytes] = deque()
         self._scheduler = Scheduler()
 
@@ -70,7 +70,7 @@ class Frames:
         frame, ignored = convert.frame_of(self._parameters, message)
         result = self._tracker.step(self._densities[stream], frame)
         self._densities[stream] = result.density
-        tracks = convert.tracks_of(
+        tracks = tracks_of(
             result.tracks,
             None,
             stream=stream,
@@ -82,7 +82,7 @@ class Frames:
             gap=0,
             ignored=ignored,
         )
-        self._publishers[stream].put(schemas.encode(tracks, delivery=self._delivery))
+        self._publishers[stream].put(tracks.encoded(self._delivery))
         return False
 
 
