@@ -9,19 +9,7 @@ import numpy as np
 
 from optipmb.calibration import calibrate_rows
 from optipmb.compiled import kernel
-from optipmb.density import (
-    OMEGA,
-    PHI,
-    STATE,
-    A,
-    V,
-    X,
-    Y,
-    copy_state,
-    misses_counted_from,
-    objects_in,
-    whole_periods,
-)
+from optipmb.density import OMEGA, PHI, STATE, A, V, X, Y, copy_state, misses_counted_from, objects_in, whole_periods
 from optipmb.errors import FrameError
 from optipmb.heading import doubt, sign_probability
 from optipmb.position_noise import PLAIN

@@ -64,7 +64,7 @@ class StreamTracking:
         try:
             self._track(session, packet, began_ns, frame=frame)
         finally:
-            # Its processor time, for which a system call asks, is no longer than the time that it took.
+            # It took no more processor time than time, and to read the processor time is a system call.
             if time.perf_counter_ns() - began_ns > self.limit.limit_ns:
                 self.limit.charge(stream, time.thread_time_ns() - processor_ns)
 

@@ -63,8 +63,8 @@ class FrameSteps:
         self.run = run
         """See `Session.run`."""
 
-    def take(self, frame: Held, pending: PendingFrames, now_ns: int) -> list[Output]:
-        """Take a frame that arrived; returns what became ready by it.
+    def accept(self, frame: Held, pending: PendingFrames, now_ns: int) -> list[Output]:
+        """Process a frame that arrived, or hold it; returns what became ready by it.
 
         Args:
             frame: the frame.

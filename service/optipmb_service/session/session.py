@@ -123,7 +123,7 @@ class Session:
         since_ns = now_ns if arrived_ns is None else arrived_ns
         contents = Contents(message, frame, ignored)
         held = pending.arrived(contents, frame_id, since_ns, ticket, (judged_by, decision, arrived))
-        return [*outputs, *self._steps.take(held, pending, now_ns)]
+        return [*outputs, *self._steps.accept(held, pending, now_ns)]
 
     def on_points(self, message: schemas.Points, now_ns: int, *, ticket: Any = None) -> list[Output]:
         """Take a cloud; returns what waited for it and, by setting, what it corrects.
