@@ -69,6 +69,18 @@ def test_any_interleaving_gives_the_state_of_frames_in_order(order: list[int], c
     assert len(merged.newest) == len(IN_ORDER)
 
 
+def test_a_frame_of_another_sensor_does_not_go_before_those_that_are_ready() -> None:
+    """Where frames go one at a time, those of one sensor that were left are still due when one of another comes."""
+    one, policy = fused(Policy(recovery_wait_ns=0, at_once=1)), Policy()
+    for seq in range(3):
+        one.on_detections(FRONT.detections(seq, has_points=True), 0)
+    assert len(tracks(one.on_tick(policy.cloud_wait_ns))) == 1
+    assert (one.held, one.deadline_ns) == (2, 0)
+    found = tracks(one.on_detections(SIDE.detections(3, has_points=False), policy.cloud_wait_ns))
+    assert [(message.sensor, message.seq) for message in found] == [(FRONT.stream, 1)]
+    assert (one.held, one.deadline_ns) == (2, 0)
+
+
 def test_tracks_name_the_session_and_the_sensor() -> None:
     """The stream is that of the session, the sensor that of the frame; equal stamps go by the names of the sensors."""
     one = fused()

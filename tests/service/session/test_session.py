@@ -162,6 +162,14 @@ def test_a_cloud_before_its_frame_is_used_at_once() -> None:
     assert (one.counters.clouds_used, one.deadline_ns) == (1, None)
 
 
+def test_a_cloud_before_its_frame_is_used_where_no_cloud_is_waited_for() -> None:
+    """With no wait for clouds, a frame still gets the one that came before it."""
+    one = session(policy=Policy(cloud_wait_ns=0))
+    one.on_points(SENSOR.points(0), 0)
+    message = tracks(one.on_detections(SENSOR.detections(0), 0))[0]
+    assert message.cloud_used
+
+
 def test_a_frame_waits_for_its_cloud() -> None:
     """A frame with has_points waits and goes when its cloud comes, in time."""
     one = session()
