@@ -9,6 +9,7 @@ import pytest
 from commands import result_of, run_here
 from optipmb_client.datasets import DataSequence, DatasetError, open_dataset
 from optipmb_client.datasets.table import TableDataset, TableSequence, match_stamps
+from optipmb_client.datasets.table.names import find_columns
 from optipmb_client.offline import track_sequence
 from optipmb_client.table_files import read_table, write_table
 from own_tables import FRAMES, boxes
@@ -132,6 +133,24 @@ def test_names_of_columns_are_many(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"a column x \(--option column.x=NAME\)"):
         notes_and_frames(tmp_path / "c.csv", east)
     same(notes_and_frames(tmp_path / "d.csv", east, **{"column.x": "east"})[1], sequence)
+
+
+@pytest.mark.parametrize(
+    ("names", "stamp", "nanosec"),
+    [
+        (("sec", "nanosec"), "sec", "nanosec"),
+        (("header.stamp.nanosec", "header.stamp.sec"), "header.stamp.sec", "header.stamp.nanosec"),
+        (("stamp.nsecs", "stamp.secs"), "stamp.secs", "stamp.nsecs"),
+        (("timestampSec", "timestampNsec"), "timestampSec", "timestampNsec"),
+        (("t", "sec", "nanosec"), "t", None),
+        (("stamp_nanosec",), "stamp_nanosec", None),
+    ],
+)
+def test_nanoseconds_belong_to_a_column_of_seconds(names: tuple[str, ...], stamp: str, nanosec: str | None) -> None:
+    """A column of nanoseconds is the second half of a stamp only where the stamp is a column of whole seconds."""
+    found = find_columns(names, {})
+    assert found["stamp"].name == stamp
+    assert (found["nanosec"].name if "nanosec" in found else None) == nanosec
 
 
 def test_lists_inside_rows_are_columns(tmp_path: Path) -> None:
