@@ -20,14 +20,14 @@ from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Ints, Pose, stack_poses, to_world
 from optipmb_client.results import ResultWriter
 from optipmb_client.results.table import TableResultWriter
-from optipmb_client.table_files import is_table
+from optipmb_client.table_files import SUFFIXES, tables_in
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = ["OPTIONS", "TableDataset", "TableSequence"]
 
-OPTIONS: Final = ("time", "rate", "yaw", "sizes", "axes", "score", "invalid", "truth")
+OPTIONS: Final = ("time", "rate", "yaw", "sizes", "axes", "score", "invalid", "truth", "decimal", "encoding", "date")
 """Options beside `column.MEANING=NAME` and `class.NAME=NAME`."""
 GAP: Final = 1.5
 _HERE: Final = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -230,17 +230,15 @@ class TableDataset:
 
     def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
         """Return a writer of `out/NAME.csv`, or of the format of the detections."""
-        suffix = self.path.suffix if self.path.is_file() and self.path.suffix not in {".gz", ".bz2", ".zst"} else ".csv"
+        suffix = self.path.suffix if self.path.is_file() and self.path.suffix.lower() in SUFFIXES else ".csv"
         return TableResultWriter(out / f"{sequence.name}{suffix}", sequence)
 
 
 def _tables(path: Path) -> list[Path]:
-    if path.is_dir():
-        files = sorted(file for file in path.iterdir() if is_table(file) and not file.name.startswith("."))
-        if not files:
-            raise DatasetError(path, "a folder with tables (.csv, .parquet, .jsonl, .feather)", "none in it")
-        return files
-    return [path]
+    files = tables_in(path) if path.is_dir() else [path]
+    if not files:
+        raise DatasetError(path, "a folder with tables (.csv, .parquet, .jsonl, .feather)", "none in it")
+    return files
 
 
 def _plain(text: str) -> str:
@@ -249,7 +247,7 @@ def _plain(text: str) -> str:
 
 
 def _stem(file: Path) -> str:
-    return file.name.split(".")[0]
+    return file.resolve().name.split(".")[0]
 
 
 def _read_truth(path: Path, options: Mapping[str, str], notes: list[str]) -> tuple[Boxes, Path]:

@@ -18,7 +18,7 @@ from optipmb_client.datasets.table.values import (
 )
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Ints, wrap_angle
-from optipmb_client.table_files import Columns, read_table
+from optipmb_client.table_files import Columns, line_of, read_table
 
 __all__ = ["NO_CLASS", "Boxes", "read_boxes"]
 
@@ -82,7 +82,7 @@ def read_boxes(reading: Reading, *, scored: bool) -> Boxes:
         DatasetError: a column is missing or a value is not allowed; names the line.
         ClientError: pyarrow is not installed.
     """
-    columns = read_table(reading.path)
+    columns = read_table(reading.path, reading.options)
     if not columns or not len(next(iter(columns.values()))):
         raise DatasetError(reading.path, "rows", f"none, columns {', '.join(columns) or 'none'}")
     return _Table(reading, columns).read(scored=scored)
@@ -102,7 +102,7 @@ class _Table:
         self._found = find_columns(columns, chosen)
 
     def _line(self, row: int) -> int:
-        return row + (2 if self._reading.path.name.lower().endswith((".csv", ".tsv", ".gz")) else 1)
+        return line_of(self._reading.path, row, self._reading.options)
 
     def _numbers(self, role: str, otherwise: float | None = None) -> Floats:
         """Return a column of numbers, NaN where there is none."""
