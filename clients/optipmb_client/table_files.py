@@ -35,7 +35,9 @@ _PICKLES: Final = (".pkl", ".pickle")
 _COMPRESSED: Final = (".gz", ".bz2", ".zst")
 _SEPARATORS: Final = ",;\t"
 _MOST_PARTS: Final = 16
-_DATE: Final = re.compile(r"\d{4}([-/])\d\d\1\d\d[T ]+\d\d?:\d\d|\d{1,2}([-/.])\d{1,2}\2\d{4}[T ]+\d\d?:\d\d")
+_DATE: Final = re.compile(
+    r"(\d{4}([-/])\d\d?\2\d\d?|\d\d?([-/.])\d\d?\3\d{4})[T ]+\d\d?:\d\d[:.,\d]*( ?UTC|(Z|[-+]\d\d(:?\d\d)?))?"
+)
 _DAY_OR_MONTH: Final = re.compile(r"^(\d{1,2})([-/.])(\d{1,2})\2(\d{4})")
 _MONTHS: Final = 12
 _COMMA: Final = r"^\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*$"
@@ -236,24 +238,24 @@ def _has_commas(pa: Any, path: Path, table: Any) -> bool:
 def _dates(pa: Any, path: Path, name: str, texts: NDArray[Any], options: Mapping[str, str]) -> NDArray[Any]:
     """Return a column of dates with a time of day as such, and other texts as they are."""
     first = next((text for text in texts.tolist() if text), "").strip()
-    if not _DATE.match(first):
+    date = _DATE.fullmatch(first)
+    if date is None:
         return texts
     unique, place = np.unique(texts, return_inverse=True)
-    order = _order_of_days(path, name, [text.strip() for text in unique.tolist()], options)
-    kind = pa.timestamp("ns", "UTC" if re.search(r"(Z|:\d\d[.\d]*[-+]\d\d(:?\d\d)?)$", first) else None)
-    stamps = np.full(len(unique), "NaT", dtype="datetime64[ns]")
-    for number, text in enumerate(unique.tolist()):
-        if not text:
-            continue
-        iso = _DAY_OR_MONTH.sub(order, text.strip().removesuffix(" UTC").replace(",", "."), count=1).replace("/", "-")
-        iso = re.sub(r"(?<=-)(\d)(?=[-T ])|(?<=[T ])(\d)(?=:)", r"0\1\2", iso)
-        try:
-            stamps[number] = np.datetime64(pa.scalar(iso).cast(kind).value, "ns")
-        except pa.ArrowInvalid as error:
-            expected = f"a date as YYYY-MM-DD HH:MM:SS.ffffff in column {name}, with a zone in all rows or in none"
-            line = line_of(path, int(np.flatnonzero(texts == text)[0]), options)
-            raise DatasetError(path, expected, repr(text), line=line) from error
-    return np.asarray(stamps[place])
+    found = [text.strip() for text in unique.tolist()]
+    order = _order_of_days(path, name, found, options)
+    days = [
+        _DAY_OR_MONTH.sub(order, text.removesuffix("UTC").strip().replace(",", ".")).replace("/", "-") for text in found
+    ]
+    dates = [re.sub(r"(?<=-)(\d)(?=[-T ])|(?<=[T ])(\d)(?=:)", r"0\1\2", text) or None for text in days]
+    try:
+        stamps = pa.array(dates).cast(pa.timestamp("ns", "UTC" if date[5] else None)).to_numpy(zero_copy_only=False)
+    except pa.ArrowInvalid as error:
+        wrong = next(number for number, text in enumerate(dates) if f"'{text}'" in str(error))
+        expected = f"a date as YYYY-MM-DD HH:MM:SS.ffffff in column {name}, with a zone in all rows or in none"
+        line = line_of(path, int(np.flatnonzero(place == wrong)[0]), options)
+        raise DatasetError(path, expected, repr(found[wrong]), line=line) from error
+    return np.asarray(stamps.astype("datetime64[ns]")[place])
 
 
 def _order_of_days(path: Path, name: str, texts: list[str], options: Mapping[str, str]) -> str:

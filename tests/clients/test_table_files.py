@@ -108,7 +108,7 @@ def test_the_day_is_found_where_a_number_exceeds_twelve(tmp_path: Path) -> None:
             "(--option decimal=. or decimal=, says which), received commas in column t",
         ),
         ("d.csv", "t,x\n", {"decimal": ";"}, "--option decimal: expected a comma or a point"),
-        ("d.csv", "t,x\n2024-05-01 10:00 nil,1\n", {"date": "ymd"}, "--option date: expected dmy or mdy"),
+        ("d.jsonl", '{"t": "1/5/2024 10:00"}\n', {"date": "ymd"}, "--option date: expected dmy or mdy"),
         ("d.csv", "t,x\n1,2\n3\n", {}, "Row #3: Expected 2 columns, got 1"),
         ("d.pkl", "anything", {}, "section Recipes of docs/own-data.md"),
         ("d.npy", "anything", {}, "a table (.csv, .tsv, .parquet, .jsonl, .ndjson, .feather, .arrow, .json, .txt)"),
@@ -200,12 +200,17 @@ def test_a_row_may_hold_the_boxes_of_a_frame(suffix: str, tmp_path: Path) -> Non
     frames = [{"t": i / 10, **one} for i, one in enumerate(lists())]
     frames.insert(7, {"t": 0.65, "name": [], "score": [], "boxes_lidar": []})
     lines = "\n".join(map(json.dumps, frames))
-    (tmp_path / f"d{suffix}").write_text(lines if suffix == ".jsonl" else json.dumps({"objects": None} | {"x": 1}))
-    if suffix == ".json":
-        (tmp_path / "d.json").write_text(json.dumps(frames))
+    (tmp_path / f"d{suffix}").write_text(lines if suffix == ".jsonl" else json.dumps(frames))
     found = frames_of(tmp_path / f"d{suffix}")
     assert found[7][0] == []
     assert found[:7] + found[8:] == flat(tmp_path)
+
+
+def test_lists_of_different_lengths_are_told_as_not_used(tmp_path: Path) -> None:
+    """A column of lists that have no common length is no number, and is named."""
+    rows = [{name: values[i].item() for name, values in boxes().items()} | {"hits": [1] * (i % 3)} for i in range(9)]
+    (tmp_path / "d.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    assert any("columns not used: hits" in note for note in open_dataset("table", tmp_path / "d.jsonl").notes)
 
 
 def test_objects_of_a_file_are_its_rows(tmp_path: Path) -> None:
