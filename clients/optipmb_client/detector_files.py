@@ -7,30 +7,17 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
 from optipmb_client.camera import sensor_from_kitti
 from optipmb_client.files import DatasetError, numbers, read_rows, read_text
 
-__all__ = ["BOX_LISTS", "LISTS", "Record", "frame_files", "is_kitti_object", "read_frames", "read_json", "split_boxes"]
+__all__ = ["BOX_LISTS", "LISTS", "frame_files", "is_kitti_object", "read_frames", "read_json", "split_boxes"]
 
-Record = dict[str, Any]
-BOX_LISTS: Final = (
-    *(
-        "bboxes_3d",
-        "boxes_3d",
-        "boxes_lidar",
-        "pred_boxes",
-        "gt_boxes",
-        "boxes",
-        "bbox_3d",
-        "box_3d",
-        "bbox3d",
-        "box3d",
-    ),
-)
+_Record: TypeAlias = dict[str, Any]
+BOX_LISTS: Final = ("bboxes_3d", "boxes_3d", "boxes_lidar", "pred_boxes", "gt_boxes", "boxes", "bbox_3d", "box3d")
 """Names of lists of x, y, z, length, width, height, yaw and, in some, a velocity."""
 LISTS: Final = (*BOX_LISTS, "detections", "objects", "predictions", "annotations")
 """Names of lists of all boxes of a frame."""
@@ -43,16 +30,12 @@ _STAMPS: Final = 1_000_000_000
 
 def frame_files(folder: Path) -> list[Path]:
     """Return the files of a folder with the boxes of a frame each; none where it is no such folder."""
-    for suffix, is_frame in ((".json", _is_mmdetection), (".txt", is_kitti_object)):
+    for suffix in (".json", ".txt"):
         files = sorted(folder.glob(f"*{suffix}"))
-        first = next((file for file in files if file.stat().st_size), None)
-        if first is not None and is_frame(first.read_bytes().decode(errors="replace")):
+        text = next((file.read_bytes().decode(errors="replace") for file in files if file.stat().st_size), "")
+        if is_kitti_object(text) if suffix == ".txt" else text[:1] == "{" and '"bboxes_3d"' in text:
             return files
     return []
-
-
-def _is_mmdetection(text: str) -> bool:
-    return text.startswith("{") and '"bboxes_3d"' in text
 
 
 def is_kitti_object(text: str) -> bool:
@@ -60,7 +43,7 @@ def is_kitti_object(text: str) -> bool:
     return re.match(r"[A-Za-z]\w*( +-?\d[-+.e\d]*){14,15} *(\n|$)", text) is not None
 
 
-def read_frames(folder: Path) -> list[Record]:
+def read_frames(folder: Path) -> list[_Record]:
     """Return a record for each box of a folder with a file for each frame, whose name has its number or stamp.
 
     Raises:
@@ -73,21 +56,19 @@ def read_frames(folder: Path) -> list[Record]:
         number = list(range(len(files)))
     name = "timestamp" if min(number) >= _STAMPS else "frame"
     read = _kitti_frame if files[0].suffix == ".txt" else read_json
-    order = np.argsort(number, kind="stable").tolist()
-    return split_boxes([{name: number[place]} | one for place in order for one in read(files[place])])
+    return split_boxes([{name: n} | one for n, file in sorted(zip(number, files, strict=True)) for one in read(file)])
 
 
-def _kitti_frame(path: Path) -> list[Record]:
+def _kitti_frame(path: Path) -> list[_Record]:
     rows = [(line, fields) for line, fields in read_rows(path, "boxes") if fields[0] != "DontCare"]
     boxes = [(line, fields[_FIRST:] + ["1"] * (len(fields) == _FIRST + 7)) for line, fields in rows]  # labels: no score
     values = numbers(path, boxes, 8, f"{_KITTI} from field {_FIRST + 1} on")
     center, size, yaw = sensor_from_kitti(values[:, 3:6], values[:, :3], values[:, 6])
     lists = np.column_stack((center, size, yaw)).tolist()
-    names = [fields[0] for _, fields in rows]
-    return [{"labels_3d": names, "scores_3d": values[:, 7].tolist(), "bboxes_3d": lists}]
+    return [{"labels_3d": [fields[0] for _, fields in rows], "scores_3d": values[:, 7].tolist(), "bboxes_3d": lists}]
 
 
-def read_json(path: Path) -> list[Record]:
+def read_json(path: Path) -> list[_Record]:
     """Return the records of a JSON file: an array of them, or an object with the boxes of a frame.
 
     Raises:
@@ -111,19 +92,17 @@ def read_json(path: Path) -> list[Record]:
     return content
 
 
-def _centre(path: Path, frame: Record) -> None:
+def _centre(path: Path, frame: _Record) -> None:
     """Move the boxes of a frame of MMDetection3D up to their centres; it gives those of their bottoms."""
     kind = frame.pop("box_type_3d")
-    if kind != "LiDAR":
-        raise DatasetError(path, "boxes of box_type_3d LiDAR", repr(kind))
+    if kind != "LiDAR" or any(len(box) not in {7, 9} for box in frame["bboxes_3d"]):
+        raise DatasetError(path, "boxes of 7 or 9 numbers, of box_type_3d LiDAR", f"others, of {kind}")
     for box in frame["bboxes_3d"]:
-        if len(box) not in {7, 9}:
-            raise DatasetError(path, "boxes of 7 or 9 numbers", str(len(box)))
         box[2] += 0.5 * box[5]
     frame["labels_3d"] = [str(label) for label in frame["labels_3d"]]
 
 
-def split_boxes(records: Sequence[Record]) -> list[Record]:
+def split_boxes(records: Sequence[_Record]) -> list[_Record]:
     """Return a record for each box: of a list of boxes in a record, and of the other lists that are as long."""
     names = dict.fromkeys(name for one in records for name in one)
 
@@ -138,7 +117,7 @@ def split_boxes(records: Sequence[Record]) -> list[Record]:
         return list(records)
     counts = [len(boxes) for boxes in lists(key)]
     split = [name for name in names if [len(one) if isinstance(one, list) else -1 for one in lists(name)] == counts]
-    rows: list[Record] = []
+    rows: list[_Record] = []
     for one, count in zip(records, counts, strict=True):
         frame = {name: value for name, value in one.items() if name not in split}
         boxes = [frame | {name: one[name][place] for name in split} for place in range(count)]

@@ -39,6 +39,7 @@ _DATE: Final = re.compile(
     r"(\d{4}([-/])\d\d?\2\d\d?|\d\d?([-/.])\d\d?\3\d{4})[T ]+\d\d?:\d\d[:.,\d]*( ?UTC|(Z|[-+]\d\d(:?\d\d)?))?"
 )
 _DAY_OR_MONTH: Final = re.compile(r"^(\d{1,2})([-/.])(\d{1,2})\2(\d{4})")
+_ONE_DIGIT: Final = re.compile(r"(?<=[-T ])(\d)(?=[-T :])")
 _MONTHS: Final = 12
 _COMMA: Final = r"^\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*$"
 
@@ -90,12 +91,11 @@ def read_table(path: Path, options: Mapping[str, str] | None = None) -> Columns:
     """
     pa = _pyarrow()
     kind, options = _kind(path), options or {}
-    formats = f"a table ({', '.join((*SUFFIXES, *_READ_ONLY))})"
-    if kind in _PICKLES:
-        how = "section Recipes of docs/own-data.md has five lines that convert it to JSON Lines"
-        raise DatasetError(path, formats, f"a pickle, which may run any program when it is read: {how}")
     if not path.is_dir() and kind not in (*SUFFIXES, *_READ_ONLY):
-        raise DatasetError(path, formats, f"a file named *{kind}" if kind else "no suffix")
+        found = f"a file named *{kind}" if kind else "no suffix"
+        if kind in _PICKLES:
+            found = "a pickle, which may run any program: docs/own-data.md, Recipes, converts it in five lines"
+        raise DatasetError(path, f"a table ({', '.join((*SUFFIXES, *_READ_ONLY))})", found)
     try:
         if not path.stat().st_size:
             raise DatasetError(path, "a table", "an empty file")
@@ -139,8 +139,10 @@ def _read(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
     return table
 
 
-def _text(path: Path, data: bytes, options: Mapping[str, str]) -> str:
+def _text(path: Path, options: Mapping[str, str]) -> str:
     """Return the text of a file in the encoding that the user or its first bytes say; UTF-8 otherwise."""
+    with _pyarrow().input_stream(path) as stream:
+        data = bytes(stream.read())
     marked = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     encoding = options.get("encoding", "utf-16" if marked else "utf-8-sig")
     text, wrong = "", data.find(0) if encoding == "utf-8-sig" else -1
@@ -156,16 +158,11 @@ def _text(path: Path, data: bytes, options: Mapping[str, str]) -> str:
     return text.replace("\r\n", "\n")
 
 
-def _bytes(pa: Any, path: Path) -> bytes:
-    with pa.input_stream(path) as stream:
-        return bytes(stream.read())
-
-
 def line_of(path: Path, row: int, options: Mapping[str, str] | None = None) -> int:
     """Return the line, from 1, of a row of a text table, or the row, from 1, of another table."""
     if path.is_dir() or _kind(path) not in _TEXT:
         return row + 1
-    lines = _text(path, _bytes(_pyarrow(), path), options or {}).split("\n")
+    lines = _text(path, options or {}).split("\n")
     filled = [number for number, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")]
     header = not any(map(_is_number, re.split(r"[,;\s]+", lines[filled[0] - 1].strip())))
     return filled[row + header]
@@ -182,7 +179,7 @@ def _normal_text(path: Path, original: str, kind: str) -> tuple[bytes, str]:
         head, rest = (re.sub(r"(?m)^ +| +$", "", re.sub(r"[ \t]+", " ", part)) for part in (head, rest))
         comments = [" ".join(line.split()) for line in comments]
     are_numbers = list(map(_is_number, head.split(separator)))
-    names = [line for line in comments if len(line.split(separator)) == len(are_numbers)]
+    names = [line for line in comments if line.count(separator) == head.count(separator)]
     if names and any(are_numbers):  # numpy writes the names of the columns into a comment
         head, rest = names[-1], f"{head}\n{rest}"
     elif all(are_numbers):
@@ -201,7 +198,7 @@ def _normal_text(path: Path, original: str, kind: str) -> tuple[bytes, str]:
 def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> Any:
     from pyarrow import csv  # noqa: PLC0415  packages of an extra
 
-    data, separator = _normal_text(path, _text(path, _bytes(pa, path), options), kind)
+    data, separator = _normal_text(path, _text(path, options), kind)
 
     def parsed(decimal: str, *, threads: bool = True) -> Any:
         null = ["", "nan", "NaN", "NA", "null", "None"]
@@ -244,10 +241,8 @@ def _dates(pa: Any, path: Path, name: str, texts: NDArray[Any], options: Mapping
     unique, place = np.unique(texts, return_inverse=True)
     found = [text.strip() for text in unique.tolist()]
     order = _order_of_days(path, name, found, options)
-    days = [
-        _DAY_OR_MONTH.sub(order, text.removesuffix("UTC").strip().replace(",", ".")).replace("/", "-") for text in found
-    ]
-    dates = [re.sub(r"(?<=-)(\d)(?=[-T ])|(?<=[T ])(\d)(?=:)", r"0\1\2", text) or None for text in days]
+    days = [_DAY_OR_MONTH.sub(order, text.removesuffix("UTC").strip()).replace("/", "-") for text in found]
+    dates = [_ONE_DIGIT.sub(r"0\1", text.replace(",", ".")) or None for text in days]
     try:
         stamps = pa.array(dates).cast(pa.timestamp("ns", "UTC" if date[5] else None)).to_numpy(zero_copy_only=False)
     except pa.ArrowInvalid as error:
@@ -261,32 +256,25 @@ def _dates(pa: Any, path: Path, name: str, texts: NDArray[Any], options: Mapping
 def _order_of_days(path: Path, name: str, texts: list[str], options: Mapping[str, str]) -> str:
     """Return how a date as 03/01/2025 is written as 2025-01-03, as a replacement of `_DAY_OR_MONTH`."""
     orders = {"dmy": r"\4-\3-\1", "mdy": r"\4-\1-\3"}
-    order = options.get("date")
-    if order is not None and order not in orders:
-        raise DatasetError("--option date", "dmy or mdy", repr(order))
     found = [match for match in map(_DAY_OR_MONTH.match, texts) if match is not None]
-    if order is None and found:
-        if any(int(match[1]) > _MONTHS or match[2] == "." for match in found):
-            order = "dmy"
-        elif any(int(match[3]) > _MONTHS for match in found):
-            order = "mdy"
-        else:
-            both = "dates as YYYY-MM-DD, or --option date=dmy (day first) or date=mdy"
-            raise DatasetError(path, both, f"{found[0].string!r} in column {name}")
-    return orders[order or "dmy"]
+    first, second = (any(int(match[place]) > _MONTHS for match in found) for place in (1, 3))
+    order = options.get("date", "dmy" if not found or first or found[0][2] == "." else "mdy" if second else "")
+    if order not in orders:
+        expected = "dates as YYYY-MM-DD, or --option date=dmy (day first) or date=mdy"
+        raise DatasetError(path, expected, repr(options.get("date", texts[-1])) + f" for column {name}")
+    return orders[order]
 
 
 def _rows(pa: Any, records: list[dict[str, Any]]) -> Any:
-    """Return records as a table."""
-    names = dict.fromkeys(name for one in records for name in one)
-    return pa.table({name: _array(pa, [one.get(name) for one in records]) for name in names})
-
-
-def _array(pa: Any, values: list[Any]) -> Any:
-    try:
-        return pa.array(values)
-    except (pa.ArrowInvalid, pa.ArrowTypeError):  # of several types: as text, so that the first wrong row can be named
-        return pa.array([None if value is None else str(value) for value in values])
+    """Return records as a table; values of several types as text, so that the first wrong one can be named."""
+    columns = {}
+    for name in dict.fromkeys(name for one in records for name in one):
+        values = [one.get(name) for one in records]
+        try:
+            columns[name] = pa.array(values)
+        except (pa.ArrowInvalid, pa.ArrowTypeError):
+            columns[name] = pa.array([None if value is None else str(value) for value in values])
+    return pa.table(columns)
 
 
 def _is_number(text: str) -> bool:
@@ -348,9 +336,7 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """
     kind = path.suffix.lower()
     if kind in {".jsonl", ".ndjson"}:  # dates as text
-        columns = {
-            name: values.astype(np.str_) if values.dtype.kind == "M" else values for name, values in columns.items()
-        }
+        columns = {name: one.astype(np.str_) if one.dtype.kind == "M" else one for name, one in columns.items()}
     table = to_arrow(columns)
     path.parent.mkdir(parents=True, exist_ok=True)
     content: Any = io.BytesIO()

@@ -112,9 +112,7 @@ def _out(out: Path) -> Path:
 Out = Annotated[
     Path,
     typer.Option(
-        "--out",
-        callback=_out,
-        help="Folder for the results, or one table: tracks.csv, .parquet, .jsonl or .feather.",
+        "--out", callback=_out, help="Folder for the results, or one table: .csv, .parquet, .jsonl, .feather."
     ),
 ]
 Full = Annotated[

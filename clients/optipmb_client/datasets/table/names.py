@@ -51,7 +51,7 @@ def _turn(bases: str, part: str, place: int) -> tuple[str, ...]:
 ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
     "stamp": ("stamp", "t", "time", "timestamp", "ts", "sec", "secs", "seconds", "nanoseconds", "sim_time", "datetime",
               "header_stamp", "header_timestamp"),
-    "nanosec": ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds", "nanosec_part", "nanoseconds_part"),
+    "nanosec": ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds"),
     "frame": ("frame", "frame_id", "frame_index", "frame_idx", "frame_number", "frame_no", "frame_nr"),
     "x": ("x", "cx", "px", "x_center", "tx", *_vector(_CENTER, "x", 0)),
     "y": ("y", "cy", "py", "y_center", "ty", *_vector(_CENTER, "y", 1)),
@@ -98,7 +98,6 @@ _UNITS: Final[Mapping[str, str]] = {
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us",
     "ns": "ns", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanosecs": "ns", "nanoseconds": "ns",
 }  # fmt: skip
-_SECONDS: Final = ("sec", "secs", "seconds")
 _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
 
 
@@ -110,7 +109,6 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, C
         chosen: meanings whose column the user has named.
     """
     known = [_normalised(name) for name in names]
-    nanosec = _nanosec([one.name for one in known])
     taken: dict[str, Column] = {}
     used = set(chosen.values())
     for role, aliases in ALIASES.items():
@@ -123,30 +121,22 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, C
             first, last = ([f"{name}_{place}" for name in lists] for lists in (BOX_LISTS, ("bbox", "box")))
             aliases = (*first, *aliases, *last)  # noqa: PLW2901
         fitting = [one for one in known if one.base in aliases and one.name not in used]
-        if role == "stamp":
-            fitting = [one for one in fitting if one.name not in nanosec.values()]
-        elif role == "nanosec":
-            part = nanosec.get(taken["stamp"].name) if "stamp" in taken else None
-            fitting = [Column(one.name, "ns", aliases[0]) for one in known if one.name == part]
+        if role == "nanosec":
+            bases = {
+                one.base for one in known if "stamp" in taken and one.name == taken["stamp"].name and one.unit == "s"
+            }
+            parts = [one for one in known if bases and _is_second_half(one)]
+            fitting = [Column(one.name, "ns", aliases[0]) for one in parts if one.base in bases or one.base in aliases]
         if fitting:
-            best = min(fitting, key=lambda one: aliases.index(one.base))
+            best = min(fitting, key=lambda one: (aliases.index(one.base), _is_second_half(one)))
             taken[role] = best
             used.add(best.name)
     return taken
 
 
-def _nanosec(names: Iterable[str]) -> dict[str, str]:
-    """Return the column of nanoseconds that belongs to each column of whole seconds: `stamp.sec`, `stamp.nanosec`."""
-    known = {_plain(name): name for name in names}
-    found: dict[str, str] = {}
-    for base, name in known.items():
-        head, _, tail = base.rpartition("_")
-        if tail in _SECONDS:
-            parts = [f"{head}_{part}" if head else part for part in ALIASES["nanosec"]] + list(ALIASES["nanosec"])
-            part = next((known[one] for one in parts if one in known), None)
-            if part is not None:
-                found[name] = part
-    return found
+def _is_second_half(column: Column) -> bool:
+    """Tell whether a column may be the rest of a stamp, as `stamp.nanosec` beside `stamp.sec`; `stamp_ns` is not."""
+    return column.unit == "ns" and not _plain(column.name).endswith("ns")
 
 
 def _plain(name: str) -> str:
