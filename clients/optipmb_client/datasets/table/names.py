@@ -133,7 +133,7 @@ def _nanosec(names: Iterable[str]) -> dict[str, str]:
         head, _, tail = base.rpartition("_")
         if tail in _SECONDS:
             parts = [f"{head}_{part}" if head else part for part in ALIASES["nanosec"]] + list(ALIASES["nanosec"])
-            found |= {name: known[part] for part in parts[::-1] if part in known}
+            found.update((name, known[part]) for part in parts[::-1] if part in known)
     return found
 
 
