@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from optipmb_schemas.installation import install_command
 
 from optipmb_client.colours import colour_of
 from optipmb_client.datasets import DataSequence, Truth
@@ -52,7 +53,7 @@ def draw_tracks(
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - matplotlib is an extra
         from matplotlib.figure import Figure  # noqa: PLC0415 - matplotlib is an extra
     except ImportError as error:
-        raise ClientError("pictures need matplotlib, which is not installed: pip install 'optipmb[plot]'") from error
+        raise ClientError(f"pictures need matplotlib, which is not installed: {install_command('plot')}") from error
     _, sensor = stack_poses(sequence.poses)
     low, high = _extent([sensor, tracks.center, truth.center if truth else sensor])
     width, height = np.maximum(11.0 / max(high - low) * (high - low), (7.5, 3.0)).tolist()
