@@ -207,6 +207,11 @@ class ClassParameters(_Table):
     adaptive_birth_rate: Positive = Field(
         description="mu_ab: weight of the Poisson component of a low-scored detection"
     )
+    baseline_birth_rate: Positive = Field(
+        default=0.1,
+        exclude_if=(0.1).__eq__,
+        description="weight of the Poisson component of every detection where HABM is off, as in GNN-PMB",
+    )
     undetected_birth_rate: Positive = Field(
         description="mu_b0: expected undetected objects in the region of observation"
     )
