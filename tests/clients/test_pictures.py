@@ -10,7 +10,7 @@ from optipmb_client.animation import WIDTH_PX, animate_tracks
 from optipmb_client.datasets import DataSequence, Truth, open_dataset
 from optipmb_client.errors import ClientError
 from optipmb_client.evaluation import ClearResult, Rules, evaluate_clear
-from optipmb_client.pictures import draw_tracks
+from optipmb_client.pictures import Panel, draw_tracks
 from optipmb_client.results import ResultTable, empty_table
 from PIL import Image
 
@@ -52,7 +52,7 @@ def test_a_picture_shows_tracks_truth_sensor_and_failures(tmp_path: Path, monkey
     results: list[ClearResult] = [evaluate_clear(truth, tracks, name, RULES) for name in truth.labels]
     assert sum(len(result.switches) for result in results) == 1
     path = tmp_path / "new" / "tracks.png"
-    texts = text_of(path, monkeypatch, sequence, tracks, truth, results)
+    texts = text_of(path, monkeypatch, sequence, [Panel(tracks, results)], truth)
     assert path.read_bytes().startswith(PNG)
     assert any("(m)" in text for text in texts)
     for name in ("truth", "sensor", "miss", "change of id"):
@@ -65,17 +65,18 @@ def test_the_same_tracks_give_the_same_bytes(tmp_path: Path) -> None:
     """A picture has no date in it."""
     sequence, truth, tracks = scene()
     for name in ("a.png", "b.png"):
-        draw_tracks(tmp_path / name, sequence, tracks, truth)
+        draw_tracks(tmp_path / name, sequence, [Panel(tracks)], truth)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 def test_a_sequence_without_tracks_or_truth_is_drawn_too(tmp_path: Path) -> None:
     """Only the sensor's path, and also when there is a single track far away."""
     sequence, truth, tracks = scene()
-    draw_tracks(tmp_path / "none.png", sequence, empty_table())
-    draw_tracks(tmp_path / "truth.png", sequence, empty_table(), truth)
+    draw_tracks(tmp_path / "none.png", sequence, [Panel(empty_table())])
+    draw_tracks(tmp_path / "truth.png", sequence, [Panel(empty_table())], truth)
     far = tracks.take(np.arange(1))
-    draw_tracks(tmp_path / "far.png", sequence, replace(far, center=far.center + np.array([900.0, 0.0, 0.0])))
+    far = replace(far, center=far.center + np.array([900.0, 0.0, 0.0]))
+    draw_tracks(tmp_path / "far.png", sequence, [Panel(far)])
     assert len(list(tmp_path.glob("*.png"))) == 3
 
 
@@ -84,7 +85,7 @@ def test_without_matplotlib_the_error_says_what_to_install(tmp_path: Path, monke
     sequence, _, tracks = scene()
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ClientError, match=r"optipmb\[plot\]"):
-        draw_tracks(tmp_path / "a.png", sequence, tracks)
+        draw_tracks(tmp_path / "a.png", sequence, [Panel(tracks)])
 
 
 def test_a_gif_shows_every_frame_in_the_time_of_the_sequence(tmp_path: Path) -> None:
