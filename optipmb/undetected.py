@@ -128,7 +128,7 @@ def with_births(
 def with_measurement_births(
     poisson: Poissons, measurements: Measurements, stamp_ns: int, table: ClassTable
 ) -> Poissons:
-    """Add a component of weight `baseline_birth_rate` for every measurement, as GNN-PMB, the baseline of the ablation."""
+    """Add a component of weight `baseline_birth_rate` for every measurement: GNN-PMB's birth model, the baseline."""
     weight = np.concatenate((poisson.weight, table["baseline_birth_rate"][measurements.label]))
     kept, born = np.arange(len(poisson)), np.arange(measurements.score.shape[0])
     components = components_in(poisson.words)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run_here
 from optipmb_client.animation import WIDTH_PX, animate_tracks
 from optipmb_client.datasets import DataSequence, Truth, open_dataset
 from optipmb_client.errors import ClientError
@@ -112,3 +113,32 @@ def test_a_gif_follows_a_sensor_that_drives_far(tmp_path: Path) -> None:
     animate_tracks(tmp_path / "none.gif", sequence, empty_table())
     with Image.open(tmp_path / "far.gif") as wide, Image.open(tmp_path / "none.gif") as empty:
         assert wide.height < wide.width == empty.width
+
+
+def test_several_trackers_are_drawn_on_the_same_axes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One panel for each --tracks, named by it, by its path where names are alike; a GIF shows one tracker."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - matplotlib is an extra
+
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_args, **_options: drawn.append(figure))
+    data = ["--dataset", "scene", "--option", "frames=16", "--option", "clouds=0", "--sequences", "0000"]
+    folders = [tmp_path / "one" / "x", tmp_path / "two" / "x", tmp_path / "wide.v2"]
+    for folder, profile in zip(folders, ("scene", "kitti", "generic"), strict=True):
+        assert run_here(capsys, "track", *data, "--profile", profile, "--out", folder).returncode == 0
+    for chosen, names in (
+        (folders[1:], ["x", "wide.v2"]),
+        (folders[:2], [str(folder) for folder in folders[:2]]),
+        (folders[:1], ["Sequence 0000"]),
+    ):
+        words = [word for folder in chosen for word in ("--tracks", folder)]
+        done = run_here(capsys, "plot", *data, *words, "--out", tmp_path / "a.png")
+        assert done.returncode == 0, done.stderr
+        panels = drawn[-1].axes
+        assert [panel.get_title().partition(":")[0] for panel in panels] == names
+        assert len({(panel.get_xlim(), panel.get_ylim()) for panel in panels}) == 1
+    words = [word for folder in folders for word in ("--tracks", folder)]
+    done = run_here(capsys, "plot", *data, *words, "--out", tmp_path / "a.gif")
+    assert done.returncode == 2
+    assert "received 3" in done.stderr

@@ -43,7 +43,7 @@ def plot(  # noqa: PLR0913  these are the command's options
     score: Annotated[float | None, typer.Option(help="Least mean score of a track; default: the best one.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Draw the tracks of one sequence from above, those of several trackers side by side, with what was missed and confused where the truth is known."""
+    """Draw the tracks of one sequence from above, with what was missed and confused where the truth is known."""
     from optipmb_client.drawing import draw_results  # noqa: PLC0415  loads the solvers of scipy
     from optipmb_client.evaluation import default_rules, evaluate_files  # noqa: PLC0415  as above
 

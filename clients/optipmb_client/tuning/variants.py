@@ -93,9 +93,7 @@ def sweep(parameters: Parameters, classes: Sequence[str], path: str, values: Seq
     return variants
 
 
-def measure_variants(
-    source: Source, variants: Sequence[Variant], on_clip: Callable[[int], None]
-) -> Iterator[Row]:
+def measure_variants(source: Source, variants: Sequence[Variant], on_clip: Callable[[int], None]) -> Iterator[Row]:
     """Track everything once with each variant; yield its row when it is done.
 
     Args:
