@@ -76,7 +76,7 @@ def ablate(  # noqa: PLR0913  these are the command's options
     marks = [[("x" if getattr(row.variant.modules, one) else "") for one in MODULES] for row in rows]
     speed = [f"{row.frames_per_second:.0f}" for row in rows]
     for title, figures in by_class(rows):
-        cells = [[*left, *shown(one, SHOWN), fps] for left, one, fps in zip(marks, figures, speed, strict=True)]
+        cells = [[*left, *cells_of(one, SHOWN), fps] for left, one, fps in zip(marks, figures, speed, strict=True)]
         print_rows(title, [one.upper() for one in MODULES], [*SHOWN, "FPS"], cells, markdown=markdown)
 
 
@@ -94,7 +94,7 @@ def by_class(rows: "Many[Row]") -> "list[tuple[str, list[Figures]]]":
     return tables if len(tables) == 1 else [*tables, ("all classes", [row.overall for row in rows])]
 
 
-def shown(figures: "Figures", names: "Many[str]") -> list[str]:
+def cells_of(figures: "Figures", names: "Many[str]") -> list[str]:
     """Return figures as the cells of a table."""
     values = figures.to_json()
     return [_cell(values[name]) for name in names]

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from optipmb_client.commands.ablate import by_class, measured, print_rows, shown
+from optipmb_client.commands.ablate import by_class, cells_of, measured, print_rows
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
@@ -79,7 +79,7 @@ def sweep(  # noqa: PLR0913  these are the command's options
         swept.append({"parameter": path, "profile": own, "values": tried, "figures": figures})
         for label, each in [] if as_json else by_class(found):
             now = f" (profile: {own[label]})" if label in own else ""
-            cells = [[str(value), *shown(one, SHOWN)] for value, one in zip(tried, each, strict=True)]
+            cells = [[str(value), *cells_of(one, SHOWN)] for value, one in zip(tried, each, strict=True)]
             print_rows(f"{label}, {path}{now}", [path], SHOWN, cells)
     result = {
         "command": "sweep",

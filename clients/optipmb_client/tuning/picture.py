@@ -26,15 +26,16 @@ def write_sweep(folder: Path, result: Mapping[str, Any], *, picture: bool) -> No
 
     """
     folder.mkdir(parents=True, exist_ok=True)
+    rows = [
+        {"parameter": one["parameter"], "value": value, "class": label, **figures}
+        for one in result["sweeps"]
+        for label, each in one["figures"].items()
+        for value, figures in zip(one["values"], each, strict=True)
+    ]
     lines = io.StringIO()
-    table = csv.writer(lines, lineterminator="\n")
-    for number, one in enumerate(result["sweeps"]):
-        for label, rows in one["figures"].items():
-            if number == 0 and label == next(iter(one["figures"])):
-                table.writerow(["parameter", "value", "class", *rows[0]])
-            table.writerows(
-                [one["parameter"], value, label, *row.values()] for value, row in zip(one["values"], rows, strict=True)
-            )
+    table = csv.DictWriter(lines, list(rows[0]), lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
     for name, text in (("sweep.json", json.dumps(result, indent=1) + "\n"), ("sweep.csv", lines.getvalue())):
         file = AtomicText(folder / name)
         file.write(text)
