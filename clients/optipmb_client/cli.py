@@ -27,6 +27,7 @@ from optipmb_client.commands.profiles import profiles
 from optipmb_client.commands.record import record
 from optipmb_client.commands.replay import replay
 from optipmb_client.commands.status import status
+from optipmb_client.commands.sweep import sweep
 from optipmb_client.commands.track import track
 from optipmb_client.commands.tracks import tracks
 from optipmb_client.commands.tune import tune
@@ -82,6 +83,7 @@ for command in (
     evaluate,
     tune,
     ablate,
+    sweep,
     plot,
     status,
     tracks,
