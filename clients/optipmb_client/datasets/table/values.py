@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from optipmb import common_name
+from optipmb_client.class_names import class_like
 from optipmb_client.datasets.motion import SAME_DIRECTION, Moves
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Ints, wrap_angle
@@ -402,7 +402,7 @@ def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bo
     """
     order = reading.chosen("sizes", ("lwh", "wlh", "hwl"))
     if order is None:
-        long = {name for name in np.unique(names).tolist() if common_name(name) in LONG}
+        long = {name for name in np.unique(names).tolist() if class_like(name, LONG)}
         vehicles = sizes[np.isin(names, list(long))]
         median = np.median(vehicles, axis=0) if len(vehicles) else np.array([3.0, 2.0, 1.0])
         longest = int(np.argmax(median))
@@ -418,7 +418,7 @@ def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bo
     return sizes[:, [order.index(letter) for letter in "lwh"]]
 
 
-LONG: Final = frozenset({"car", "truck", "bus", "trailer"})
+LONG: Final = ("car", "truck", "bus", "trailer")
 _SIDES: Final = {"l": "length", "w": "width", "h": "height"}
 
 
