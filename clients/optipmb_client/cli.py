@@ -14,6 +14,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from optipmb_client.arguments import filled, spread
 from optipmb_client.commands.ablate import ablate
+from optipmb_client.commands.check import check
 from optipmb_client.commands.demo import demo
 from optipmb_client.commands.drain import drain
 from optipmb_client.commands.evaluate import evaluate
@@ -73,6 +74,7 @@ app = typer.Typer(
 )
 for command in (
     demo,
+    check,
     track,
     replay,
     record,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from optipmb_schemas.installation import install_command
 
 from optipmb_client.colours import colour_of
 from optipmb_client.datasets import DataSequence, Truth
@@ -54,7 +55,7 @@ def draw_tracks(path: Path, sequence: DataSequence, panels: Sequence[Panel], tru
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - matplotlib is an extra
         from matplotlib.figure import Figure  # noqa: PLC0415 - matplotlib is an extra
     except ImportError as error:
-        raise ClientError("pictures need matplotlib, which is not installed: pip install 'optipmb[plot]'") from error
+        raise ClientError(f"pictures need matplotlib, which is not installed: {install_command('plot')}") from error
     _, sensor = stack_poses(sequence.poses)
     low, high = _extent([sensor, *(panel.tracks.center for panel in panels), truth.center if truth else sensor])
     longest = 11.0 if len(panels) == 1 else 8.0

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from optipmb_schemas.installation import install_command
 
 from optipmb_client.errors import ClientError
 from optipmb_client.files import AtomicText, DatasetError
@@ -47,7 +48,7 @@ def _pyarrow() -> Any:
     try:
         import pyarrow as pa  # noqa: PLC0415  packages of an extra
     except ImportError as error:
-        raise ClientError("tables need pyarrow, which is not installed: pip install 'optipmb[table]'") from error
+        raise ClientError(f"tables need pyarrow, which is not installed: {install_command('table')}") from error
     return pa
 
 
