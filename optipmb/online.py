@@ -104,7 +104,7 @@ class OnlineTracks:
         try:
             import pyarrow as pa  # noqa: PLC0415 - an extra
         except ImportError as error:
-            raise ImportError("to_arrow needs pyarrow: pip install 'optipmb[table]'") from error
+            raise ImportError("to_arrow needs pyarrow: pip install pyarrow") from error
         return pa.table(
             {name: pa.array(values, from_pandas=values.dtype.kind == "f") for name, values in self.columns().items()}
         )

@@ -9,6 +9,7 @@ Called as: python tests/paths.py DIST [PATH...]
 import csv
 import os
 import re
+import shlex
 import shutil
 import socket
 import statistics
@@ -64,15 +65,21 @@ class Environment:
         files = (file for one in ours for file in (one.rglob("*") if one.is_dir() else (one,)))
         return sum(file.stat().st_blocks for file in files) * 512 / 2**20
 
-    def run(self, program: str, *arguments: object) -> str:
-        """Run a program of the environment and return what it printed; it must end well."""
+    def run(self, program: str, *arguments: object, folder: Path | None = None, status: int = 0) -> str:
+        """Run a program of the environment and return what it printed; it must end with the status."""
         command = [str(self.folder / "bin" / program), *map(str, arguments)]
         done = subprocess.run(
-            command, cwd=self.work, env=self.variables, capture_output=True, text=True, timeout=LIMIT_S, check=False
+            command,
+            cwd=folder or self.work,
+            env=self.variables,
+            capture_output=True,
+            text=True,
+            timeout=LIMIT_S,
+            check=False,
         )
-        if done.returncode:
+        if done.returncode != status:
             sys.exit(f"{' '.join(command)}: status {done.returncode}\n{done.stdout}{done.stderr}")
-        return done.stdout
+        return done.stdout if status == 0 else done.stderr
 
     def start(self, program: str, *arguments: object) -> "subprocess.Popen[str]":
         """Start a program of the environment; what it says on standard error goes into a file."""
@@ -127,9 +134,15 @@ def write_cars(path: Path) -> None:
 
 def csv_in_and_out(base: Path, wheel: Path, _node: Path) -> None:
     """A table to a table: with pip, and with pipx and uv, which give a command an environment of its own."""
-    place = Environment(base, "table", f"{wheel}[table]")
+    place = Environment(base, "table", f"{wheel}[client]")
+    for line in sorted(set(re.findall(r"pip (install (?:'\..*?'|\..*?)(?=[ `\n]))", README))):
+        place.run("pip", *shlex.split(line), "--dry-run", "--no-deps", "--ignore-installed", folder=ROOT)
+        said(f"  pip {line}: can be installed")
     write_cars(place.work / "detections.csv")
     command = blocks(README, "sh", "track detections.csv").splitlines()[-1].split()
+    hint = place.run(*command, status=1).strip().rpartition("not installed: ")[2]
+    place.run(*shlex.split(hint), "--quiet", "--disable-pip-version-check")
+    said(f"  {hint}: {place.megabytes:.0f} MB beside Python and pip")
     for what in ("the first tracks, with compilation", "again"):
         timed(what, lambda: place.run(*command))
     with (place.work / "tracks.csv").open() as file:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from optipmb_schemas.installation import install_command
 
 from optipmb_client.colours import colour_of
 from optipmb_client.datasets import DataSequence, DetectionFrame, Truth
@@ -54,7 +55,7 @@ def animate_tracks(path: Path, sequence: DataSequence, tracks: ResultTable, trut
     try:
         from PIL import Image  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise ClientError("pictures need matplotlib, which is not installed: pip install 'optipmb[plot]'") from error
+        raise ClientError(f"pictures need matplotlib, which is not installed: {install_command('plot')}") from error
     step = -(-len(sequence) // FRAMES)
     given = [frame for frame in sequence.frames() if frame.index % step == 0]
     if not given:

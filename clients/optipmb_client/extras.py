@@ -4,6 +4,8 @@ import importlib.util
 from collections.abc import Mapping
 from typing import Final
 
+from optipmb_schemas.installation import install_command
+
 from optipmb_client.errors import ClientError
 
 __all__ = ["needed", "to_install"]
@@ -26,7 +28,7 @@ _EXTRA_OF: Final = {package: extra for extra, packages in _EXTRAS.items() for pa
 def to_install(package: str, what: str = "this") -> str | None:
     """Return the line that says how to install a package that is missing; None for one that no extra brings."""
     extra = _EXTRA_OF.get(package.partition(".")[0])
-    return None if extra is None else f"{what} needs {package}, which is not installed: pip install 'optipmb[{extra}]'"
+    return None if extra is None else f"{what} needs {package}, which is not installed: {install_command(extra)}"
 
 
 def needed(what: str, extra: str, *packages: str) -> None:
@@ -37,4 +39,4 @@ def needed(what: str, extra: str, *packages: str) -> None:
     """
     for package in packages:
         if importlib.util.find_spec(package) is None:
-            raise ClientError(f"{what} needs {package}, which is not installed: pip install 'optipmb[{extra}]'")
+            raise ClientError(f"{what} needs {package}, which is not installed: {install_command(extra)}")

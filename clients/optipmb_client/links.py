@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Protocol
 
 from optipmb_schemas import Message
+from optipmb_schemas.installation import install_command
 
 from optipmb_client.errors import ClientError, ConnectionFailed
 from optipmb_client.incoming import Answer, Inbox
@@ -74,6 +75,5 @@ def linked(
     try:
         from optipmb_client.grpc import GrpcConnection  # noqa: PLC0415  an extra that only this needs
     except ModuleNotFoundError as error:
-        how = "pip install 'optipmb[grpc]', or 'optipmb-node[grpc]'"
-        raise ClientError(f"gRPC needs {error.name}, which is not installed: {how}") from error
+        raise ClientError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
     return GrpcConnection(tuple(endpoint.removeprefix(GRPC) for endpoint in endpoints), config=config, timeout=timeout)

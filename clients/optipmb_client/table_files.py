@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from optipmb_schemas.installation import install_command
 
 from optipmb_client.detector_files import LISTS, frame_files, is_kitti_object, read_frames, read_json, split_boxes
 from optipmb_client.errors import ClientError
@@ -74,7 +75,7 @@ def _pyarrow() -> Any:
     try:
         import pyarrow as pa  # noqa: PLC0415  packages of an extra
     except ImportError as error:
-        raise ClientError("tables need pyarrow, which is not installed: pip install 'optipmb[table]'") from error
+        raise ClientError(f"tables need pyarrow, which is not installed: {install_command('table')}") from error
     return pa
 
 

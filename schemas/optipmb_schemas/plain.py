@@ -17,7 +17,7 @@ WHOLE: Final = (int,)
 REAL: Final = (int, float)
 
 if sys.byteorder != "little":
-    raise ImportError("on a big-endian machine the messages need numpy: pip install 'optipmb-node[arrays]'")
+    raise ImportError("on a big-endian machine the messages need numpy: pip install numpy")
 
 _CODES: Final = dict(zip(("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"), "fdbhiqBHIQ", strict=True))
 """Number types of the wire, by the letters of `array` and `struct`."""
@@ -30,7 +30,7 @@ class Numbers:
     """Numbers in rows, read-only: what a field holds where numpy is not installed.
 
     `len`, loops, `[i]`, `shape`, `tolist` and `tobytes` do what those of a numpy array do; a row of a table is again of
-    this type. Further operations need numpy: `pip install 'optipmb-node[arrays]'`.
+    this type. Further operations need numpy: `pip install numpy`.
 
     Args:
         flat: All numbers, row by row.
@@ -73,7 +73,7 @@ class Numbers:
         try:
             at = operator.index(row)
         except TypeError:
-            needs = "slices and several indices need numpy: pip install 'optipmb-node[arrays]'"
+            needs = "slices and several indices need numpy: pip install numpy"
             raise TypeError(needs) from None
         number = range(len(self))[at]
         if len(self.shape) == 1:

@@ -18,7 +18,9 @@ def main() -> None:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("optipmb"):
             raise
-        sys.exit(f"optipmb-service needs {error.name}, which is not installed: pip install 'optipmb[service]'")
+        from optipmb_schemas.installation import install_command  # noqa: PLC0415 - as above
+
+        sys.exit(f"optipmb-service needs {error.name}, which is not installed: {install_command('service')}")
     cli.main()
 
 

@@ -19,6 +19,7 @@ from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.offline import profile_for
 from optipmb_client.table_files import write_table
 from optipmb_client.tracking import track
+from optipmb_schemas.installation import install_command
 from own_tables import FRAMES, boxes
 
 ENDS_S = 120.0
@@ -156,4 +157,4 @@ def test_no_ray_is_said(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.
     scene = ["--dataset", "scene", "--option", "frames=3", "--option", "clouds=0"]
     for words in (["--ray", *scene], [*scene, "--ray"], [*scene, "--ray", "10.0.0.1:6379"], [*scene, "--ray", "auto"]):
         assert command(["track", *words]) == 1
-        assert "pip install 'optipmb[ray]'" in capsys.readouterr().err
+        assert install_command("ray") in capsys.readouterr().err

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
+from optipmb_schemas.installation import install_command
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
 
@@ -232,7 +233,7 @@ def mcap_needed() -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise ClientError("recordings need mcap, which is not installed: pip install 'optipmb[record]'") from error
+        raise ClientError(f"recordings need mcap, which is not installed: {install_command('record')}") from error
 
 
 def print_table(table: RenderableType) -> None:

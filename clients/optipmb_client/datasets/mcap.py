@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from optipmb_schemas import Detections, Points, decode
+from optipmb_schemas.installation import install_command
 
 from optipmb_client.camera import synthetic_camera
 from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFrame, Truth
@@ -27,7 +28,7 @@ try:
     from optipmb_client.mcap_files.plan import StreamPlan, plan, steps
     from optipmb_client.mcap_files.reading import Recorded, RecordingFile
 except ImportError as error:
-    raise ClientError("recordings need mcap, which is not installed: pip install 'optipmb[record]'") from error
+    raise ClientError(f"recordings need mcap, which is not installed: {install_command('record')}") from error
 
 _HERE = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 

@@ -8,6 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 
+from optipmb_schemas.installation import install_command
+
 from optipmb_client.camera import synthetic_camera
 from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFrame, Points, Truth
 from optipmb_client.errors import ClientError
@@ -23,7 +25,7 @@ try:
     from optipmb_client.rosbag.reading import Bag, Raw
     from optipmb_client.rosbag.writing import BagResultWriter
 except ImportError as error:
-    raise ClientError("bags need rosbags, which is not installed: pip install 'optipmb[ros2]'") from error
+    raise ClientError(f"bags need rosbags, which is not installed: {install_command('ros2')}") from error
 
 _CLASS = "class."
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from optipmb_schemas.installation import install_command
 from rich.table import Table
 
 from optipmb_client.colours import COLOURS
@@ -41,7 +42,7 @@ def draw_runs(path: Path, runs: Sequence[Run], latency_ms: float | None = None) 
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra
         from matplotlib.figure import Figure  # noqa: PLC0415  matplotlib is an extra
     except ImportError as error:
-        raise ClientError("pictures need matplotlib, which is not installed: pip install 'optipmb[plot]'") from error
+        raise ClientError(f"pictures need matplotlib, which is not installed: {install_command('plot')}") from error
     runs = sorted(runs, key=lambda run: run.throughput)
     rates = [run.throughput for run in runs]
     figure = Figure(figsize=(8.0, 4.8), layout="constrained")

