@@ -209,7 +209,7 @@ class _Table:
         row = np.flatnonzero(kept)
         center, size, yaw, names = center[row], size[row], yaw[row], names[row]
         kind = np.unique(names, return_inverse=True)[1].astype(np.int64)
-        stated = found["l"].base in {"l", "length", "box_length"} or found["l"].base.endswith("_l")
+        stated = found["l"].base == "l" or found["l"].base.endswith(("_l", "length"))
         size = read_sizes(reading, size, names, stated=stated)
         camera = read_axes(reading, center)
         if camera:
