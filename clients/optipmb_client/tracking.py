@@ -7,13 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from optipmb import Modules, Parameters
 from optipmb_client.bulk import Done, Executor, Failed, Here, Outcome, in_order, run
 from optipmb_client.datasets import DataSequence, Dataset, DatasetArguments
+from optipmb_client.datasets.nuscenes import NuScenesDataset
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.files import remove_unfinished
 from optipmb_client.offline import track_whole
 from optipmb_client.recording import Latency, Results, horizons_for, latency
+from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES
 from optipmb_client.table_files import Columns
 
 __all__ = ["RecordingsFailed", "TrackedSequence", "track"]
@@ -31,8 +35,12 @@ class TrackedSequence:
     frames: int
     clouds: int
     detections: int
-    left_out: int
-    """Detections of classes that the profile lacks."""
+    left_out: dict[str, int]
+    """Number of detections of each class that the profile lacks, by the detector's name."""
+    filtered: dict[str, tuple[int, int]]
+    """Number of detections below the score filter, and of all, of each class of the profile that has any."""
+    cut: tuple[int, int]
+    """Number of boxes beyond those that a benchmark accepts in a sample, and of the samples."""
     tracks: int
     confirmed: int
     """Tracks that were confirmed in some frame."""
@@ -105,6 +113,8 @@ def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Col
         on_frame=opened.on_frame,
     )
     written = Results(opened.dataset, shared.out, full=shared.full).write(sequence, found.tracks)
+    most = NUSCENES_MAX_BOXES if isinstance(opened.dataset, NuScenesDataset) and isinstance(written, Path) else np.inf
+    beyond = np.maximum(np.array([len(one.id) for one in found.tracks.values()]) - most, 0)
     return TrackedSequence(
         name,
         written if isinstance(written, Path) else shared.out,
@@ -112,6 +122,8 @@ def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Col
         found.clouds,
         found.detections,
         found.left_out,
+        found.filtered,
+        (int(beyond.sum()), int((beyond > 0).sum())),
         len({int(number) for one in found.tracks.values() for number in one.id}),
         len({int(number) for one in found.tracks.values() for number in one.id[one.tracks.confirmed]}),
         found.seconds,

@@ -38,6 +38,7 @@ from optipmb_client.datasets.kitti_files import (
 from optipmb_client.files import DatasetError, read_points, read_rows
 from optipmb_client.geometry import Floats, Ints, Pose, pose_of, stack_poses, to_world
 from optipmb_client.results import KittiResultWriter, ResultWriter
+from optipmb_client.results.kitti import SUBMISSION_SCORES
 
 PERIOD_NS = 100_000_000
 
@@ -253,6 +254,7 @@ class KittiDataset:
         clouds: bool = True,
         split: str | None = None,
         poses: str | None = None,
+        submission: str | None = None,
     ) -> None:
         halves = [name for name in (split, "training", "testing") if name and (root / name).is_dir()]
         base = root / halves[0] if halves else root
@@ -263,6 +265,7 @@ class KittiDataset:
         if poses not in {None, "none"}:
             raise DatasetError("option poses", "none: the sensor is taken to stand still", repr(poses))
         self._layout = Layout(root, base, _find_detector(root, base, detections), clouds, poses == "none")
+        self._submitted = None if submission is None else _thresholds(submission)
 
     @property
     def notes(self) -> Iterator[str]:
@@ -270,6 +273,11 @@ class KittiDataset:
         layout = self._layout
         if layout.still:
             yield "poses=none: the sensor is taken to stand still, and tracks are in its frame"
+        if self._submitted is not None:
+            least = ", ".join(f"{name} {score:g}" for name, score in self._submitted.items())
+            yield f"submission: confirmed tracks from these mean scores on, where the image shows them: {least}"
+            if missing := sorted(self._calibrated() - set(self._present())):
+                yield f"submission: no detections, so no file, of {' '.join(missing)}"
         for name, folder in _by_class(sorted(layout.detector.glob("*/")) if layout.detector else ()).items():
             if name != folder.name:
                 yield f"{folder}: read as detections of {name}"
@@ -301,10 +309,13 @@ class KittiDataset:
     def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
         """Return a writer of `out/SSSS.txt`."""
         camera = KittiSequence(sequence.name, self._layout).camera
-        return KittiResultWriter(out / f"{sequence.name}.txt", camera)
+        return KittiResultWriter(out / f"{sequence.name}.txt", camera, self._submitted)
+
+    def _calibrated(self) -> set[str]:
+        return {path.stem for path in (self._layout.base / "calib").glob("*.txt")}
 
     def _present(self) -> list[str]:
-        calibrated = {path.stem for path in (self._layout.base / "calib").glob("*.txt")}
+        calibrated = self._calibrated()
         if self._layout.detector is None:
             return sorted(calibrated)
         detected = {path.stem for path in self._layout.detector.glob("*/*.txt")}
@@ -312,6 +323,19 @@ class KittiDataset:
 
     def _needed(self) -> str:
         return "calib" if self._layout.detector is None else f"calib and detections ({self._layout.detector})"
+
+
+def _thresholds(submission: str) -> dict[str, float]:
+    """Return the least mean score of a track by class, given one for all or `default`."""
+    if submission == "default":
+        return SUBMISSION_SCORES
+    try:
+        score = float(submission)
+    except ValueError:
+        score = np.nan
+    if not 0.0 <= score <= 1.0:
+        raise DatasetError("--submission", "a mean score from 0 to 1", repr(submission))
+    return dict.fromkeys(SUBMISSION_SCORES, score)
 
 
 def _by_class(folders: Iterable[Path]) -> dict[str, Path]:

@@ -26,7 +26,7 @@ from optipmb_client.datasets.nuscenes_tables import Annotations, Keyframe, NuSce
 from optipmb_client.files import DatasetError, read_points
 from optipmb_client.geometry import Bools, Floats, Ints, Pose
 from optipmb_client.results import ResultWriter
-from optipmb_client.results.nuscenes import NuScenesResultWriter, join_scenes
+from optipmb_client.results.nuscenes import NUSCENES_FILE, NUSCENES_MAX_BOXES, NuScenesResultWriter, join_scenes
 from optipmb_client.results.nuscenes_layout import (
     NUSCENES_CLASSES,
     Submission,
@@ -278,17 +278,23 @@ class NuScenesDataset:
         *,
         clouds: bool = True,
         z_bottom: bool | None = None,
+        submission: bool = False,
     ) -> None:
         folder = _find_tables(root)
         base = folder.parent
         detector = _find_detector(base, detections)
         found = None if detector is None else NuScenesDetections(detector, z_bottom=z_bottom)
         self._source = _Source(base, NuScenesTables(folder), found, clouds)
+        self._submission = submission
 
     @property
     def notes(self) -> Iterator[str]:
-        """What was assumed about the detections."""
-        return iter(()) if self._source.detections is None else self._source.detections.notes
+        """What was assumed about the detections, and what a submission has."""
+        if self._source.detections is not None:
+            yield from self._source.detections.notes
+        if self._submission:
+            most = f"at most {NUSCENES_MAX_BOXES} boxes in a sample"
+            yield f"submission: {NUSCENES_FILE} has all tracks, confirmed or not, as AMOTA is over all scores; {most}"
 
     @property
     def tables(self) -> NuScenesTables:
