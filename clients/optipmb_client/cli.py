@@ -1,6 +1,7 @@
 """The command `optipmb`. An error is one line on standard error and a status: 2 for what was asked, 1 for the rest."""
 
 import inspect
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from optipmb_client.commands.drain import drain
 from optipmb_client.commands.evaluate import evaluate
 from optipmb_client.commands.load import load
 from optipmb_client.commands.move import move
-from optipmb_client.commands.options import MANY, RAY_ADDRESS, SUBMISSION_SCORE
+from optipmb_client.commands.options import MANY, RAY_ADDRESS
 from optipmb_client.commands.play import play
 from optipmb_client.commands.plot import plot
 from optipmb_client.commands.profiles import profiles
@@ -113,7 +114,7 @@ def run(arguments: Sequence[str]) -> int:
     """Run one command line, without the program's name; return the exit status."""
     try:
         words = filled(spread(arguments, MANY), "--ray", RAY_ADDRESS, "local")
-        words = filled(words, "--submission", SUBMISSION_SCORE, "default")
+        words = filled(words, "--submission", re.compile(r"\d*\.?\d+"), "default")
         result = app(words or ["--help"], prog_name="optipmb", standalone_mode=False)
         return int(result or 0)
     except _OptionError as error:

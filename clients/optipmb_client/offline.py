@@ -187,9 +187,7 @@ class Tracked:
     clouds: int
     detections: int
     left_out: dict[str, int]
-    """Number of detections of each class that the profile lacks, by the detector's name."""
-    filtered: dict[str, tuple[int, int]]
-    """Number of detections below the score filter, and of all, of each class of the profile that has any."""
+    """Number of detections of each class that the profile lacks, or that are below its score filter."""
     steps_ns: tuple[int, ...]
     seconds: float
 
@@ -393,7 +391,6 @@ def track_whole(
     steps: list[int] = []
     clouds = detections = 0
     left_out: Counter[str] = Counter()
-    low, used = np.zeros(len(parameters.labels), dtype=np.int64), np.zeros(len(parameters.labels), dtype=np.int64)
     least = np.array([one.score_filter for one in parameters.classes.values()])
     names = tuple(parameters.classes)
     smoother = Smoother(parameters) if smooth else None
@@ -404,14 +401,13 @@ def track_whole(
         steps.append(took)
         clouds += frame.cloud is not None
         detections += len(frame)
-        left_out.update(np.asarray(frame.labels)[np.delete(frame.label, taken.source)].tolist())
-        used += np.bincount(taken.label, minlength=len(used))
-        low += np.bincount(taken.label[taken.score < least[taken.label]], minlength=len(low))
+        left_out.update(frame.labels[i] for i in np.delete(frame.label, taken.source).tolist())
+        low = taken.label[taken.score < least[taken.label]].tolist()
+        left_out.update(f"{names[i]} below its score_filter" for i in low)
         on_frame()
     if smoother is not None:
         found = {index: _with_paths(parameters, NamedTracks(one, names)) for index, one in smoother.tracks()}
-    filtered = {name: (int(low[i]), int(used[i])) for i, name in enumerate(parameters.labels) if used[i]}
-    return Tracked(found, clouds, detections, dict(left_out), filtered, tuple(steps), time.monotonic() - begun)
+    return Tracked(found, clouds, detections, dict(left_out), tuple(steps), time.monotonic() - begun)
 
 
 def _with_paths(parameters: Parameters, named: NamedTracks) -> NamedTracks:

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from optipmb import Modules, Parameters
 from optipmb_client.bulk import Done, Executor, Failed, Here, Outcome, in_order, run
 from optipmb_client.datasets import DataSequence, Dataset, DatasetArguments
@@ -36,9 +34,7 @@ class TrackedSequence:
     clouds: int
     detections: int
     left_out: dict[str, int]
-    """Number of detections of each class that the profile lacks, by the detector's name."""
-    filtered: dict[str, tuple[int, int]]
-    """Number of detections below the score filter, and of all, of each class of the profile that has any."""
+    """Number of detections of each class that the profile lacks, or that are below its score filter."""
     cut: tuple[int, int]
     """Number of boxes beyond those that a benchmark accepts in a sample, and of the samples."""
     tracks: int
@@ -113,8 +109,9 @@ def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Col
         on_frame=opened.on_frame,
     )
     written = Results(opened.dataset, shared.out, full=shared.full).write(sequence, found.tracks)
-    most = NUSCENES_MAX_BOXES if isinstance(opened.dataset, NuScenesDataset) and isinstance(written, Path) else np.inf
-    beyond = np.maximum(np.array([len(one.id) for one in found.tracks.values()]) - most, 0)
+    limited = isinstance(opened.dataset, NuScenesDataset) and isinstance(written, Path)
+    counts = [len(one.id) for one in found.tracks.values()] if limited else []
+    beyond = [count - NUSCENES_MAX_BOXES for count in counts if count > NUSCENES_MAX_BOXES]
     return TrackedSequence(
         name,
         written if isinstance(written, Path) else shared.out,
@@ -122,8 +119,7 @@ def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Col
         found.clouds,
         found.detections,
         found.left_out,
-        found.filtered,
-        (int(beyond.sum()), int((beyond > 0).sum())),
+        (sum(beyond), len(beyond)),
         len({int(number) for one in found.tracks.values() for number in one.id}),
         len({int(number) for one in found.tracks.values() for number in one.id[one.tracks.confirmed]}),
         found.seconds,

@@ -174,7 +174,7 @@ def test_a_submission_has_confirmed_tracks_of_high_mean_score_in_the_image(
     done = run_here(capsys, "track", tmp_path, "--out", tmp_path / "cut", "--submission", *options)
     assert done.returncode == 0, done.stderr
     least = float(options[0]) if options else SUBMISSION_SCORES["Car"]
-    assert f"confirmed tracks from these mean scores on, where the image shows them: Car {least:g}" in done.stderr
+    assert f"confirmed tracks from these mean scores on, in the image: Car {least:g}" in done.stderr
     (sequence,) = open_dataset("kitti", tmp_path).sequences(["all"])
     found = track_whole(read_profile("kitti"), sequence).tracks.values()
     confirmed = {int(one) for tracks in found for one in tracks.id[tracks.confirmed]}

@@ -24,7 +24,6 @@ from optipmb_client.zenoh import DEFAULT_ENDPOINT
 __all__ = [
     "MANY",
     "RAY_ADDRESS",
-    "SUBMISSION_SCORE",
     "AsJson",
     "Classes",
     "Config",
@@ -132,8 +131,6 @@ Patience = Annotated[float, typer.Option("--patience", min=1.0, help="End when n
 Prefix = Annotated[str, typer.Option("--prefix", help="First part of all keys, as the service has it.")]
 RAY_ADDRESS: Final = re.compile(r"auto|local|(ray://)?[^\s/]+:\d+")
 """What may follow --ray."""
-SUBMISSION_SCORE: Final = re.compile(r"\d*\.?\d+")
-"""What may follow --submission."""
 Ray = Annotated[
     str | None,
     typer.Option(

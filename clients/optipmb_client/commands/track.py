@@ -3,7 +3,7 @@
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -38,9 +38,6 @@ if TYPE_CHECKING:
     from optipmb_client.datasets import DataSequence
     from optipmb_client.tracking import TrackedSequence
 
-FILTERED: Final = 0.9
-"""Part of the detections of a class from which on the score filter is reported."""
-
 
 def track(  # noqa: PLR0913  these are the command's options
     data: Source = None,
@@ -67,13 +64,7 @@ def track(  # noqa: PLR0913  these are the command's options
     ] = False,
     submission: Annotated[
         str | None,
-        typer.Option(
-            "--submission",
-            metavar="[SCORE]",
-            help="Write what the server of the benchmark takes and scores best. Of KITTI: confirmed tracks whose mean "
-            "score is at least SCORE (default: one for each class), where the image shows them.",
-            show_default=False,
-        ),
+        typer.Option(metavar="[SCORE]", help="Write a submission; of KITTI confirmed tracks from this mean score on."),
     ] = None,
     jobs: Annotated[
         int | None,
@@ -162,11 +153,7 @@ def _complain(results: "list[TrackedSequence]", profile: str) -> None:
     left_out: Counter[str] = sum((Counter(one.left_out) for one in results), Counter())
     if left_out:
         named = ", ".join(f"{count} {name}" for name, count in sorted(left_out.items()))
-        warn(f"{left_out.total()} of {detections} detections are left out (not in {profile}, or of score 0): {named}")
-    for name in sorted({name for one in results for name in one.filtered}):
-        low, every = map(sum, zip(*(one.filtered.get(name, (0, 0)) for one in results), strict=True))
-        if low >= FILTERED * every:
-            warn(f"{low} of {every} detections of {name} have a score below the score_filter of profile {profile}")
+        warn(f"{left_out.total()} of {detections} detections are left out with profile {profile}: {named}")
     cut, samples = map(sum, zip(*(one.cut for one in results), strict=True))
     if cut:
         warn(f"{cut} boxes in {samples} samples are not written: a sample of nuScenes has {NUSCENES_MAX_BOXES} at most")

@@ -104,8 +104,6 @@ def _kitti(root: Path, detections: str | Path | None, options: _Options) -> Data
 
 def _nuscenes(root: Path, detections: str | Path | None, options: _Options) -> Dataset:
     _known(options, {"clouds", "z_bottom", "submission"})
-    if options.get("submission", "default") != "default":
-        raise DatasetError("--submission", "no score: AMOTA of nuScenes is over all scores", str(options["submission"]))
     z_bottom = bool(options["z_bottom"]) if "z_bottom" in options else None
     clouds, submission = bool(options.get("clouds", True)), "submission" in options
     return NuScenesDataset(root, detections, clouds=clouds, z_bottom=z_bottom, submission=submission)

@@ -12,10 +12,10 @@ tracks that were confirmed in some frame and whose mean score is at least the th
 rows with an image box.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 
@@ -29,20 +29,10 @@ LEAST_SHOWN = 0.5
 """Part of a projected box that must lie in the image for its line to have an image box."""
 
 SUBMISSION_SCORES = {"Car": 0.55, "Cyclist": 0.6, "Pedestrian": 0.55}
-"""Least mean score of a track in a submission, for the highest HOTA of image boxes. Chosen with five detectors on the
-sequences 0000 0003 0005 0009 0017; `docs/tuning.md` has the figures of others."""
+"""Least mean score of a track in a submission, for the highest HOTA of image boxes (`docs/tuning.md`)."""
 
 _FIELDS = 18
 _TYPE = 2
-
-
-class _Line(NamedTuple):
-    """A line of a submission, unless its track is left out."""
-
-    id: int
-    name: str
-    score: float
-    text: str
 
 
 class KittiResultWriter:
@@ -51,13 +41,13 @@ class KittiResultWriter:
     Args:
         path: the file.
         camera: the camera of the image boxes.
-        least: for a submission, the least mean score of a track by class; None writes every track.
+        least: for a submission, the least mean score of a track by class; other classes are refused. None: all tracks.
     """
 
     def __init__(self, path: Path, camera: Camera, least: Mapping[str, float] | None = None) -> None:
         self._camera = camera
         self._least = least
-        self._lines: list[_Line] = []
+        self._lines: list[tuple[int, str, float, bool, str]] = []  # id, class, score, whether the image shows it, text
         self._confirmed: set[int] = set()
         self._file = AtomicText(path)
 
@@ -67,12 +57,7 @@ class KittiResultWriter:
         return self._file.path
 
     def add(self, index: int, pose: PoseLike, tracks: TrackRows) -> None:
-        """Write the tracks (world frame) of frame `index`, whose sensor stood at `pose`.
-
-        Raises:
-            DatasetError: a track of a submission is of a class that the benchmark does not have.
-
-        """
+        """Write the tracks (world frame) of frame `index`, whose sensor stood at `pose`."""
         center, yaw = to_sensor(
             rotation_of(np.asarray(pose.quaternion)), np.asarray(pose.translation), tracks.center, tracks.yaw
         )
@@ -82,39 +67,28 @@ class KittiResultWriter:
         values = np.column_stack([alpha, image, hwl, bottom, rotation_y, tracks.score])
         # Adding zero turns a rounded -0 into 0, so that equal numbers are written alike.
         values = np.round(values, 6) + 0.0
-        names = tracks.labels if self._least is None else self._official(tracks)
-        for identity, label, row, shown in zip(tracks.id.tolist(), tracks.label, values, seen, strict=True):
+        known = tuple(self._least or ())
+        names = [class_like(name, known) or "" if known else name for name in tracks.labels]
+        if other := [tracks.labels[label] for label in tracks.label.tolist() if not names[label]]:
+            raise DatasetError("--submission", f"--classes of {', '.join(known)}", f"tracks of {other[0]!r}")
+        for identity, label, row, shown in zip(tracks.id.tolist(), tracks.label.tolist(), values, seen, strict=True):
             text = " ".join(f"{value:.6f}" for value in row)
             line = f"{index} {identity} {names[label]} -1 -1 {text}\n"
-            if self._least is None:
-                self._file.write(line)
-            elif shown:
-                self._lines.append(_Line(identity, names[label], float(row[-1]), line))
-        if self._least is not None and tracks.confirmed is not None:
+            self._lines.append((identity, names[label], float(row[-1]), bool(shown), line))
+        if known and tracks.confirmed is not None:
             self._confirmed.update(tracks.id[np.asarray(tracks.confirmed, dtype=np.bool_)].tolist())
-
-    def _official(self, tracks: TrackRows) -> dict[int, str]:
-        """Return the benchmark's names of the classes of tracks."""
-        known = tuple(self._least or ())
-        names = {int(label): class_like(tracks.labels[label], known) for label in np.unique(tracks.label)}
-        if other := [tracks.labels[label] for label, name in names.items() if name is None]:
-            classes = f"tracks of the classes {', '.join(known)} (--classes)"
-            raise DatasetError("--submission", classes, f"tracks of {other[0]!r}")
-        return {label: name for label, name in names.items() if name is not None}
-
-    def _submitted(self) -> Iterator[str]:
-        """Yield the lines of confirmed tracks of high mean score."""
-        scores: dict[int, list[float]] = {}
-        for one in self._lines:
-            scores.setdefault(one.id, []).append(one.score)
-        mean = {identity: fmean(values) for identity, values in scores.items() if identity in self._confirmed}
-        least = self._least or {}
-        yield from (one.text for one in self._lines if one.id in mean and mean[one.id] >= least[one.name])
 
     def close(self) -> None:
         """Put the file in its place; a sequence without tracks leaves an empty file."""
-        for line in self._submitted():
-            self._file.write(line)
+        scores: dict[int, list[float]] = {}
+        for identity, _, score, shown, _ in self._lines:
+            if shown and identity in self._confirmed:
+                scores.setdefault(identity, []).append(score)
+        mean = {identity: fmean(values) for identity, values in scores.items()}
+        for identity, name, _, shown, line in self._lines:
+            if self._least is None or (shown and mean.get(identity, -1.0) >= self._least[name]):
+                self._file.write(line)
+        self._lines.clear()
         self._file.close()
 
     def discard(self) -> None:
