@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -20,10 +21,12 @@ from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Ints, wrap_angle
 from optipmb_client.table_files import Columns, read_table
 
-__all__ = ["NO_CLASS", "Boxes", "read_boxes"]
+__all__ = ["NO_CLASS", "NO_ID", "Boxes", "line_of", "read_boxes"]
 
 NO_CLASS: Final = "object"
 """Class of all boxes of a table without classes."""
+NO_ID: Final = -1
+"""Id of a box that has none."""
 _UNIT: Final = 1e-3
 _MOST_SHOWN: Final = 6
 LEAST_VARIANCE: Final = 1e-8
@@ -50,9 +53,9 @@ class Boxes:
     center: Floats
     """(B, 3)"""
     size: Floats
-    """(B, 3)"""
+    """(B, 3); NaN in a table of objects that has neither l nor w."""
     yaw: Floats
-    """(B,)"""
+    """(B,); NaN in a table of objects that has none."""
     velocity: Floats | None
     """(B, 2); rows of NaN where unknown."""
     position_covariance: Floats | None
@@ -62,7 +65,7 @@ class Boxes:
     name: NDArray[np.str_]
     """(B,) class"""
     id: Ints | None
-    """(B,) object; None where the table has no such column."""
+    """(B,) object, `NO_ID` where the cell has none; None where the table has no such column."""
     time_column: str
     key_columns: tuple[str, ...]
     sensor_column: str
@@ -71,18 +74,24 @@ class Boxes:
     """Key -> values of the columns that it stands for."""
 
 
-def read_boxes(reading: Reading, *, scored: bool) -> Boxes:
+def line_of(path: Path, row: int) -> int:
+    """Return the line, from 1, of a row, from 0."""
+    return row + (2 if path.name.lower().endswith((".csv", ".tsv", ".gz")) else 1)
+
+
+def read_boxes(reading: Reading, *, scored: bool, columns: Columns | None = None) -> Boxes:
     """Read the table of a `Reading`; what was assumed is noted there.
 
     Args:
         reading: the file and the options of the user.
-        scored: whether boxes are detections, which have a score.
+        scored: whether boxes are detections, which have a score, a size and a heading.
+        columns: of the file, where they were read already.
 
     Raises:
         DatasetError: a column is missing or a value is not allowed; names the line.
         ClientError: pyarrow is not installed.
     """
-    columns = read_table(reading.path)
+    columns = read_table(reading.path) if columns is None else columns
     if not columns or not len(next(iter(columns.values()))):
         raise DatasetError(reading.path, "rows", f"none, columns {', '.join(columns) or 'none'}")
     return _Table(reading, columns).read(scored=scored)
@@ -98,17 +107,22 @@ class _Table:
         }
         for role, name in chosen.items():
             if name not in columns:
-                raise DatasetError(f"--option column.{role}", f"a column: {', '.join(columns)}", repr(name))
+                option = f"column.{role}"
+                error = DatasetError(f"--option {option}", f"a column: {', '.join(columns)}", repr(name))
+                reading.unmatched[option] = error
+        chosen = {role: name for role, name in chosen.items() if name in columns}
         self._found = find_columns(columns, chosen)
 
     def _line(self, row: int) -> int:
-        return row + (2 if self._reading.path.name.lower().endswith((".csv", ".tsv", ".gz")) else 1)
+        return line_of(self._reading.path, row)
 
     def _numbers(self, role: str, otherwise: float | None = None) -> Floats:
         """Return a column of numbers, NaN where there is none."""
         column = self._found.get(role)
         if column is None:
             if otherwise is None:
+                if error := self._reading.unmatched.get(f"column.{role}"):
+                    raise error
                 have = ", ".join(self._columns)
                 raise DatasetError(
                     self._reading.path, f"a column {role} (--option column.{role}=NAME)", f"the columns {have}"
@@ -129,14 +143,18 @@ class _Table:
         stamp, time, time_column = self._stamps()
         key, key_columns, keys = self._keys()
         center = np.column_stack([self._numbers("x"), self._numbers("y"), self._numbers("z", 0.0)])
-        size = np.column_stack([self._numbers("l"), self._numbers("w"), self._numbers("h", 1.5)])
-        yaw = self._yaw()
+        centres = not scored and not {"l", "w"} & found.keys()
+        side = 1.0 if centres else None
+        size = np.column_stack([self._numbers("l", side), self._numbers("w", side), self._numbers("h", 1.5)])
+        yaw, turned = self._yaw(otherwise=None if scored else 0.0)
+        if centres or not turned:
+            reading.note("no columns for the size or the heading: only centres can be compared")
         score = self._numbers("score", 1.0)
         names, id_ = self._names(), self._ids()
         for role, text in (("z", "z = 0"), ("h", "a height of 1.5 m"), ("score", "a score of 1")):
             if role not in found and (scored or role != "score"):
                 reading.note(f"no column for {role}: {text} for every box")
-        empty = np.isnan(center[:, :2]).all(axis=1) & np.isnan(size[:, :2]).all(axis=1)
+        empty = np.isnan(center[:, :2]).all(axis=1) & (centres | np.isnan(size[:, :2]).all(axis=1))
         kept = self._valid(np.asarray(~empty), center, size, yaw, score)
         if "score" in found and scored:
             score[kept] = read_scores(reading, score[kept])
@@ -148,7 +166,7 @@ class _Table:
                 kept &= ~zero
         covariance = self._covariances(kept) if scored else None
         row = np.flatnonzero(kept)
-        stated = found["l"].base in {"l", "length", "box_length"} or found["l"].base.endswith("_l")
+        stated = centres or found["l"].base in {"l", "length", "box_length"} or found["l"].base.endswith("_l")
         size = read_sizes(reading, size[row], names[row], stated=stated)
         angle = read_angle(reading, yaw[row], self._unit("yaw"))
         center, size, angle = read_axes(reading, center[row], size, angle)
@@ -167,8 +185,8 @@ class _Table:
             frame_time=time,
             row=row,
             center=center,
-            size=size,
-            yaw=wrap_angle(angle),
+            size=np.full_like(size, np.nan) if centres else size,
+            yaw=wrap_angle(angle) if turned else np.full_like(angle, np.nan),
             velocity=velocity,
             position_covariance=None if covariance is None else covariance[row],
             score=score[row],
@@ -207,28 +225,28 @@ class _Table:
         joined = [".".join(row) for row in zip(*parts, strict=True)]
         return np.array(joined, dtype=np.str_), names, dict(zip(joined, zip(*parts, strict=True), strict=True))
 
-    def _yaw(self) -> Floats:
+    def _yaw(self, otherwise: float | None) -> tuple[Floats, bool]:
+        """Return headings, and whether the table has any."""
         if "yaw" in self._found:
-            return self._numbers("yaw")
+            return self._numbers("yaw"), True
         turns = [f"q{part}" for part in _TURNS]
         if all(role in self._found for role in turns):
             w, x, y, z = (self._numbers(role) for role in turns)
-            return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
-        return self._numbers("yaw")  # raises: there is none
+            return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z), True
+        return self._numbers("yaw", otherwise), False
 
     def _names(self) -> NDArray[np.str_]:
         column = self._found.get("class")
         if column is None:
             self._reading.note(f"no column for class: every box is of class {NO_CLASS}")
-            return np.full(self._rows, NO_CLASS, dtype=np.str_)
-        names = self._columns[column.name].astype(np.str_)
+        names = np.full(self._rows, NO_CLASS) if column is None else self._columns[column.name].astype(np.str_)
         renamed = {
             key.removeprefix("class."): name for key, name in self._reading.options.items() if key.startswith("class.")
         }
-        unknown = sorted(set(renamed) - set(names.tolist()))
-        if unknown:
-            have = ", ".join(sorted(set(names.tolist())))
-            raise DatasetError(f"--option class.{unknown[0]}", f"a class of the table: {have}", repr(unknown[0]))
+        have = ", ".join(sorted(set(names.tolist())))
+        for name in sorted(set(renamed) - set(names.tolist())):
+            error = DatasetError(f"--option class.{name}", f"a class of the table: {have}", repr(name))
+            self._reading.unmatched[f"class.{name}"] = error
         return np.array([renamed.get(name, name) for name in names.tolist()], dtype=np.str_)
 
     def _ids(self) -> Ints | None:
@@ -238,7 +256,9 @@ class _Table:
         values = self._columns[column.name]
         if values.dtype.kind == "i":
             return values.astype(np.int64)
-        return np.unique(values.astype(np.str_), return_inverse=True)[1].astype(np.int64)
+        texts = values.astype(np.str_)
+        numbers = np.unique(texts, return_inverse=True)[1].astype(np.int64)
+        return np.where(np.isin(texts, ("", "nan", "-1", "-1.0")), NO_ID, numbers)
 
     def _poses(self) -> Floats | None:
         """Return the poses (R, 7) that the table has."""

@@ -37,6 +37,8 @@ class Reading:
     path: Path
     options: Mapping[str, str]
     notes: list[str] = field(default_factory=list)
+    unmatched: dict[str, DatasetError] = field(default_factory=dict)
+    """Options `column.*` and `class.*` that name nothing in this table; another table may have it."""
 
     def note(self, text: str) -> None:
         """Report an assumption, once."""

@@ -1,0 +1,171 @@
+"""Tables of objects with ids, which are truth or tracks, at the frames of detections.
+
+Conventions: a row belongs to the frame that is nearest in time, within half a frame. Of several rows of an object at a
+frame the nearest one counts. A frame without a row has no object or no label: where the frames with rows lie `SPARSE`
+times as far apart as all frames, only these are labelled.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from optipmb_client.datasets.interface import Regions, Truth
+from optipmb_client.datasets.table.rows import NO_ID, Boxes, line_of, read_boxes
+from optipmb_client.datasets.table.values import Reading
+from optipmb_client.files import DatasetError
+from optipmb_client.geometry import Floats, Ints, Pose, stack_poses, to_world
+from optipmb_client.table_files import Columns, read_table
+
+__all__ = ["ObjectTable", "TableOptions", "match_stamps", "read_objects", "truth_at"]
+
+SPARSE: Final = 1.5
+_WRITTEN: Final = frozenset({"existence", "age", "time_since_detection", "detection_row"})
+"""Columns by which a table of tracks that OptiPMB wrote is known."""
+_PLACES: Final = ("time", "rate", "column.stamp", "column.frame", "column.recording", "column.sensor")
+
+
+@dataclass
+class TableOptions:
+    """Options by which all tables of a dataset are read: detections, truth and tracks."""
+
+    options: Mapping[str, str] = field(default_factory=dict)
+    recordings: set[str] = field(default_factory=set)
+    """Names and keys of all recordings."""
+    _found: set[str] = field(default_factory=set)
+    _errors: dict[str, DatasetError] = field(default_factory=dict)
+
+    def add(self, reading: Reading) -> None:
+        """Record which options name a column or a class of a table."""
+        self._found |= reading.options.keys() - reading.unmatched.keys()
+        self._errors |= reading.unmatched
+
+    def check(self) -> None:
+        """Raise for an option that names a column or class of no table."""
+        for error in (error for name, error in self._errors.items() if name not in self._found):
+            raise error
+
+
+@dataclass(frozen=True)
+class ObjectTable:
+    """A table of objects with ids, and the assumptions about it."""
+
+    path: Path
+    boxes: Boxes
+    notes: tuple[str, ...] = ()
+
+    def at(self, key: str, stamps: Ints) -> tuple[Ints, Ints, list[str]]:
+        """Return the boxes (R,) of a recording, ordered by frame, their frames (R,), -1 where at none, and notes.
+
+        Raises:
+            DatasetError: the table has no ids, or one id twice at a stamp.
+        """
+        boxes = self.boxes
+        if boxes.id is None:
+            raise DatasetError(self.path, "a column of ids (id, track_id …; --option column.id=NAME)", "none")
+        rows = np.flatnonzero(boxes.frame_key[boxes.row] == key)
+        known = boxes.id[rows] != NO_ID
+        notes = [] if known.all() else [f"{self.path}: {int((~known).sum())} rows with no id, or -1, are left out"]
+        rows = rows[known]
+        stamp, identity = boxes.frame_stamp[boxes.row[rows]], boxes.id[rows]
+        order = np.lexsort((identity, stamp))
+        twice = order[1:][(np.diff(stamp[order]) == 0) & (np.diff(identity[order]) == 0)]
+        if len(twice):
+            line = line_of(self.path, int(boxes.row[rows[twice.min()]]))
+            raise DatasetError(self.path, "an id once per frame", "an id again at the same stamp", line=line)
+        frame = match_stamps(stamps, stamp)
+        order = np.lexsort((np.abs(stamps[frame] - stamp), identity, frame))
+        again = (np.diff(frame[order]) == 0) & (np.diff(identity[order]) == 0) & (frame[order[1:]] >= 0)
+        kept = np.sort(order[np.append(True, ~again)[: len(order)]])
+        kept = kept[np.argsort(frame[kept], kind="stable")]
+        return rows[kept], frame[kept], notes
+
+    def in_world(self, rows: Ints) -> tuple[Floats, Floats, Floats]:
+        """Return centre (R, 3), yaw (R,) and velocity (R, 2) of some boxes in the world frame."""
+        boxes = self.boxes
+        center, yaw = boxes.center[rows], boxes.yaw[rows]
+        velocity = np.full((len(rows), 2), np.nan) if boxes.velocity is None else boxes.velocity[rows]
+        if boxes.frame_pose is not None:
+            pose = boxes.frame_pose[boxes.row[rows]]
+            rotation, translation = stack_poses([Pose(row[:3], row[3:]) for row in pose])
+            center, yaw = to_world(rotation, translation, center, yaw)
+            velocity = np.einsum("nij,nj->ni", rotation[:, :2, :2], velocity)
+        return center, yaw, velocity
+
+
+def read_objects(path: Path, tables: TableOptions, columns: Columns | None = None) -> ObjectTable:
+    """Return a table of truth or tracks, of which `columns` may have been read already.
+
+    A table that OptiPMB wrote has known units and columns: only options of times and classes apply to it.
+
+    Raises:
+        DatasetError: a column is missing or a value is wrong; names the line.
+    """
+    columns = read_table(path) if columns is None else columns
+    options, written = tables.options, columns.keys() >= _WRITTEN
+    if written:
+        results = {f"class.{value}" for name, value in options.items() if name.startswith("class.")}
+        kept = {*_PLACES, *(name for name in options.keys() - results if name.startswith("class."))}
+        options = {name: value for name, value in options.items() if name in kept}
+    reading = Reading(path, options)
+    boxes = read_boxes(reading, scored=False, columns=columns)
+    tables.add(reading)
+    return ObjectTable(path, boxes, () if written else tuple(f"{path}: {note}" for note in reading.notes))
+
+
+def match_stamps(stamps: Ints, wanted: Ints) -> Ints:
+    """Return the frame nearest to each `wanted` stamp (R,), -1 where it is more than half a frame away."""
+    if not len(stamps):
+        return np.full(len(wanted), -1, dtype=np.int64)
+    period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 2e9
+    after = np.clip(np.searchsorted(stamps, wanted), 1, max(1, len(stamps) - 1))
+    before = after - 1
+    after = np.minimum(after, len(stamps) - 1)
+    nearest = np.where(abs(stamps[after] - wanted) < abs(wanted - stamps[before]), after, before)
+    return np.where(abs(stamps[nearest] - wanted) <= 0.5 * period, nearest, -1)
+
+
+def truth_at(name: str, stamps: Ints, table: ObjectTable, key: str) -> Truth:
+    """Return the objects of a recording at the frames (F,) of its detections.
+
+    Raises:
+        DatasetError: none of them is at a frame, or as for `ObjectTable.at`.
+    """
+    boxes, path = table.boxes, table.path
+    rows, frame, notes = table.at(key, stamps)
+    outside = int((frame < 0).sum())
+    if outside == len(rows):
+        raise DatasetError(path, f"boxes at the stamps of {name}", "none of its stamps")
+    if outside:
+        notes.append(f"{path}: {outside} rows are at no frame of {name}: left out")
+    rows, frame = rows[outside:], frame[outside:]
+    labelled = np.isin(np.arange(len(stamps)), match_stamps(stamps, boxes.frame_stamp[boxes.frame_key == key]))
+    count, steps = int(labelled.sum()), np.diff(stamps[labelled])
+    sparse = count < len(stamps) and (not len(steps) or np.median(steps) >= SPARSE * np.median(np.diff(stamps)))
+    if count < len(stamps):
+        meaning = "only these are compared" if sparse else "the others count as frames without objects"
+        notes.append(f"{path}: truth has {count} of {len(stamps)} frames of {name}: {meaning}")
+    center, yaw, velocity = table.in_world(rows)
+    labels = tuple(dict.fromkeys(boxes.name[rows].tolist()))
+    zero = np.zeros(len(rows), dtype=np.int64)
+    return Truth(
+        labels=labels,
+        frame=frame,
+        id=zero if boxes.id is None else boxes.id[rows],
+        label=np.array([labels.index(one) for one in boxes.name[rows].tolist()], dtype=np.int64),
+        center=center,
+        size=boxes.size[rows],
+        yaw=yaw,
+        velocity=velocity,
+        occlusion=zero,
+        truncation=zero,
+        covered=np.full(len(rows), np.nan),
+        points=np.full(len(rows), -1, dtype=np.int64),
+        box2d=np.full((len(rows), 4), np.nan),
+        ignored=np.zeros(len(rows), dtype=np.bool_),
+        regions=Regions(np.empty(0, dtype=np.int64), np.empty((0, 4))),
+        labelled=labelled if sparse else None,
+        notes=tuple(notes),
+    )
