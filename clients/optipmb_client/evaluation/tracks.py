@@ -62,8 +62,9 @@ def read_compared(
             notes.append(f"classes of the {owner} not compared: {', '.join(other)} (--option class.NAME=NAME)")
     if all(renamed) and set(renamed[0].values()).isdisjoint(renamed[1].values()):
         notes.append(f"no class is in both: truth has {', '.join(renamed[0])}, tracks have {', '.join(renamed[1])}")
-    for note in notes if warn else ():
-        warn(note)
+    if warn is not None:
+        for note in notes:
+            warn(note)
     return [(_relabelled(truth, renamed[0]), _relabelled(tracks, renamed[1])) for truth, tracks in pairs]
 
 

@@ -78,6 +78,8 @@ class ObjectTable:
         frame = match_stamps(stamps, stamp)
         order = np.lexsort((np.abs(stamps[frame] - stamp), identity, frame))
         again = (np.diff(frame[order]) == 0) & (np.diff(identity[order]) == 0) & (frame[order[1:]] >= 0)
+        if again.any():
+            notes.append(f"{self.path}: of several rows of an object at a frame the nearest counts, in time")
         kept = np.sort(order[np.append(True, ~again)[: len(order)]])
         kept = kept[np.argsort(frame[kept], kind="stable")]
         return rows[kept], frame[kept], notes
