@@ -1,4 +1,4 @@
-"""How new objects enter: births at measurements (Section IV.F) and first-time detections (IV.D.2).
+"""How new objects enter: births at measurements (Section IV.G) and first-time detections (IV.D.2).
 
 A birth starts at the measurement: m^0 = [z_x, z_y, speed, heading, 0, 0] under the covariance P^0 of its class. The
 paper takes speed and heading from the measured velocity. Two cases that it leaves open: without a velocity the

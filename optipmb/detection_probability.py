@@ -1,4 +1,4 @@
-"""Adaptive detection probability (ADP, Section IV.F): an object without LiDAR points in its box is hidden, not gone."""
+"""Adaptive detection probability (ADP, Section IV.G): an object without LiDAR points in its box is hidden, not gone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Track extraction with two thresholds (OTE, Section IV.G), and the tracks that come out."""
+"""Track extraction with two thresholds (OTE, Section IV.H), and the tracks that come out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Local data association hypotheses and their costs (Section IV.D and the birth model of IV.F).
+"""Local data association hypotheses and their costs (Section IV.D and the birth model of IV.G).
 
 Three kinds: an object is missed, an object is detected by a measurement, a measurement detects something for the
 first time. The costs need the position alone (eq. Simplified measurement model), so the full update is left to the

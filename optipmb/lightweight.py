@@ -1,4 +1,4 @@
-"""The light-weight filter of the non-motion states (Section IV.E): box size, height, counters and confidence."""
+"""The light-weight filter of the non-motion states (Section IV.F): box size, height, counters and confidence."""
 
 from __future__ import annotations
 

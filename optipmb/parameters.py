@@ -204,12 +204,11 @@ class ClassParameters(_Table):
     birth_score: Probability = Field(
         description="eta_score: unused detections from this score on start a track at once"
     )
-    adaptive_birth_rate: Positive = Field(
-        description="mu_ab: weight of the Poisson component of a low-scored detection"
+    adaptive_birth_rate: Positive = Field(description="mu_ab: Poisson weight of a low-scored detection")
+    baseline_birth_rate: Positive = Field(
+        default=0.1, exclude_if=(0.1).__eq__, description="Poisson weight of every detection where HABM is off"
     )
-    undetected_birth_rate: Positive = Field(
-        description="mu_b0: expected undetected objects in the region of observation"
-    )
+    undetected_birth_rate: Positive = Field(description="mu_b0: expected undetected objects in the observed region")
     clutter_rate: Positive = Field(description="mu_c: expected false detections in a frame")
     area: Positive = Field(description="A: area of the region of observation, m^2")
     poisson_steps: Periods = Field(description="eta_step: nominal periods a Poisson component survives")

@@ -1,4 +1,4 @@
-"""LiDAR points inside boxes: PTS(x) of the adaptive detection probability (Section IV.F).
+"""LiDAR points inside boxes: PTS(x) of the adaptive detection probability (Section IV.G).
 
 The boxes go to the points, not the points to the boxes: each box is turned into the sensor frame once, and put into
 the cells of a grid that it touches. The points are read where they lie, block by block. A first loop computes the cells

@@ -71,6 +71,7 @@ class ClassRow(Protocol):
     birth_overlap: float
     birth_heading_speed: float
     adaptive_birth_rate: float
+    baseline_birth_rate: float
     poisson_steps: int
     extract_new: float
     extract_known: float

@@ -1,7 +1,7 @@
 """The Poisson intensity of undetected objects after a frame: what stays of it, and what is born (eq. PPP Update).
 
-Redundant components go (RPP, Section IV.G), and measurements that were taken for clutter announce objects that later
-frames may find (hybrid adaptive birth model, HABM, Section IV.F).
+Redundant components go (RPP, Section IV.H), and measurements that were taken for clutter announce objects that later
+frames may find (hybrid adaptive birth model, HABM, Section IV.G).
 """
 
 from __future__ import annotations
@@ -128,8 +128,8 @@ def with_births(
 def with_measurement_births(
     poisson: Poissons, measurements: Measurements, stamp_ns: int, table: ClassTable
 ) -> Poissons:
-    """Add a component of weight mu_ab for every measurement: GNN-PMB's birth model, the baseline of the ablation."""
-    weight = np.concatenate((poisson.weight, table["adaptive_birth_rate"][measurements.label]))
+    """Add a component of weight `baseline_birth_rate` for every measurement: GNN-PMB's birth model, the baseline."""
+    weight = np.concatenate((poisson.weight, table["baseline_birth_rate"][measurements.label]))
     kept, born = np.arange(len(poisson)), np.arange(measurements.score.shape[0])
     components = components_in(poisson.words)
     return Poissons.of(with_births(components, kept, born, weight, measurements, stamp_ns, table.classes))

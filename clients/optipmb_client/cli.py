@@ -14,6 +14,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from optipmb_client.arguments import filled, spread
 from optipmb_client.commands.ablate import ablate
+from optipmb_client.commands.check import check
 from optipmb_client.commands.demo import demo
 from optipmb_client.commands.drain import drain
 from optipmb_client.commands.evaluate import evaluate
@@ -26,6 +27,7 @@ from optipmb_client.commands.profiles import profiles
 from optipmb_client.commands.record import record
 from optipmb_client.commands.replay import replay
 from optipmb_client.commands.status import status
+from optipmb_client.commands.sweep import sweep
 from optipmb_client.commands.track import track
 from optipmb_client.commands.tracks import tracks
 from optipmb_client.commands.tune import tune
@@ -72,6 +74,7 @@ app = typer.Typer(
 )
 for command in (
     demo,
+    check,
     track,
     replay,
     record,
@@ -80,6 +83,7 @@ for command in (
     evaluate,
     tune,
     ablate,
+    sweep,
     plot,
     status,
     tracks,

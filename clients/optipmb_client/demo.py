@@ -71,7 +71,7 @@ def demonstrate(
     figures = combine(result.sweep.results[result.sweep.best] for result in results)
     picture: Path | None = out / "tracks.png"
     try:
-        draw_results(out / "tracks.png", sequence, out, results)
+        draw_results(out / "tracks.png", sequence, [out], [results])
     except ClientError as error:  # the picture is worth having, not worth failing for
         on_stage(str(error))
         picture = None

@@ -6,7 +6,7 @@ tracks too. matplotlib is an extra of the installation and is imported when the 
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from optipmb_schemas.installation import install_command
@@ -29,21 +29,23 @@ _BREAK = 5
 """A path is not drawn across more missing frames than this."""
 
 
-def draw_tracks(
-    path: Path,
-    sequence: DataSequence,
-    tracks: ResultTable,
-    truth: Truth | None = None,
-    results: Sequence[ClearResult] = (),
-) -> None:
-    """Draw the tracks of a sequence from above.
+class Panel(NamedTuple):
+    """Tracks of one tracker, in the world frame."""
+
+    tracks: ResultTable
+    results: Sequence[ClearResult] = ()
+    """CLEAR figures of the classes; their misses and identity switches are marked."""
+    title: str = ""
+
+
+def draw_tracks(path: Path, sequence: DataSequence, panels: Sequence[Panel], truth: Truth | None = None) -> None:
+    """Draw the tracks of a sequence from above, those of several trackers side by side on the same axes.
 
     Args:
         path: the PNG file.
         sequence: what was tracked; its poses give the sensor's path.
-        tracks: the tracks in the world frame.
+        panels: one for each tracker.
         truth: annotations in the world frame, drawn thin below the tracks.
-        results: CLEAR figures of the classes; their misses and identity switches are marked.
 
     Raises:
         ClientError: matplotlib is not installed.
@@ -55,26 +57,32 @@ def draw_tracks(
     except ImportError as error:
         raise ClientError(f"pictures need matplotlib, which is not installed: {install_command('plot')}") from error
     _, sensor = stack_poses(sequence.poses)
-    low, high = _extent([sensor, tracks.center, truth.center if truth else sensor])
-    width, height = np.maximum(11.0 / max(high - low) * (high - low), (7.5, 3.0)).tolist()
-    figure = Figure(figsize=(width + 0.6, height + 1.2), layout="constrained")
+    low, high = _extent([sensor, *(panel.tracks.center for panel in panels), truth.center if truth else sensor])
+    longest = 11.0 if len(panels) == 1 else 8.0
+    width, height = np.maximum(longest / max(high - low) * (high - low), (7.5, 3.0)).tolist()
+    # Panels of a long street lie one below the other, others side by side.
+    rows, columns = (1, len(panels)) if height > 0.4 * width else (len(panels), 1)
+    figure = Figure(figsize=(columns * width + 0.6, rows * height + 1.2), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.set_aspect("equal")
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_xlabel("x in the world frame (m)")
-    axes.set_ylabel("y in the world frame (m)")
-    axes.set_title(f"Sequence {sequence.name}: {len(np.unique(tracks.id))} tracks in {len(sequence)} frames")
-    axes.grid(visible=True, color="#EEEEEE", linewidth=0.6)
-    axes.set_axisbelow(True)
-    if truth is not None:
-        _draw_truth(axes, truth)
-    _draw_sensor(axes, sensor, sequence)
-    _draw_paths(axes, tracks, last_frame=len(sequence) - 1)
-    if truth is not None:
-        _draw_failures(axes, truth, results)
-    _legend(figure, axes)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel().tolist()
+    for axes, panel in zip(grid, panels, strict=True):
+        axes.set_aspect("equal")
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
+        axes.set_xlabel("x in the world frame (m)")
+        axes.set_ylabel("y in the world frame (m)")
+        title = panel.title or f"Sequence {sequence.name}"
+        axes.set_title(f"{title}: {len(np.unique(panel.tracks.id))} tracks in {len(sequence)} frames")
+        axes.grid(visible=True, color="#EEEEEE", linewidth=0.6)
+        axes.set_axisbelow(True)
+        if truth is not None:
+            _draw_truth(axes, truth)
+        _draw_sensor(axes, sensor, sequence)
+        _draw_paths(axes, panel.tracks, last_frame=len(sequence) - 1)
+        if truth is not None:
+            _draw_failures(axes, truth, panel.results)
+        axes.label_outer()
+    _legend(figure, grid)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
@@ -151,9 +159,10 @@ def _draw_failures(axes: "Axes", truth: Truth, results: Sequence[ClearResult]) -
             label = "_"
 
 
-def _legend(figure: "Figure", axes: "Axes") -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=max(1, len(labels)), frameon=False, fontsize=9)
+def _legend(figure: "Figure", grid: "Sequence[Axes]") -> None:
+    found = {label: one for axes in grid for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    columns = max(1, len(found))
+    figure.legend(found.values(), found, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
 
 
 def _rows_by_id(identity: np.ndarray) -> list[np.ndarray]:

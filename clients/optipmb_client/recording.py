@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from optipmb_client.class_names import class_like
 from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame, Truth
 from optipmb_client.datasets.nuscenes import NuScenesDataset
 from optipmb_client.errors import UsageError
@@ -70,11 +71,12 @@ def selected_frames(sequence: DataSequence, classes: Sequence[str]) -> Iterator[
         if not classes:
             yield frame
             continue
-        unknown = [name for name in classes if name not in frame.labels]
+        wanted = [(name, class_like(name, frame.labels)) for name in classes]
+        unknown = [name for name, known in wanted if known is None]
         if unknown:
             known = ", ".join(frame.labels)
             raise UsageError(f"sequence {sequence.name} has no detections of class {unknown[0]!r} (it has: {known})")
-        rows = np.isin(frame.label, [frame.labels.index(name) for name in classes])
+        rows = np.isin(frame.label, [i for i, name in enumerate(frame.labels) if name in dict(wanted).values()])
         yield replace(
             frame,
             label=frame.label[rows],

@@ -156,7 +156,7 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.startswith("optipmb ")
     assert run([]) == 0
     text = capsys.readouterr().out
-    for command in ("demo", "track", "replay", "evaluate", "plot", "status", "warm-up"):
+    for command in ("demo", "track", "replay", "evaluate", "sweep", "plot", "status", "warm-up"):
         assert command in text
         assert run([command, "--help"]) == 0
         assert "--json" in capsys.readouterr().out

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run_here
 from optipmb_client.camera import SENSOR_FROM_CAMERA, alpha_of, sensor_from_kitti
 from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.datasets.kitti import SPLITS, KittiDataset, KittiSequence, read_scan
@@ -157,9 +158,63 @@ def test_a_root_that_is_none_and_poses_that_are_missing_are_reported(tmp_path: P
     write_root(tmp_path)
     (tmp_path / "training/poses/0000.txt").unlink()
     with pytest.raises(
-        DatasetError, match=r"poses/0000.txt: expected a pose file, or .*oxts/0000.txt, received neither"
+        DatasetError,
+        match=r"poses/0000.txt: expected a pose file, or .*oxts/0000.txt, or --option poses=none .*, received neither",
     ):
         len(only_sequence(tmp_path))
+
+
+def test_without_poses_the_sensor_can_be_taken_to_stand_still(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`poses=none` tracks up to the last frame of the detections, in the frame of the sensor, and a line says so."""
+    write_root(tmp_path)
+    (tmp_path / "training/poses/0000.txt").unlink()
+    rows = [f"{k}" + ROW.format(score="0.9")[1:] for k in (0, 1, 2, 4)]
+    (tmp_path / "detections/rcnn/Car/0000.txt").write_text("\n".join(rows))
+    options = ["track", tmp_path, "--out", tmp_path / "out"]
+    refused = run_here(capsys, *options)
+    assert (refused.returncode, "--option poses=none" in refused.stderr) == (2, True)
+    done = run_here(capsys, *options, "--option", "poses=none")
+    assert done.returncode == 0, done.stderr
+    assert "the sensor is taken to stand still, and tracks are in its frame" in done.stderr
+    assert "0000: 5 frames" in done.stdout
+    assert (tmp_path / "out/0000.txt").read_text().splitlines()[-1].split()[13:16] == [
+        "1.000000",
+        "1.700000",
+        "20.000000",
+    ]
+    with pytest.raises(DatasetError, match="option poses: expected none"):
+        open_dataset("kitti", tmp_path, poses="gps")
+
+
+def test_the_testing_half_is_read_on_its_own_and_when_asked(tmp_path: Path) -> None:
+    """`testing/` is read without `training/`, and by `split=testing` beside it, then with its own detections only."""
+    write_root(tmp_path, frames=3)
+    (tmp_path / "training").rename(tmp_path / "testing")
+    assert len(only_sequence(tmp_path)) == 3
+    write_root(tmp_path, frames=2)
+    assert len(only_sequence(tmp_path)) == 2
+    (asked,) = open_dataset("kitti", tmp_path, split="testing").sequences(["all"])
+    assert len(asked.poses) == 3
+    with pytest.raises(DatasetError, match="the name of a detector, or just one"):
+        next(asked.frames())
+    write_root(tmp_path / "testing", scores=("0.5", "0.25"), frames=3)
+    (asked,) = open_dataset("kitti", tmp_path, split="testing").sequences(["all"])
+    assert next(asked.frames()).score.tolist() == [0.5, 0.25]
+    assert asked.truth() is None
+    with pytest.raises(DatasetError, match="with other/calib"):
+        open_dataset("kitti", tmp_path, split="other")
+
+
+def test_class_folders_are_matched_without_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Detections in `CAR/` are of the benchmark's `Car`, which is said; `--classes vehicle` means it, too."""
+    write_root(tmp_path)
+    (tmp_path / "detections/rcnn/Car").rename(tmp_path / "detections/rcnn/CAR")
+    done = run_here(capsys, "track", tmp_path, "--out", tmp_path / "out", "--classes", "vehicle")
+    assert done.returncode == 0, done.stderr
+    assert "detections/rcnn/CAR: read as detections of Car" in done.stderr
+    assert (tmp_path / "out/0000.txt").read_text().split()[2] == "Car"
 
 
 def test_unknown_datasets_and_options_are_reported() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import run_here
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nuscenes_tables import (
@@ -93,6 +94,21 @@ def test_other_classes_are_left_out(tmp_path: Path) -> None:
     names = ["traffic_cone", "bicycle", "barrier", "construction_vehicle"]
     frame = next(opened(tmp_path, one_scene(), {token: [box(token, detection_name=n) for n in names]}).frames())
     assert [frame.labels[label] for label in frame.label] == ["bicycle"]
+
+
+def test_class_names_of_others_are_matched_and_what_is_dropped_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`Car` and `vehicle.car` are cars; a line names each class that is left out with its count."""
+    scene = one_scene(2)
+    names = ["Car", "vehicle.car", "CAR", "pedestrian", "barrier", "barrier", "construction_vehicle", "sign"]
+    boxes = {scene.token(i): [box(scene.token(i), detection_name=name) for name in names] for i in range(2)}
+    frame = next(opened(tmp_path, scene, boxes).frames())
+    assert [frame.labels[label] for label in frame.label] == ["car", "car", "car", "pedestrian"]
+    done = run_here(capsys, "track", tmp_path, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "read with another class name: Car as car (2), vehicle.car as car (2), CAR as car (2)" in done.stderr
+    assert "lacks are left out: barrier (4), construction_vehicle (2), sign (2)" in done.stderr
 
 
 def test_height_of_the_bottom_is_raised_when_the_caller_or_the_file_says_so(tmp_path: Path) -> None:

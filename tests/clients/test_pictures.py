@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run_here
 from optipmb_client.animation import WIDTH_PX, animate_tracks
 from optipmb_client.datasets import DataSequence, Truth, open_dataset
 from optipmb_client.errors import ClientError
 from optipmb_client.evaluation import ClearResult, Rules, evaluate_clear
-from optipmb_client.pictures import draw_tracks
+from optipmb_client.pictures import Panel, draw_tracks
 from optipmb_client.results import ResultTable, empty_table
 from PIL import Image
 
@@ -52,7 +53,7 @@ def test_a_picture_shows_tracks_truth_sensor_and_failures(tmp_path: Path, monkey
     results: list[ClearResult] = [evaluate_clear(truth, tracks, name, RULES) for name in truth.labels]
     assert sum(len(result.switches) for result in results) == 1
     path = tmp_path / "new" / "tracks.png"
-    texts = text_of(path, monkeypatch, sequence, tracks, truth, results)
+    texts = text_of(path, monkeypatch, sequence, [Panel(tracks, results)], truth)
     assert path.read_bytes().startswith(PNG)
     assert any("(m)" in text for text in texts)
     for name in ("truth", "sensor", "miss", "change of id"):
@@ -65,17 +66,18 @@ def test_the_same_tracks_give_the_same_bytes(tmp_path: Path) -> None:
     """A picture has no date in it."""
     sequence, truth, tracks = scene()
     for name in ("a.png", "b.png"):
-        draw_tracks(tmp_path / name, sequence, tracks, truth)
+        draw_tracks(tmp_path / name, sequence, [Panel(tracks)], truth)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 def test_a_sequence_without_tracks_or_truth_is_drawn_too(tmp_path: Path) -> None:
     """Only the sensor's path, and also when there is a single track far away."""
     sequence, truth, tracks = scene()
-    draw_tracks(tmp_path / "none.png", sequence, empty_table())
-    draw_tracks(tmp_path / "truth.png", sequence, empty_table(), truth)
+    draw_tracks(tmp_path / "none.png", sequence, [Panel(empty_table())])
+    draw_tracks(tmp_path / "truth.png", sequence, [Panel(empty_table())], truth)
     far = tracks.take(np.arange(1))
-    draw_tracks(tmp_path / "far.png", sequence, replace(far, center=far.center + np.array([900.0, 0.0, 0.0])))
+    far = replace(far, center=far.center + np.array([900.0, 0.0, 0.0]))
+    draw_tracks(tmp_path / "far.png", sequence, [Panel(far)])
     assert len(list(tmp_path.glob("*.png"))) == 3
 
 
@@ -84,7 +86,7 @@ def test_without_matplotlib_the_error_says_what_to_install(tmp_path: Path, monke
     sequence, _, tracks = scene()
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ClientError, match=r"optipmb\[plot\]"):
-        draw_tracks(tmp_path / "a.png", sequence, tracks)
+        draw_tracks(tmp_path / "a.png", sequence, [Panel(tracks)])
 
 
 def test_a_gif_shows_every_frame_in_the_time_of_the_sequence(tmp_path: Path) -> None:
@@ -111,3 +113,32 @@ def test_a_gif_follows_a_sensor_that_drives_far(tmp_path: Path) -> None:
     animate_tracks(tmp_path / "none.gif", sequence, empty_table())
     with Image.open(tmp_path / "far.gif") as wide, Image.open(tmp_path / "none.gif") as empty:
         assert wide.height < wide.width == empty.width
+
+
+def test_several_trackers_are_drawn_on_the_same_axes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One panel for each --tracks, named by it, by its path where names are alike; a GIF shows one tracker."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - matplotlib is an extra
+
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_args, **_options: drawn.append(figure))
+    data = ["--dataset", "scene", "--option", "frames=16", "--option", "clouds=0", "--sequences", "0000"]
+    folders = [tmp_path / "one" / "x", tmp_path / "two" / "x", tmp_path / "wide.v2"]
+    for folder, profile in zip(folders, ("scene", "kitti", "generic"), strict=True):
+        assert run_here(capsys, "track", *data, "--profile", profile, "--out", folder).returncode == 0
+    for chosen, names in (
+        (folders[1:], ["x", "wide.v2"]),
+        (folders[:2], [str(folder) for folder in folders[:2]]),
+        (folders[:1], ["Sequence 0000"]),
+    ):
+        words = [word for folder in chosen for word in ("--tracks", folder)]
+        done = run_here(capsys, "plot", *data, *words, "--out", tmp_path / "a.png")
+        assert done.returncode == 0, done.stderr
+        panels = drawn[-1].axes
+        assert [panel.get_title().partition(":")[0] for panel in panels] == names
+        assert len({(panel.get_xlim(), panel.get_ylim()) for panel in panels}) == 1
+    words = [word for folder in folders for word in ("--tracks", folder)]
+    done = run_here(capsys, "plot", *data, *words, "--out", tmp_path / "a.gif")
+    assert done.returncode == 2
+    assert "received 3" in done.stderr

@@ -9,6 +9,7 @@ import pytest
 from commands import result_of, run_here
 from optipmb_client.datasets import DataSequence, DatasetError, open_dataset
 from optipmb_client.datasets.table import TableDataset, TableSequence, match_stamps
+from optipmb_client.datasets.table.names import find_columns
 from optipmb_client.offline import track_sequence
 from optipmb_client.table_files import read_table, write_table
 from own_tables import FRAMES, boxes
@@ -61,13 +62,13 @@ STAMPS = np.repeat(np.arange(FRAMES) * 100_000_000 + 1_700_000_000_000_000_000, 
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"t": np.repeat(np.arange(FRAMES) * 100, 3)}, "stamps look like milliseconds"),
-        ({"t": np.repeat(np.arange(FRAMES) * 100_000, 3)}, "stamps look like microseconds"),
-        ({"t": None, "timestamp": STAMPS}, "stamps look like nanoseconds"),
-        ({"t": None, "timestamp": STAMPS / 1e9}, "stamps look like seconds"),
+        ({"t": np.repeat(np.arange(FRAMES) * 100, 3)}, "stamps are in milliseconds"),
+        ({"t": np.repeat(np.arange(FRAMES) * 100_000, 3)}, "stamps are in microseconds"),
+        ({"t": None, "timestamp": STAMPS}, "stamps are in nanoseconds"),
+        ({"t": None, "timestamp": STAMPS / 1e9}, "stamps are in seconds"),
         ({"t": None, "stamp_ns": STAMPS}, ""),
         ({"t": None, "stamp": STAMPS.astype("datetime64[ns]")}, ""),
-        ({"yaw": np.tile([0.0, 177.617, 5.72958], FRAMES)}, "yaw looks like degrees (up to 177.6)"),
+        ({"yaw": np.tile([0.0, 177.617, 5.72958], FRAMES)}, "yaw is in degrees"),
         ({"yaw": None, "heading_deg": np.tile([0.0, 177.617, 5.72958], FRAMES)}, ""),
         ({"score": np.tile([2.197, 1.386, -0.8473], FRAMES)}, "scores look like logits"),
         ({"score": np.tile([90.0, 80.0, 70.0], FRAMES)}, "scores look like percent"),
@@ -77,7 +78,6 @@ def test_units_are_found_and_said(tmp_path: Path, changed: dict[str, Any], said:
     """Units that no name states are found in the values, and one line says so."""
     notes, sequence = notes_and_frames(tmp_path / "d.parquet", boxes(**changed))
     assert said in notes
-    assert ("look" in notes) == bool(said) or "t" in boxes(**changed)
     frames = list(sequence.frames())
     assert np.diff([frame.stamp_ns for frame in frames]) == pytest.approx(1e8, abs=300)
     assert frames[0].yaw == pytest.approx([0.0, 3.1, 0.1], abs=1e-5)
@@ -89,11 +89,11 @@ def test_sizes_in_another_order_are_found_where_no_name_says_the_order(tmp_path:
     """`size` as height, width, length is told from the cars; columns l, w, h that look so are read as named."""
     hwl = {"l": None, "w": None, "h": None, "size_0": boxes()["h"], "size_1": boxes()["w"], "size_2": boxes()["l"]}
     notes, sequence = notes_and_frames(tmp_path / "a.csv", boxes(**hwl))
-    assert "sizes look like h, w, l" in notes
+    assert "sizes are height, width, length, as the Car boxes have them (--option sizes=" in notes
     assert next(sequence.frames()).size[0] == pytest.approx([4.5, 1.9, 1.6])
     swapped = boxes(l=boxes()["h"], h=boxes()["l"])
     notes, sequence = notes_and_frames(tmp_path / "b.csv", swapped)
-    assert "sizes look like h, w, l, and not as their columns are named: --option sizes=hwl reads them so" in notes
+    assert "sizes look like height, width, length, not as their columns are named (--option sizes=hwl)" in notes
     assert next(sequence.frames()).size[0] == pytest.approx([1.6, 1.9, 4.5])
     _, sequence = notes_and_frames(tmp_path / "c.csv", swapped, sizes="hwl")
     assert next(sequence.frames()).size[0] == pytest.approx([4.5, 1.9, 1.6])
@@ -132,6 +132,24 @@ def test_names_of_columns_are_many(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"a column x \(--option column.x=NAME\)"):
         notes_and_frames(tmp_path / "c.csv", east)
     same(notes_and_frames(tmp_path / "d.csv", east, **{"column.x": "east"})[1], sequence)
+
+
+@pytest.mark.parametrize(
+    ("names", "stamp", "nanosec"),
+    [
+        (("sec", "nanosec"), "sec", "nanosec"),
+        (("header.stamp.nanosec", "header.stamp.sec"), "header.stamp.sec", "header.stamp.nanosec"),
+        (("stamp.nsecs", "stamp.secs"), "stamp.secs", "stamp.nsecs"),
+        (("timestampSec", "timestampNsec"), "timestampSec", "timestampNsec"),
+        (("t", "sec", "nanosec"), "t", None),
+        (("stamp_nanosec",), "stamp_nanosec", None),
+    ],
+)
+def test_nanoseconds_belong_to_a_column_of_seconds(names: tuple[str, ...], stamp: str, nanosec: str | None) -> None:
+    """A column of nanoseconds is the second half of a stamp only where the stamp is a column of whole seconds."""
+    found = find_columns(names, {})
+    assert found["stamp"].name == stamp
+    assert (found["nanosec"].name if "nanosec" in found else None) == nanosec
 
 
 def test_lists_inside_rows_are_columns(tmp_path: Path) -> None:

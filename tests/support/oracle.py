@@ -117,7 +117,7 @@ class Oracle:
         if not self.modules.habm:
             for z in measurements:
                 mean, covariance = birth(z, self.classes[z.label])
-                weight = self.classes[z.label].adaptive_birth_rate
+                weight = self.classes[z.label].baseline_birth_rate
                 self.poisson.append(Poisson(mean, covariance, weight, z.label, z.auxiliary.copy(), now, newborn=True))
         p_d = [self._detection_probability(b, world) for b in self.bernoulli]
         p_du = [self._detection_probability(u, world) for u in self.poisson]

@@ -89,12 +89,13 @@ def test_rpp_off_forgets_all_components() -> None:
 
 
 def test_habm_off_starts_tracks_from_any_score() -> None:
-    """Without HABM every measurement adds a component before the update and may start a track from it at once."""
-    parameters = car()
-    result = run(parameters, [boxes(parameters, 0, (0, 0), score=0.2)], optipmb.Modules(habm=False))[0]
-    np.testing.assert_array_equal(result.density.bernoulli.id, [1])
-    assert result.density.bernoulli.existence[0] < 1.0
-    np.testing.assert_allclose(result.density.poisson.weight, [2.0 * 0.1])
+    """Without HABM every measurement adds a component of the baseline's weight and may start a track at once."""
+    for changes, weight in (({}, 0.1), ({"baseline_birth_rate": 0.4}, 0.4)):
+        parameters = car(**changes)
+        result = run(parameters, [boxes(parameters, 0, (0, 0), score=0.2)], optipmb.Modules(habm=False))[0]
+        np.testing.assert_array_equal(result.density.bernoulli.id, [1])
+        assert result.density.bernoulli.existence[0] < 1.0
+        np.testing.assert_allclose(result.density.poisson.weight, [weight * (1.0 - 0.9)])
 
 
 def test_a_missed_object_follows_the_misdetection_formula() -> None:

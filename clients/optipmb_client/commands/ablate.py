@@ -1,5 +1,6 @@
 """`optipmb ablate`: what each module of the tracker is worth on a dataset."""
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -27,7 +28,8 @@ from optipmb_client.progress import FrameProgress
 if TYPE_CHECKING:
     from collections.abc import Sequence as Many
 
-    from optipmb_client.tuning import Figures, Row
+    from optipmb_client import tuning
+    from optipmb_client.tuning import Figures, Row, Variant
 
 MODULES = ("adp", "habm", "rpp", "ote")
 SHOWN = ("AMOTA", "AMOTP", "FN", "FP", "IDS", "sAMOTA", "MOTA", "MOTP", "HOTA", "HOTA, all")
@@ -59,14 +61,7 @@ def ablate(  # noqa: PLR0913  these are the command's options
     name = profile or opened.profile
     parameters = profile_compared(name, chosen)
     source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, classes)
-    lengths = [len(clip.frames) for clip in source.clips] * len(tuning.ROWS)
-    done = iter(lengths)
-    with FrameProgress("ablation", sum(lengths)) as progress:
-        rows = list(
-            tuning.ablate(
-                asked.name, chosen, source.clips, parameters, source.classes, lambda: progress.advance(next(done))
-            )
-        )
+    rows = measured("ablation", source, tuning.ablation(parameters))
     if as_json:
         print_json(
             {
@@ -74,47 +69,55 @@ def ablate(  # noqa: PLR0913  these are the command's options
                 "dataset": asked.name,
                 "profile": name,
                 "sequences": [sequence.name for sequence in chosen],
-                "rows": [row.to_json() for row in rows],
+                "rows": [{"modules": asdict(row.variant.modules)} | row.to_json() for row in rows],
             }
         )
         return
-    tables = [(label, [row.classes[label] for row in rows]) for label in source.classes]
-    if len(source.classes) > 1:
-        tables.append(("all classes", [row.overall for row in rows]))
-    for title, figures in tables:
-        if markdown:
-            say(_markdown(title, rows, figures))
-        else:
-            print_table(_table(title, rows, figures))
+    marks = [[("x" if getattr(row.variant.modules, one) else "") for one in MODULES] for row in rows]
+    speed = [f"{row.frames_per_second:.0f}" for row in rows]
+    for title, figures in by_class(rows):
+        cells = [[*left, *cells_of(one, SHOWN), fps] for left, one, fps in zip(marks, figures, speed, strict=True)]
+        print_rows(title, [one.upper() for one in MODULES], [*SHOWN, "FPS"], cells, markdown=markdown)
 
 
-def _cells(row: "Row", figures: "Figures") -> list[str]:
+def measured(title: str, source: "tuning.Source", variants: "Many[Variant]") -> "list[Row]":
+    """Measure variants of the tracker, with a progress bar."""
+    from optipmb_client.tuning import measure_variants  # noqa: PLC0415  as above
+
+    with FrameProgress(title, sum(len(clip.frames) for clip in source.clips) * len(variants)) as progress:
+        return list(measure_variants(source, variants, progress.advance))
+
+
+def by_class(rows: "Many[Row]") -> "list[tuple[str, list[Figures]]]":
+    """Return the figures of all rows for each class, and of all classes where there are several."""
+    tables = [(label, [row.classes[label] for row in rows]) for label in rows[0].classes]
+    return tables if len(tables) == 1 else [*tables, ("all classes", [row.overall for row in rows])]
+
+
+def cells_of(figures: "Figures", names: "Many[str]") -> list[str]:
+    """Return figures as the cells of a table."""
     values = figures.to_json()
-    return [
-        *("x" if getattr(row.modules, module) else "" for module in MODULES),
-        *(_shown(values[name]) for name in SHOWN),
-        f"{row.frames_per_second:.0f}",
-    ]
+    return [_cell(values[name]) for name in names]
 
 
-def _markdown(title: str, rows: "Many[Row]", figures: "Many[Figures]") -> str:
-    names = (*(module.upper() for module in MODULES), *SHOWN, "FPS")
-    lines = [f"{title}:", "", "| " + " | ".join(names) + " |"]
-    lines.append("|" + " --- |" * len(MODULES) + " ---: |" * (len(names) - len(MODULES)))
-    lines += ["| " + " | ".join(_cells(row, one)) + " |" for row, one in zip(rows, figures, strict=True)]
-    return "\n".join([*lines, ""])
-
-
-def _table(title: str, rows: "Many[Row]", figures: "Many[Figures]") -> Table:
+def print_rows(
+    title: str, left: "Many[str]", right: "Many[str]", cells: "Many[Many[str]]", *, markdown: bool = False
+) -> None:
+    """Print a table; the columns named in `left` say what a row is, the others are figures."""
+    if markdown:
+        lines = [f"{title}:", "", "| " + " | ".join([*left, *right]) + " |"]
+        lines.append("|" + " --- |" * len(left) + " ---: |" * len(right))
+        say("\n".join([*lines, *("| " + " | ".join(row) + " |" for row in cells), ""]))
+        return
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for name in (*(module.upper() for module in MODULES), *SHOWN, "FPS"):
+    for name in (*left, *right):
         table.add_column(name, justify="right", no_wrap=True)
-    for row, one in zip(rows, figures, strict=True):
-        table.add_row(*_cells(row, one))
-    return table
+    for row in cells:
+        table.add_row(*row)
+    print_table(table)
 
 
-def _shown(value: float | None) -> str:
+def _cell(value: float | None) -> str:
     if value is None:
         return "-"
     return str(int(value)) if value == int(value) else f"{value:.4f}"

@@ -14,7 +14,6 @@ from optipmb_client.commands.options import (
     Root,
     Sequences,
     Source,
-    Tracks,
     Truth,
     asked_for,
     open_sequences,
@@ -28,7 +27,13 @@ def plot(  # noqa: PLR0913  these are the command's options
     data: Source = None,
     *,
     dataset: DatasetName = None,
-    tracks: Tracks,
+    tracks: Annotated[
+        list[Path],
+        typer.Option(
+            help="Folder with the result files of track or replay, or a table of tracks; several times for several "
+            "trackers side by side."
+        ),
+    ],
     out: Annotated[Path, typer.Option("--out", help="The PNG file, or a GIF file of a moving picture.")],
     root: Root = None,
     detections: Detections = None,
@@ -42,13 +47,16 @@ def plot(  # noqa: PLR0913  these are the command's options
     from optipmb_client.drawing import draw_results  # noqa: PLC0415  loads the solvers of scipy
     from optipmb_client.evaluation import default_rules, evaluate_files  # noqa: PLC0415  as above
 
+    if out.suffix == ".gif" and len(tracks) > 1:
+        raise UsageError(f"--out {out}: a moving picture shows one --tracks, received {len(tracks)}; name a PNG file")
     asked = asked_for(data, dataset, root, detections, option, truth)
     _, chosen = open_sequences(asked, sequences)
     if len(chosen) != 1:
         raise UsageError(f"--sequences: one sequence makes a picture, received {len(chosen)}")
     (sequence,) = chosen
     known = sequence.truth() is not None
-    results = evaluate_files(chosen, tracks, labels_of(chosen), default_rules(asked.name)) if known else []
+    rules = default_rules(asked.name)
+    results = [evaluate_files(chosen, one, labels_of(chosen), rules) if known else [] for one in tracks]
     draw_results(out, sequence, tracks, results, score)
     if as_json:
         print_json({"command": "plot", "dataset": asked.name, "sequence": sequence.name, "picture": out})

@@ -8,6 +8,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from optipmb_client.commands.ablate import cells_of
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
@@ -34,7 +35,7 @@ from optipmb_client.extras import needed
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from optipmb_client.tuning import Curves, Estimate, Figures, Refined
+    from optipmb_client.tuning import Curves, Estimate, Refined
 
 SHOWN = ("sAMOTA", "AMOTA", "MOTA", "MOTP", "HOTA", "IDS", "FP", "FN", "GT")
 LEAST_SHOWN = 100
@@ -173,10 +174,10 @@ def _report(refined: "Refined") -> Group:
         ("after (on the tuning data)", refined.after),
     ):
         for copy, row in zip(copies, rows, strict=False):
-            figures.add_row(title + copy, *_cells(row))
+            figures.add_row(title + copy, *cells_of(row, SHOWN))
     for fold in refined.folds:
-        figures.add_row(f"without {' '.join(fold.sequences)}: before", *_cells(fold.before[0]))
-        figures.add_row(f"without {' '.join(fold.sequences)}: after", *_cells(fold.after[0]))
+        figures.add_row(f"without {' '.join(fold.sequences)}: before", *cells_of(fold.before[0], SHOWN))
+        figures.add_row(f"without {' '.join(fold.sequences)}: after", *cells_of(fold.after[0], SHOWN))
     evidence = Table(box=None, pad_edge=False)
     for column in ("changed", "from", "to", "gain", "+-", "gains"):
         evidence.add_column(column, justify="left" if column == "changed" else "right")
@@ -216,14 +217,3 @@ def _objective(refined: "Refined") -> str:
     gains = [fold.value_after - fold.value_before for fold in refined.folds]
     shown = ", ".join(f"{gain:+.4f}" for gain in gains)
     return f"{text}, cross-validated {refined.value_crossed:.4f}; gains on what was left out: {shown}"
-
-
-def _cells(figures: "Figures") -> list[str]:
-    values = figures.to_json()
-    return [_shown(values[name]) for name in SHOWN]
-
-
-def _shown(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return str(int(value)) if value == int(value) else f"{value:.4f}"

@@ -67,8 +67,8 @@ def open_dataset(
         root: the folder of a dataset on disk, the file of a recording; a generated one takes none.
         detections: the detector whose results are used: its name, its folder or file. None when there is just one, or
             when only truth, poses and clouds are read.
-        options: of the dataset. kitti: `clouds`; nuscenes: `clouds`, `z_bottom`; scene: the fields of `SceneOptions`;
-            mcap: none; rosbag: `points`, `odometry`, `fixed_frame`, `keep_input` and `class.NAME`;
+        options: of the dataset. kitti: `clouds`, `poses`, `split`; nuscenes: `clouds`, `z_bottom`; scene: the fields of
+            `SceneOptions`; mcap: none; rosbag: `points`, `odometry`, `fixed_frame`, `keep_input` and `class.NAME`;
             table: those of `optipmb_client.datasets.table.OPTIONS`. For table and mcap also `fuse`: the sensors of a
             recording share a density.
 
@@ -97,8 +97,9 @@ _Options: TypeAlias = dict[str, float | str]
 
 
 def _kitti(root: Path, detections: str | Path | None, options: _Options) -> Dataset:
-    _known(options, {"clouds"})
-    return KittiDataset(root, detections, clouds=bool(options.get("clouds", True)))
+    _known(options, {"clouds", "poses", "split"})
+    text = {name: str(options[name]) for name in ("poses", "split") if name in options}
+    return KittiDataset(root, detections, clouds=bool(options.get("clouds", True)), **text)
 
 
 def _nuscenes(root: Path, detections: str | Path | None, options: _Options) -> Dataset:

@@ -4,13 +4,14 @@ Conventions: the sensor frame of detections is the rectified camera frame with i
 `optipmb_client.camera`); the world is the same for the camera of frame 0. Clouds are in the velodyne frame. Frames are
 0.1 s apart. Truth boxes are ignored when largely invisible or cut by the image's border, as AB3DMOT's protocol has it.
 
-Layout, below a root that holds `training` or is itself such a folder: `calib/SSSS.txt`, `poses/SSSS.txt` or
-`oxts/SSSS.txt`, and, where there are any, `label_02/SSSS.txt` and `velodyne/SSSS/FFFFFF.bin`. Detections are
-`detections/DETECTOR/CLASS/SSSS.txt`, in the root or beside it. Only tracking needs them: truth, poses and clouds can be
+Layout, below a root that holds `training` or `testing`, or is itself such a folder: `calib/SSSS.txt`,
+`poses/SSSS.txt` or `oxts/SSSS.txt`, and, where there are any, `label_02/SSSS.txt` and `velodyne/SSSS/FFFFFF.bin`.
+Detections are `detections/DETECTOR/CLASS/SSSS.txt`, in the root or beside it; those of `testing` are in it where there
+is `training` too, for sequences have the same names in both. Only tracking needs them: truth, poses and clouds can be
 read of a root with several detectors of which none is named, and of one with none.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -65,6 +66,8 @@ class Layout:
     """The folder with one folder per class; None where no detector is named and there is not just one."""
     clouds: bool
     """Clouds are wanted."""
+    still: bool = False
+    """The sensor is taken to stand still; no poses are read."""
 
     @cached_property
     def probability(self) -> bool:
@@ -90,9 +93,9 @@ class KittiSequence:
     def __init__(self, name: str, layout: Layout) -> None:
         self.name = name
         self._layout = layout
-        self.labels = _CLASSES
-        if layout.detector is not None:
-            self.labels = tuple(path.parent.name for path in sorted(layout.detector.glob(f"*/{name}.txt")))
+        folders = [path.parent for path in sorted(layout.detector.glob(f"*/{name}.txt"))] if layout.detector else []
+        self._folders = _by_class(folders)
+        self.labels = tuple(self._folders) if layout.detector else _CLASSES
         if not self.labels:
             raise DatasetError(f"{layout.detector}/CLASS/{name}.txt", "detections of at least one class", "none")
 
@@ -112,12 +115,26 @@ class KittiSequence:
     @cached_property
     def _world_from_camera(self) -> Floats:
         """(F, 4, 4) in camera axes."""
+        if self._layout.still:
+            return np.tile(np.eye(4), (self._last_frame() + 1, 1, 1))
         poses, oxts = self._layout.text("poses", self.name), self._layout.text("oxts", self.name)
         if poses.exists():
             return read_poses(poses)
         if oxts.exists():
             return read_oxts(oxts, self.calibration)
-        raise DatasetError(poses, f"a pose file, or {oxts}", "neither")
+        instead = "--option poses=none for a sensor that stands still"
+        raise DatasetError(poses, f"a pose file, or {oxts}, or {instead}", "neither")
+
+    def _last_frame(self) -> int:
+        """Return the last frame that detections, labels, scans or images have; -1 without any."""
+        images = (self._layout.base / "image_02" / self.name).glob("*.*")
+        frames = {*self._scans, *(int(path.stem) for path in images if path.stem.isdigit())}
+        files = [(folder / f"{self.name}.txt", ",") for folder in self._folders.values()]
+        for path, separator in (*files, (self._layout.text("label_02", self.name), None)):
+            if path.is_file():
+                rows = read_rows(path, "frames", separator)
+                frames |= {int(number) for _, (number, *_) in rows if number.strip().isdigit()}
+        return max(frames, default=-1)
 
     @cached_property
     def poses(self) -> tuple[Pose, ...]:
@@ -138,10 +155,11 @@ class KittiSequence:
 
     def frames(self) -> Iterator[DetectionFrame]:
         """Yield every frame in order, also those without detections."""
-        count, detector = len(self), self._layout.need_detector()
+        self._layout.need_detector()
+        count = len(self)
         files = [
-            read_detections(detector / label / f"{self.name}.txt", count, _TYPE_CODES.get(label))
-            for label in self.labels
+            read_detections(folder / f"{self.name}.txt", count, _TYPE_CODES.get(label))
+            for label, folder in self._folders.items()
         ]
         label = np.concatenate([np.full(len(file.frame), i, dtype=np.int64) for i, file in enumerate(files)])
         frame = np.concatenate([file.frame for file in files])
@@ -227,12 +245,34 @@ class KittiDataset:
     name = "kitti"
     profile = "kitti"
 
-    def __init__(self, root: Path, detections: str | Path | None = None, *, clouds: bool = True) -> None:
-        base = root / "training" if (root / "training").is_dir() else root
-        if not (base / "calib").is_dir():
+    def __init__(
+        self,
+        root: Path,
+        detections: str | Path | None = None,
+        *,
+        clouds: bool = True,
+        split: str | None = None,
+        poses: str | None = None,
+    ) -> None:
+        halves = [name for name in (split, "training", "testing") if name and (root / name).is_dir()]
+        base = root / halves[0] if halves else root
+        if not (base / "calib").is_dir() or split not in {None, base.name}:
             received = "a folder without them" if root.is_dir() else "no such folder"
-            raise DatasetError(root, "a KITTI tracking root (with training/calib or calib)", received)
-        self._layout = Layout(root, base, _find_detector(root, base, detections), clouds)
+            expected = f"{split}/calib" if split else "training/calib, testing/calib or calib"
+            raise DatasetError(root, f"a KITTI tracking root (with {expected})", received)
+        if poses not in {None, "none"}:
+            raise DatasetError("option poses", "none: the sensor is taken to stand still", repr(poses))
+        self._layout = Layout(root, base, _find_detector(root, base, detections), clouds, poses == "none")
+
+    @property
+    def notes(self) -> Iterator[str]:
+        """What was assumed about the data."""
+        layout = self._layout
+        if layout.still:
+            yield "poses=none: the sensor is taken to stand still, and tracks are in its frame"
+        for name, folder in _by_class(sorted(layout.detector.glob("*/")) if layout.detector else ()).items():
+            if name != folder.name:
+                yield f"{folder}: read as detections of {name}"
 
     def sequences(self, names: Sequence[str]) -> list[KittiSequence]:
         """Return the sequences of these names; `train` and `val` are the splits.
@@ -274,6 +314,15 @@ class KittiDataset:
         return "calib" if self._layout.detector is None else f"calib and detections ({self._layout.detector})"
 
 
+def _by_class(folders: Iterable[Path]) -> dict[str, Path]:
+    """Return folders of detections by class, with the benchmark's name for a class that it has in other letters."""
+    found: dict[str, Path] = {}
+    for folder in folders:
+        name = next((one for one in _CLASSES if one.lower() == folder.name.lower()), folder.name)
+        found[folder.name if name in found else name] = folder
+    return found
+
+
 def _find_detector(root: Path, base: Path, detections: str | Path | None) -> Path | None:
     """Return the folder of a detector, given its name or its path, or the only one there is; None where it is open."""
     if detections is None:
@@ -291,7 +340,9 @@ def _detectors(root: Path, base: Path) -> list[Path]:
 
 
 def _detector_folders(root: Path, base: Path) -> list[Path]:
-    return list(dict.fromkeys(place / "detections" for place in (root, base, base.parent, root.parent)))
+    beside = base.name == "testing" and (base.parent / "training").is_dir()
+    places = (base,) if beside else (root, base, base.parent, root.parent)
+    return list(dict.fromkeys(place / "detections" for place in places))
 
 
 def _are_probabilities(detector: Path) -> bool:

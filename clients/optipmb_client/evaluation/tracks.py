@@ -12,14 +12,13 @@ from optipmb_client.datasets import DataSequence, DatasetError, Truth
 from optipmb_client.datasets.kitti import KittiSequence
 from optipmb_client.datasets.nuscenes import NuScenesSequence
 from optipmb_client.datasets.table import TableSequence
-from optipmb_client.datasets.table.rows import line_of
 from optipmb_client.datasets.table.truth import ObjectTable, TableOptions, read_objects
 from optipmb_client.results import ResultTable, read_kitti_results
 from optipmb_client.results.full import FullTable, full_path, read_full
 from optipmb_client.results.kitti import LEAST_SHOWN
 from optipmb_client.results.nuscenes import NUSCENES_FILE, read_nuscenes_results, result_table
 from optipmb_client.results.rows import empty_table
-from optipmb_client.table_files import SUFFIXES, is_table, read_table
+from optipmb_client.table_files import SUFFIXES, is_table
 
 __all__ = ["read_compared", "read_full_tracks", "read_tracks"]
 
@@ -121,19 +120,18 @@ def _file(results: Path, name: str) -> Path:
 
 def _from_table(path: Path, sequence: DataSequence) -> ResultTable:
     """Return the tracks of a table in the world frame."""
-    columns = read_table(path)
-    if columns and not len(next(iter(columns.values()))):
-        return empty_table()
     tables: TableOptions = getattr(sequence, "tables", TableOptions())
-    table = read_objects(path, tables, columns)
-    key = _key(table, sequence, tables)
+    (table,) = read_objects(path, [path], tables)
+    key = _key(table, sequence, tables) if len(table.boxes.frame_stamp) else None
     if key is None:
         return replace(empty_table(), notes=(f"{path}: no tracks of {sequence.name}",))
-    stamps = np.array([frame.stamp_ns for frame in sequence.frames()], dtype=np.int64)
-    rows, frame, notes = table.at(key, stamps)
+    stamps = getattr(sequence, "stamps", None)
+    if stamps is None:
+        stamps = np.array([frame.stamp_ns for frame in sequence.frames()], dtype=np.int64)
+    rows, frame, notes = table.at(key, *table.times(stamps, getattr(sequence, "numbers", None)))
     boxes = table.boxes
     if (frame < 0).any():
-        line = line_of(path, int(boxes.row[rows[np.flatnonzero(frame < 0)[0]]]))
+        line = table.line(int(rows[np.flatnonzero(frame < 0)[0]]))
         raise DatasetError(path, f"stamps of the frames of {sequence.name}", "another stamp", line=line)
     labels = tuple(dict.fromkeys(boxes.name[rows].tolist()))
     center, yaw, _ = table.in_world(rows)

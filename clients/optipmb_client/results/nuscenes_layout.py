@@ -7,9 +7,11 @@ tracks, a `tracking_id`. Columns have the size as length, width, height, and the
 axis seen from above.
 """
 
+import functools
 import json
 import math
 from array import array
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from optipmb_client.class_names import class_like
 from optipmb_client.files import DatasetError, read_text
 from optipmb_client.geometry import Floats, Ints
 
@@ -29,7 +32,8 @@ Kind: TypeAlias = Literal["detection", "tracking"]
 _Row: TypeAlias = "array[float]"
 
 _WIDTH = 14
-_LABEL = {name: float(index) for index, name in enumerate(NUSCENES_CLASSES)}
+_UNTRACKED = frozenset(("barrier", "construction_vehicle", "traffic_cone", "vehicle.construction"))
+"""Classes of the detection benchmark that the tracking benchmark lacks, whatever they resemble."""
 _LENGTHS = {"translation": 3, "size": 3, "rotation": 4}
 _PLANE = 2
 
@@ -65,6 +69,8 @@ class Submission:
     meta: Mapping[str, Any]
     rows: Mapping[str, list[tuple[str, _Row]]]
     """By sample token: id and numbers of each box."""
+    classes: Mapping[str, int]
+    """Number of boxes of each class name of the file, also of classes that are left out."""
 
     def __contains__(self, token: str) -> bool:
         return token in self.rows
@@ -113,9 +119,11 @@ def read_submission(path: Path, kind: Kind) -> Submission:
     """
     what = f"a nuScenes {kind} file"
 
+    classes: Counter[str] = Counter()
+
     def convert(record: dict[str, Any]) -> Any:
         # Boxes become rows of numbers as soon as they are read: a million maps would take gigabytes.
-        return _row(path, record, kind) if "translation" in record else record
+        return _row(path, record, kind, classes) if "translation" in record else record
 
     try:
         content = json.loads(read_text(path, what), object_hook=convert)
@@ -130,21 +138,29 @@ def read_submission(path: Path, kind: Kind) -> Submission:
             raise DatasetError(path, f"a list of boxes in results.{token}", "something else")
         rows[token] = [box for box in boxes if box]
     meta = content.get("meta")
-    return Submission(path, meta if isinstance(meta, dict) else {}, rows)
+    return Submission(path, meta if isinstance(meta, dict) else {}, rows, classes)
 
 
-def _row(path: Path, record: dict[str, Any], kind: Kind) -> tuple[str, _Row] | tuple[()]:
-    """Return id and numbers of a box; nothing when its class is not tracked."""
+@functools.lru_cache(maxsize=256)
+def tracked_class(name: str) -> str | None:
+    """Return the class of the tracking benchmark that a class name means; None for another class."""
+    return None if name.lower() in _UNTRACKED else class_like(name, NUSCENES_CLASSES)
+
+
+def _row(path: Path, record: dict[str, Any], kind: Kind, classes: Counter[str]) -> tuple[str, _Row] | tuple[()]:
+    """Return id and numbers of a box; nothing when its class is not tracked. Counts the class in `classes`."""
     token = record.get("sample_token", "?")
     try:
-        label = _LABEL.get(record[f"{kind}_name"])
+        name = str(record[f"{kind}_name"])
+        classes[name] += 1
+        label = tracked_class(name)
         if label is None:
             return ()
-        numbers = [label]
-        for name, length in _LENGTHS.items():
-            values = record[name]
+        numbers = [float(NUSCENES_CLASSES.index(label))]
+        for field, length in _LENGTHS.items():
+            values = record[field]
             if len(values) != length:
-                raise DatasetError(path, f"{length} numbers in {name} (sample {token})", f"{len(values)}")
+                raise DatasetError(path, f"{length} numbers in {field} (sample {token})", f"{len(values)}")
             numbers += map(float, values)
         numbers.append(float(record[f"{kind}_score"]))
         numbers += _velocity(record.get("velocity"))

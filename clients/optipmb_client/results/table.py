@@ -1,11 +1,12 @@
 """Tracks as tables: one row per track and frame, in the world frame, in order of frames and, in a frame, of ids.
 
 Columns: what names the recording and the time in the table of detections (for other datasets `sequence` and
-`stamp_ns`), then frame, id, class, x, y, z, l, w, h, yaw, vx, vy, yaw_rate, acceleration, score, existence, age,
-time_since_detection and detection_row: the row of the table (from 0; for other datasets the place in the frame) of the
-detection that the track was given, no value while it is missed. A velocity has no value until it is known: from the
-second detection on, where the detector gives none. On request the upper triangle of the covariance of (x, y, v, phi,
-omega, a) follows, `cov_x_x` to `cov_a_a`. Metres, seconds, radians. The same tracks always give the same bytes.
+`stamp_ns`), then frame (its number in the table of detections, or else counted from 0), id, class, x, y, z, l, w, h,
+yaw, vx, vy, yaw_rate, acceleration, score, existence, age, time_since_detection and detection_row: the row of the table
+(from 0; for other datasets the place in the frame) of the detection that the track was given, no value while it is
+missed. A velocity has no value until it is known: from the second detection on, where the detector gives none. On
+request the upper triangle of the covariance of (x, y, v, phi, omega, a) follows, `cov_x_x` to `cov_a_a`.
+Metres, seconds, radians. The same tracks always give the same bytes.
 """
 
 from collections.abc import Iterator, Sequence
@@ -60,7 +61,9 @@ class TrackColumns:
         frame = np.repeat(np.array(order, dtype=np.int64), [len(self._tracks[i].id) for i in order])
         names = [name for i in order for name in np.asarray(self._tracks[i].labels, np.str_)[self._tracks[i].label]]
         columns = self._place(frame)
-        columns |= {"frame": frame, "id": self._all("id"), "class": np.array(names, dtype=np.str_)}
+        numbers = getattr(sequence, "numbers", None)
+        columns |= {"frame": frame if numbers is None else numbers[frame]}
+        columns |= {"id": self._all("id"), "class": np.array(names, dtype=np.str_)}
         for name, parts in (("center", "xyz"), ("size", "lwh"), ("velocity", ("vx", "vy"))):
             values = self._all(name, len(parts))
             if name == "velocity":

@@ -1,12 +1,12 @@
 """Tuning: from a detector's results and labels to a parameter profile, and what each module of the tracker is worth."""
 
-from optipmb_client.tuning.ablation import ROWS, Row, ablate
 from optipmb_client.tuning.display import TrialDisplay
 from optipmb_client.tuning.estimate import Estimate, estimate
 from optipmb_client.tuning.figures import Figures
 from optipmb_client.tuning.run import Curves, Source, Tuned, calibrate_scores, estimate_all, tune_all
 from optipmb_client.tuning.session import Plan, Refined, refine
 from optipmb_client.tuning.values import value_of
+from optipmb_client.tuning.variants import ROWS, Row, Variant, ablation, measure_variants, sweep
 
 __all__ = [
     "ROWS",
@@ -19,11 +19,14 @@ __all__ = [
     "Source",
     "TrialDisplay",
     "Tuned",
-    "ablate",
+    "Variant",
+    "ablation",
     "calibrate_scores",
     "estimate",
     "estimate_all",
+    "measure_variants",
     "refine",
+    "sweep",
     "tune_all",
     "value_of",
 ]

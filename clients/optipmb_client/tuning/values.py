@@ -44,11 +44,11 @@ def value_of(parameters: Parameters, name: str, path: str) -> Value:
     return value
 
 
-def with_values(parameters: Parameters, name: str, values: Mapping[str, Value]) -> Parameters:
-    """Return the parameters with other values of one class.
+def with_values(parameters: Parameters, name: str, values: Mapping[str, Value | str]) -> Parameters:
+    """Return the parameters with other values of one class; text is read as the parameter has it.
 
     Raises:
-        UsageError: a value is not allowed.
+        UsageError: there is no such parameter, or a value is not allowed.
 
     """
     document = parameters.model_dump()
@@ -56,7 +56,11 @@ def with_values(parameters: Parameters, name: str, values: Mapping[str, Value]) 
         *parents, last = path.split(".")
         table = document["classes"][name]
         for part in parents:
-            table = table[part]
+            table = table.get(part) if isinstance(table, dict) else None
+        if not isinstance(table, dict):
+            raise UsageError(f"{path}: class {name} of profile {parameters.name} has no table {'.'.join(parents)}")
+        if isinstance(table.get(last), dict):
+            raise UsageError(f"{path}: expected one value of this table, such as {path}.{next(iter(table[last]))}")
         table[last] = value
     return _parsed(document)
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from optipmb_client.datasets.interface import DataSequence, DetectionFrame, Truth
 from optipmb_client.datasets.table.names import ALIASES
-from optipmb_client.datasets.table.rows import Boxes, read_boxes
+from optipmb_client.datasets.table.rows import Boxes, read_tables
 from optipmb_client.datasets.table.truth import ObjectTable, TableOptions, read_objects, truth_at
-from optipmb_client.datasets.table.values import Reading
+from optipmb_client.datasets.table.values import Finding, Reading
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Ints, Pose
 from optipmb_client.results import ResultWriter
@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 
 __all__ = ["OPTIONS", "TableDataset", "TableSequence"]
 
-OPTIONS: Final = ("time", "rate", "yaw", "sizes", "axes", "score", "invalid", "truth", "tracks")
+OPTIONS: Final = (
+    *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
+    *("poses", "truth", "tracks"),
+)
 """Options beside `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them."""
 GAP: Final = 1.5
 _HERE: Final = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -47,6 +50,7 @@ class TableSequence:
         key: str,
         truth: tuple[ObjectTable, str] | None,
         tables: TableOptions,
+        origin: int = 0,
     ) -> None:
         self.tables = tables
         self.name = name
@@ -58,11 +62,14 @@ class TableSequence:
         self.recording = ".".join(map(_plain, self.columns.values())) or stem
         self._boxes = boxes
         self._truth = truth
+        self._origin = origin
         member = boxes.frame_key == key
         rows = np.flatnonzero(member)
         self._stamps, first, frame = np.unique(boxes.frame_stamp[rows], return_index=True, return_inverse=True)
         self.times: NDArray[Any] = boxes.frame_time[rows[first]]
         """(F,) as the table has them."""
+        self.numbers = None if boxes.frame_number is None else boxes.frame_number[rows[first]]
+        """(F,) numbers of the frames as the table has them, None where it has none."""
         self._poses = None if boxes.frame_pose is None else boxes.frame_pose[rows[first]]
         frame_of_row = np.full(len(boxes.frame_stamp), -1, dtype=np.int64)
         frame_of_row[rows] = frame
@@ -79,7 +86,7 @@ class TableSequence:
 
     @property
     def stamps(self) -> Ints:
-        """(F,) nanoseconds."""
+        """(F,) nanoseconds, of any origin; those of frames are counted from an origin before them."""
         return self._stamps
 
     @cached_property
@@ -103,7 +110,7 @@ class TableSequence:
             chosen = self._of(index)
             yield DetectionFrame(
                 index=index,
-                stamp_ns=int(self._stamps[index]),
+                stamp_ns=int(self._stamps[index]) - self._origin,
                 pose=self.poses[index],
                 labels=self.labels,
                 label=self._label[self._start[index] : self._start[index + 1]],
@@ -121,7 +128,7 @@ class TableSequence:
         Raises:
             DatasetError: as `truth_at`.
         """
-        return None if self._truth is None else truth_at(self.name, self._stamps, *self._truth)
+        return None if self._truth is None else truth_at(self.name, self._stamps, self.numbers, *self._truth)
 
 
 class TableDataset:
@@ -130,6 +137,7 @@ class TableDataset:
     Args:
         path: the file or folder.
         options: see `OPTIONS`.
+        lenient: whether what is wrong becomes a finding (`Reading`), where nothing is to be tracked.
 
     Raises:
         DatasetError: a file, a column, a value or an option is wrong; says where.
@@ -139,7 +147,7 @@ class TableDataset:
     name = "table"
     profile = "auto"
 
-    def __init__(self, path: Path, options: Mapping[str, str] | None = None) -> None:
+    def __init__(self, path: Path, options: Mapping[str, str] | None = None, *, lenient: bool = False) -> None:
         options = dict(options or {})
         for name in options:
             role = name.removeprefix("column.")
@@ -151,29 +159,34 @@ class TableDataset:
         self._sequences: dict[str, TableSequence] = {}
         self._notes: list[str] = []
         self.path = path
-        tracks = options.pop("tracks", None)
-        tables = TableOptions(options)
-        others = [read_objects(file, tables) for file in _tables(Path(truth))] if truth is not None else []
+        shared, tracks = TableOptions(options), options.pop("tracks", None)
+        others = read_objects(Path(truth), _tables(Path(truth)), shared) if truth is not None else []
         self._notes += [note for one in others for note in one.notes]
-        for file in files:
-            reading = Reading(file, options)
-            boxes = read_boxes(reading, scored=True)
-            tables.add(reading)
-            self._notes += [f"{file}: {note}" for note in reading.notes]
+        reading = Reading(path, options, lenient, named=shared.named)
+        tables = read_tables(files, reading, scored=True)
+        self.findings: tuple[Finding, ...] = tuple(reading.findings)
+        """What was assumed about the table, and what is wrong with it."""
+        self._notes += [f"{path}: {note}" for note in reading.notes]
+        origin = min(int(boxes.frame_stamp.min(initial=0)) for _, boxes in tables)
+        if not any(len(boxes.frame_stamp) for _, boxes in tables):
+            raise DatasetError(path, "rows", "none")
+        for file, boxes in tables:
             own = [ObjectTable(file, boxes)] if boxes.id is not None else []
-            for key in dict.fromkeys(boxes.frame_key.tolist()):
+            if not len(boxes.frame_stamp):
+                self._notes.append(f"{file}: no rows, a recording without frames")
+            for key in dict.fromkeys(boxes.frame_key.tolist()) or boxes.keys:
                 name = _plain(".".join(part for part in (_stem(file), key) if part))
                 if len(files) == 1 and key:
                     name = _plain(key)
                 where = _truth_of(others or own, key, file)
-                sequence = TableSequence(name, _plain(_stem(file)), boxes, key, where, tables)
+                sequence = TableSequence(name, _plain(_stem(file)), boxes, key, where, shared, origin)
                 if name in self._sequences:
                     raise DatasetError(file, "names of recordings that differ", f"{name!r} twice")
                 self._sequences[name] = sequence
                 self._notes += _gaps(sequence)
-                tables.recordings |= {name, key}
+                shared.recordings |= {name, key}
         if tracks is None:
-            tables.check()
+            shared.check()
 
     @property
     def notes(self) -> tuple[str, ...]:

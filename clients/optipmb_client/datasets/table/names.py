@@ -47,7 +47,9 @@ def _turn(bases: str, part: str, place: int) -> tuple[str, ...]:
 
 
 ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
-    "stamp": ("stamp", "t", "time", "timestamp", "ts", "sec", "secs", "seconds", "nanoseconds", "sim_time", "datetime"),
+    "stamp": ("stamp", "t", "time", "timestamp", "ts", "sec", "secs", "seconds", "nanoseconds", "sim_time", "datetime",
+              "header_stamp", "header_timestamp"),
+    "nanosec": ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds", "nanosec_part", "nanoseconds_part"),
     "frame": ("frame", "frame_id", "frame_index", "frame_idx", "frame_number", "frame_no", "frame_nr"),
     "x": ("x", "cx", "px", "x_center", *_vector(_CENTER, "x", 0)),
     "y": ("y", "cy", "py", "y_center", *_vector(_CENTER, "y", 1)),
@@ -88,8 +90,9 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
 _UNITS: Final[Mapping[str, str]] = {
     "deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad",
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us",
-    "ns": "ns", "nsec": "ns", "nanoseconds": "ns",
+    "ns": "ns", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanosecs": "ns", "nanoseconds": "ns",
 }  # fmt: skip
+_SECONDS: Final = ("sec", "secs", "seconds")
 _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
 
 
@@ -101,6 +104,7 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, C
         chosen: meanings whose column the user has named.
     """
     known = [_normalised(name) for name in names]
+    nanosec = _nanosec([one.name for one in known])
     taken: dict[str, Column] = {}
     used = set(chosen.values())
     for role, aliases in ALIASES.items():
@@ -109,6 +113,11 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, C
             taken[role] = Column(chosen[role], unit, "")
             continue
         fitting = [one for one in known if one.base in aliases and one.name not in used]
+        if role == "stamp":
+            fitting = [one for one in fitting if one.name not in nanosec.values()]
+        elif role == "nanosec":
+            part = nanosec.get(taken["stamp"].name) if "stamp" in taken else None
+            fitting = [Column(one.name, "ns", aliases[0]) for one in known if one.name == part]
         if fitting:
             best = min(fitting, key=lambda one: aliases.index(one.base))
             taken[role] = best
@@ -116,8 +125,24 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, C
     return taken
 
 
+def _nanosec(names: Iterable[str]) -> dict[str, str]:
+    """Return the column of nanoseconds that belongs to each column of whole seconds: `stamp.sec`, `stamp.nanosec`."""
+    known = {_plain(name): name for name in names}
+    found: dict[str, str] = {}
+    for base, name in known.items():
+        head, _, tail = base.rpartition("_")
+        if tail in _SECONDS:
+            parts = [f"{head}_{part}" if head else part for part in ALIASES["nanosec"]] + list(ALIASES["nanosec"])
+            found.update((name, known[part]) for part in parts[::-1] if part in known)
+    return found
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()).strip("_")
+
+
 def _normalised(name: str) -> Column:
-    base = re.sub(r"[^a-z0-9]+", "_", re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()).strip("_")
+    base = _plain(name)
     head, _, tail = base.rpartition("_")
     if head and tail in _UNITS:
         return Column(name, _UNITS[tail], head)

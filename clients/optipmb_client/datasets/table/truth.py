@@ -5,19 +5,20 @@ frame the nearest one counts. A frame without a row has no object or no label: w
 times as far apart as all frames, only these are labelled.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optipmb_client.datasets.interface import Regions, Truth
-from optipmb_client.datasets.table.rows import NO_ID, Boxes, line_of, read_boxes
+from optipmb_client.datasets.table.rows import NO_ID, Boxes, read_tables
 from optipmb_client.datasets.table.values import Reading
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Ints, Pose, stack_poses, to_world
-from optipmb_client.table_files import Columns, read_table
+from optipmb_client.table_files import read_table
 
 __all__ = ["ObjectTable", "TableOptions", "match_stamps", "read_objects", "truth_at"]
 
@@ -34,17 +35,12 @@ class TableOptions:
     options: Mapping[str, str] = field(default_factory=dict)
     recordings: set[str] = field(default_factory=set)
     """Names and keys of all recordings."""
-    _found: set[str] = field(default_factory=set)
-    _errors: dict[str, DatasetError] = field(default_factory=dict)
-
-    def add(self, reading: Reading) -> None:
-        """Record which options name a column or a class of a table."""
-        self._found |= reading.options.keys() - reading.unmatched.keys()
-        self._errors |= reading.unmatched
+    named: dict[str, DatasetError | None] = field(default_factory=dict)
+    """As `Reading.named`, of all tables."""
 
     def check(self) -> None:
         """Raise for an option that names a column or class of no table."""
-        for error in (error for name, error in self._errors.items() if name not in self._found):
+        for error in filter(None, self.named.values()):
             raise error
 
 
@@ -56,8 +52,20 @@ class ObjectTable:
     boxes: Boxes
     notes: tuple[str, ...] = ()
 
-    def at(self, key: str, stamps: Ints) -> tuple[Ints, Ints, list[str]]:
+    def times(self, stamps: Ints, numbers: NDArray[Any] | None) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return what frames (F,) and rows (R,) are matched by: numbers of frames if the table has no stamps."""
+        boxes = self.boxes
+        if numbers is None or boxes.frame_number is None or not np.array_equal(boxes.frame_number, boxes.frame_time):
+            return stamps, boxes.frame_stamp
+        return numbers, boxes.frame_number
+
+    def at(self, key: str, frames: NDArray[Any], times: NDArray[Any]) -> tuple[Ints, Ints, list[str]]:
         """Return the boxes (R,) of a recording, ordered by frame, their frames (R,), -1 where at none, and notes.
+
+        Args:
+            key: of the recording.
+            frames: as `times` gives it.
+            times: likewise.
 
         Raises:
             DatasetError: the table has no ids, or one id twice at a stamp.
@@ -69,20 +77,24 @@ class ObjectTable:
         known = boxes.id[rows] != NO_ID
         notes = [] if known.all() else [f"{self.path}: {int((~known).sum())} rows with no id, or -1, are left out"]
         rows = rows[known]
-        stamp, identity = boxes.frame_stamp[boxes.row[rows]], boxes.id[rows]
+        stamp, identity = times[boxes.row[rows]], boxes.id[rows]
         order = np.lexsort((identity, stamp))
         twice = order[1:][(np.diff(stamp[order]) == 0) & (np.diff(identity[order]) == 0)]
         if len(twice):
-            line = line_of(self.path, int(boxes.row[rows[twice.min()]]))
+            line = self.line(int(rows[twice.min()]))
             raise DatasetError(self.path, "an id once per frame", "an id again at the same stamp", line=line)
-        frame = match_stamps(stamps, stamp)
-        order = np.lexsort((np.abs(stamps[frame] - stamp), identity, frame))
+        frame = match_stamps(frames, stamp)
+        order = np.lexsort((np.abs(frames[frame] - stamp), identity, frame))
         again = (np.diff(frame[order]) == 0) & (np.diff(identity[order]) == 0) & (frame[order[1:]] >= 0)
         if again.any():
             notes.append(f"{self.path}: of several rows of an object at a frame the nearest counts, in time")
         kept = np.sort(order[np.append(True, ~again)[: len(order)]])
         kept = kept[np.argsort(frame[kept], kind="stable")]
         return rows[kept], frame[kept], notes
+
+    def line(self, box: int) -> int:
+        """Return the line of a box, counted from 1."""
+        return Reading(self.path, {}).place(int(self.boxes.row[box]))[1]
 
     def in_world(self, rows: Ints) -> tuple[Floats, Floats, Floats]:
         """Return centre (R, 3), yaw (R,) and velocity (R, 2) of some boxes in the world frame."""
@@ -97,27 +109,27 @@ class ObjectTable:
         return center, yaw, velocity
 
 
-def read_objects(path: Path, tables: TableOptions, columns: Columns | None = None) -> ObjectTable:
-    """Return a table of truth or tracks, of which `columns` may have been read already.
+def read_objects(path: Path, files: Sequence[Path], tables: TableOptions) -> list[ObjectTable]:
+    """Return the tables of truth or tracks that a file or folder is, judged together.
 
-    A table that OptiPMB wrote has known units and columns: only options of times and classes apply to it.
+    Tables that OptiPMB wrote have known units and columns: only options of times and classes apply to them.
 
     Raises:
         DatasetError: a column is missing or a value is wrong; names the line.
     """
-    columns = read_table(path) if columns is None else columns
-    options, written = tables.options, columns.keys() >= _WRITTEN
+    columns = {file: read_table(file) for file in files}
+    options, written = tables.options, all(one.keys() >= _WRITTEN for one in columns.values())
     if written:
         results = {f"class.{value}" for name, value in options.items() if name.startswith("class.")}
         kept = {*_PLACES, *(name for name in options.keys() - results if name.startswith("class."))}
         options = {name: value for name, value in options.items() if name in kept}
-    reading = Reading(path, options)
-    boxes = read_boxes(reading, scored=False, columns=columns)
-    tables.add(reading)
-    return ObjectTable(path, boxes, () if written else tuple(f"{path}: {note}" for note in reading.notes))
+    reading = Reading(path, options, named=tables.named)
+    found = read_tables(files, reading, scored=False, loaded=columns)
+    notes = () if written else tuple(f"{path}: {note}" for note in reading.notes)
+    return [ObjectTable(file, boxes, notes) for file, boxes in found]
 
 
-def match_stamps(stamps: Ints, wanted: Ints) -> Ints:
+def match_stamps(stamps: NDArray[Any], wanted: NDArray[Any]) -> Ints:
     """Return the frame nearest to each `wanted` stamp (R,), -1 where it is more than half a frame away."""
     if not len(stamps):
         return np.full(len(wanted), -1, dtype=np.int64)
@@ -129,21 +141,22 @@ def match_stamps(stamps: Ints, wanted: Ints) -> Ints:
     return np.where(abs(stamps[nearest] - wanted) <= 0.5 * period, nearest, -1)
 
 
-def truth_at(name: str, stamps: Ints, table: ObjectTable, key: str) -> Truth:
+def truth_at(name: str, stamps: Ints, numbers: NDArray[Any] | None, table: ObjectTable, key: str) -> Truth:
     """Return the objects of a recording at the frames (F,) of its detections.
 
     Raises:
         DatasetError: none of them is at a frame, or as for `ObjectTable.at`.
     """
     boxes, path = table.boxes, table.path
-    rows, frame, notes = table.at(key, stamps)
+    frames, times = table.times(stamps, numbers)
+    rows, frame, notes = table.at(key, frames, times)
     outside = int((frame < 0).sum())
     if outside == len(rows):
         raise DatasetError(path, f"boxes at the stamps of {name}", "none of its stamps")
     if outside:
         notes.append(f"{path}: {outside} rows are at no frame of {name}: left out")
     rows, frame = rows[outside:], frame[outside:]
-    labelled = np.isin(np.arange(len(stamps)), match_stamps(stamps, boxes.frame_stamp[boxes.frame_key == key]))
+    labelled = np.isin(np.arange(len(stamps)), match_stamps(frames, times[boxes.frame_key == key]))
     count, steps = int(labelled.sum()), np.diff(stamps[labelled])
     sparse = count < len(stamps) and (not len(steps) or np.median(steps) >= SPARSE * np.median(np.diff(stamps)))
     if count < len(stamps):

@@ -1,0 +1,139 @@
+"""`optipmb check`: what the readers find in data, before anything is tracked."""
+
+import itertools
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from optipmb import common_name
+from optipmb_client.commands.options import (
+    AsJson,
+    DatasetName,
+    Detections,
+    Options,
+    Root,
+    Sequences,
+    Source,
+    asked_for,
+    open_sequences,
+    print_json,
+    print_table,
+)
+from optipmb_client.datasets.motion import MOST_FRAMES, SAME_DIRECTION, Moves, find_moves
+from optipmb_client.geometry import Floats, stack_poses, to_world
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence as Many
+
+    from optipmb_client.datasets import DataSequence
+
+
+def check(
+    data: Source = None,
+    *,
+    dataset: DatasetName = None,
+    root: Root = None,
+    detections: Detections = None,
+    sequences: Sequences = None,
+    option: Options = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show how your data are read, without tracking: optipmb check detections.csv.
+
+    Units, rate, classes, headings against the motion of the boxes, suspicious rows, and the options that read them
+    otherwise. Status 1: track would refuse the data; the findings marked as wrong say why.
+    """
+    asked = asked_for(data, dataset, root, detections, option)
+    if asked.name == "table" and asked.root is not None:
+        from optipmb_client.datasets.table import TableDataset  # noqa: PLC0415  packages of an extra
+
+        table = TableDataset(Path(asked.root), {name: str(value) for name, value in asked.options}, lenient=True)
+        chosen = list(table.sequences(sequences or ["all"]))
+        findings: list[dict[str, Any]] = [asdict(one) for one in table.findings]
+    else:
+        _, chosen = open_sequences(asked, sequences)
+        findings = [{"topic": "yaw", "text": _headings(chosen), "option": "", "wrong": False}]
+    recordings = [_recording(one) for one in chosen]
+    classes = _classes(chosen)
+    wrong = any(one["wrong"] for one in findings)
+    if as_json:
+        print_json({"command": "check", "findings": findings, "recordings": recordings, "classes": classes})
+    else:
+        _print(findings, recordings, classes)
+    if wrong:
+        raise typer.Exit(1)
+
+
+def _recording(sequence: "DataSequence") -> dict[str, Any]:
+    stamps = np.array([frame.stamp_ns for frame in sequence.frames()], dtype=np.int64)
+    steps = np.diff(stamps) / 1e9
+    return {
+        "recording": sequence.name,
+        "frames": len(stamps),
+        "Hz": round(1.0 / float(np.median(steps)), 3) if len(steps) and np.median(steps) else None,
+        "seconds": round(float(steps.sum()), 3),
+        "longest_gap_s": round(float(steps.max(initial=0.0)), 3),
+        "boxes": sum(len(frame) for frame in sequence.frames()),
+    }
+
+
+def _classes(sequences: "Many[DataSequence]") -> list[dict[str, Any]]:
+    rows: dict[str, list[Floats]] = {}
+    for frame in itertools.chain.from_iterable(one.frames() for one in sequences):
+        for label in np.unique(frame.label).tolist():
+            mine = frame.label == label
+            rows.setdefault(frame.labels[label], []).append(np.column_stack([frame.size, frame.score])[mine])
+    found = []
+    for name, parts in rows.items():
+        values = np.concatenate(parts)
+        size = " x ".join(f"{side:.3g}" for side in np.median(values[:, :3], axis=0))
+        scores = f"{values[:, 3].min():.3g} to {values[:, 3].max():.3g}"
+        tracked = common_name(name) or "other"
+        found.append({"class": name, "kind": tracked, "boxes": len(values), "size": size, "scores": scores})
+    return found
+
+
+def _headings(sequences: "Many[DataSequence]") -> str:
+    """Compare headings with the motion of the boxes of the first frames."""
+    parts: list[tuple[Floats, ...]] = []
+    names: dict[str, int] = {}
+    for number, sequence in enumerate(sequences):
+        for frame in itertools.islice(sequence.frames(), MOST_FRAMES):
+            rotation, translation = stack_poses([frame.pose])
+            center, yaw = to_world(rotation[0], translation[0], frame.center, frame.yaw)
+            kind = np.array([names.setdefault(label, len(names)) for label in frame.labels], dtype=np.int64)
+            count = np.ones(len(frame))
+            parts.append(
+                (number * count, frame.stamp_ns / 1e9 * count, *center[:, :2].T, yaw, kind[frame.label] * count)
+            )
+    key, seconds, x, y, heading, label = (np.concatenate(column) for column in zip(*parts, strict=True))
+    moves: Moves = find_moves(key.astype(np.int64), seconds, np.column_stack([x, y]), label.astype(np.int64))
+    if not len(moves):
+        return "no box moves far enough to compare headings with motion"
+    off = np.abs(moves.turn(heading[moves.start]))
+    share = float(np.mean(np.minimum(off, np.pi - off) < SAME_DIRECTION))
+    return f"{share:.0%} of {len(moves)} moves are along the heading"
+
+
+def _print(
+    findings: "Many[dict[str, Any]]", recordings: "Many[dict[str, Any]]", classes: "Many[dict[str, Any]]"
+) -> None:
+    table = Table(box=None, pad_edge=False)
+    for name in ("", "finding", "change with"):
+        table.add_column(name, no_wrap=not name)
+    for one in findings:
+        mark = "WRONG " if one["wrong"] else ""
+        table.add_row(one["topic"], mark + one["text"], one["option"])
+    print_table(table)
+    for rows in (recordings, classes):
+        print_table("")
+        table = Table(box=None, pad_edge=False)
+        for place, name in enumerate(rows[0] if rows else ()):
+            table.add_column(name.replace("_", " "), justify="right" if place else "left", no_wrap=bool(place))
+        for row in rows:
+            table.add_row(*("-" if value is None else str(value) for value in row.values()))
+        print_table(table)
