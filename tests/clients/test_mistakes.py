@@ -36,11 +36,17 @@ def classes(*names: str) -> dict[str, np.ndarray]:
 
 MISTAKES: list[tuple[str, Any, list[str], int, str]] = [
     ("swapped axes", camera_boxes(), [], 2, "camera axes: x right, y down, z forward"),
-    ("degrees", boxes(yaw=np.tile([0.0, 179.0, 5.0], FRAMES)), [], 0, "yaw looks like degrees (up to 179)"),
-    ("milliseconds", boxes(t=np.repeat(np.arange(FRAMES) * 100, 3)), [], 0, "stamps look like milliseconds"),
+    ("degrees", boxes(yaw=np.tile([0.0, 179.0, 5.0], FRAMES)), [], 0, "yaw is in degrees"),
+    ("milliseconds", boxes(t=np.repeat(np.arange(FRAMES) * 100, 3)), [], 0, "stamps are in milliseconds"),
     ("frame numbers as time", boxes(t=np.repeat(np.arange(FRAMES), 3)), [], 2, "may count frames"),
-    ("frames without a rate", boxes(t=None, frame=np.repeat(np.arange(FRAMES), 3)), [], 2, "--option rate=HZ"),
-    ("sizes as h, w, l", boxes(l=boxes()["h"], h=boxes()["l"]), [], 0, "--option sizes=hwl reads them so"),
+    ("frames without a rate", boxes(t=None, frame=np.repeat(np.arange(FRAMES), 3)), [], 0, "--option rate=HZ"),
+    (
+        "sizes as h, w, l",
+        boxes(l=boxes()["h"], h=boxes()["l"]),
+        [],
+        0,
+        "not as their columns are named (--option sizes=hwl)",
+    ),
     ("lower-case classes", classes("car", "car", "pedestrian"), ["--profile", "kitti"], 0, "tracks car as Car"),
     ("classes of nobody", classes("cone", "cone", "sign"), ["--profile", "kitti"], 2, "nothing would be tracked"),
     ("some classes unknown", classes("Car", "Car", "Cone"), ["--profile", "kitti"], 0, "does not track Cone: left out"),
@@ -63,7 +69,7 @@ MISTAKES: list[tuple[str, Any, list[str], int, str]] = [
     ("a header alone", "t,x,y,z,l,w,h,yaw,score,class\n", [], 2, "expected rows, received none"),
     ("no such file", None, [], 2, "expected a table (.csv), received No such file or directory"),
     ("a wrong profile", boxes(), ["--profile", "kiti"], 2, "(is kitti meant?)"),
-    ("a wrong option", boxes(), ["--option", "jaw=degrees"], 2, "--option jaw: expected one of time, rate, yaw"),
+    ("a wrong option", boxes(), ["--option", "jaw=degrees"], 2, "--option jaw: expected one of time, rate, group, yaw"),
     ("no tracks", boxes(score=np.full(ROWS, 0.01)), ["--profile", "kitti"], 1, "no tracks came of 90 detections"),
 ]
 

@@ -4,11 +4,10 @@ import re
 from pathlib import Path
 from pkgutil import resolve_name
 
-import optipmb_client
 import pytest
 from optipmb_client.cli import run
 
-PAGE = (Path(optipmb_client.__file__).parents[2] / "docs" / "paper.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "paper.md").read_text(encoding="utf-8")
 
 TABLES = ("Table I", "Table II", "Table III", "Table IV", "Table V", "Table VI")
 

@@ -85,7 +85,7 @@ def test_without_matplotlib_the_error_says_what_to_install(tmp_path: Path, monke
     """One clear error, which names the extra of the installation, and no import error."""
     sequence, _, tracks = scene()
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ClientError, match=r"optipmb\[plot\]"):
+    with pytest.raises(ClientError, match=r"pip install .*\[plot\]"):
         draw_tracks(tmp_path / "a.png", sequence, [Panel(tracks)])
 
 

@@ -338,4 +338,4 @@ def test_a_dataset_is_guessed_from_its_file(tmp_path: Path, capsys: pytest.Captu
     (tmp_path / "a.xyz").write_text("nothing")
     done = run_here(capsys, "track", tmp_path / "a.xyz")
     assert done.returncode == 2
-    assert "expected a table (.csv, .parquet, .jsonl, .feather)" in done.stderr
+    assert "expected a table (.csv, .parquet, .jsonl, .json, .feather)" in done.stderr

@@ -9,7 +9,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from optipmb import common_name
+from optipmb_client.class_names import class_like
 from optipmb_client.commands.options import (
     AsJson,
     DatasetName,
@@ -25,6 +25,9 @@ from optipmb_client.commands.options import (
 )
 from optipmb_client.datasets.motion import MOST_FRAMES, SAME_DIRECTION, Moves, find_moves
 from optipmb_client.geometry import Floats, stack_poses, to_world
+
+KINDS = ("car", "truck", "bus", "trailer", "pedestrian", "bicycle", "motorcycle")
+"""Kinds of objects that a profile for unknown detectors tells apart."""
 
 if TYPE_CHECKING:
     from collections.abc import Sequence as Many
@@ -92,7 +95,7 @@ def _classes(sequences: "Many[DataSequence]") -> list[dict[str, Any]]:
         values = np.concatenate(parts)
         size = " x ".join(f"{side:.3g}" for side in np.median(values[:, :3], axis=0))
         scores = f"{values[:, 3].min():.3g} to {values[:, 3].max():.3g}"
-        tracked = common_name(name) or "other"
+        tracked = class_like(name, KINDS) or "other"
         found.append({"class": name, "kind": tracked, "boxes": len(values), "size": size, "scores": scores})
     return found
 

@@ -19,6 +19,7 @@ from optipmb_client.bulk import Executor, executor_for
 from optipmb_client.columns import parts
 from optipmb_client.datasets import DATASETS, DataSequence, Dataset, DatasetArguments, dataset_at
 from optipmb_client.errors import ClientError, UsageError
+from optipmb_client.table_files import SUFFIXES
 from optipmb_client.zenoh import DEFAULT_ENDPOINT
 
 __all__ = [
@@ -99,9 +100,21 @@ Options = Annotated[
 Tracks = Annotated[
     Path, typer.Option("--tracks", help="Folder with the result files of track or replay, or a table of tracks.")
 ]
+
+
+def _out(out: Path) -> Path:
+    """Refuse a file in a format that is not written."""
+    suffix = out.suffix.lower()
+    if not out.is_dir() and suffix not in (*SUFFIXES, ".mcap") and re.fullmatch(r"\.[a-z]{2,}[a-z0-9]*", suffix):
+        raise UsageError(f"--out {out}: expected a folder, or a table ({', '.join(SUFFIXES)})")
+    return out
+
+
 Out = Annotated[
     Path,
-    typer.Option("--out", help="Folder for the results, or one table: tracks.csv, .parquet, .jsonl or .feather."),
+    typer.Option(
+        "--out", callback=_out, help="Folder for the results, or one table: .csv, .parquet, .jsonl, .feather."
+    ),
 ]
 Full = Annotated[
     bool, typer.Option("--full", help="Also write all that is known of the tracks, with covariances, as .npz files.")

@@ -19,7 +19,7 @@ from optipmb_client.datasets.nuscenes import NuScenesDataset
 from optipmb_client.datasets.scene import SceneDataset, scene_options
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Pose
-from optipmb_client.table_files import is_table
+from optipmb_client.table_files import tables_in
 
 __all__ = [
     "DATASETS",
@@ -136,7 +136,7 @@ def dataset_at(path: Path) -> str:
     Raises:
         DatasetError: it looks like none.
     """
-    if is_table(path):
+    if not path.is_dir() and tables_in(path):
         return "table"
     if (path / "metadata.yaml").is_file() or path.suffix == ".db3":
         return "rosbag"
@@ -147,11 +147,11 @@ def dataset_at(path: Path) -> str:
             return "nuscenes"
         if (path / "training").is_dir() or (path / "testing").is_dir():
             return "kitti"
-        tables, recordings = any(is_table(file) for file in path.iterdir()), list(path.glob("*.mcap"))
+        tables, recordings = tables_in(path), list(path.glob("*.mcap"))
         if tables or (recordings and not any(map(_is_ros2, recordings))):
             return "table" if tables else "mcap"
     expected = (
-        "a table (.csv, .parquet, .jsonl, .feather), a bag of ROS 2 (with metadata.yaml, or .mcap or .db3), a "
+        "a table (.csv, .parquet, .jsonl, .json, .feather), a bag of ROS 2 (with metadata.yaml, or .mcap or .db3), a "
         "recording (.mcap) or a folder of them, or a folder of KITTI or nuScenes"
     )
     raise DatasetError(path, expected, "another file or folder" if path.exists() else "nothing")

@@ -21,7 +21,7 @@ from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Ints, Pose
 from optipmb_client.results import ResultWriter
 from optipmb_client.results.table import TableResultWriter
-from optipmb_client.table_files import is_table
+from optipmb_client.table_files import SUFFIXES, tables_in
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,7 +30,7 @@ __all__ = ["OPTIONS", "TableDataset", "TableSequence"]
 
 OPTIONS: Final = (
     *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
-    *("poses", "truth", "tracks"),
+    *("poses", "truth", "tracks", "decimal", "encoding", "date"),
 )
 """Options beside `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them."""
 GAP: Final = 1.5
@@ -171,7 +171,7 @@ class TableDataset:
         if not any(len(boxes.frame_stamp) for _, boxes in tables):
             raise DatasetError(path, "rows", "none")
         for file, boxes in tables:
-            own = [ObjectTable(file, boxes)] if boxes.id is not None else []
+            own = [ObjectTable(file, boxes, options)] if boxes.id is not None else []
             if not len(boxes.frame_stamp):
                 self._notes.append(f"{file}: no rows, a recording without frames")
             for key in dict.fromkeys(boxes.frame_key.tolist()) or boxes.keys:
@@ -205,17 +205,15 @@ class TableDataset:
 
     def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
         """Return a writer of `out/NAME.csv`, or of the format of the detections."""
-        suffix = self.path.suffix if self.path.is_file() and self.path.suffix not in {".gz", ".bz2", ".zst"} else ".csv"
+        suffix = self.path.suffix if self.path.is_file() and self.path.suffix.lower() in SUFFIXES else ".csv"
         return TableResultWriter(out / f"{sequence.name}{suffix}", sequence)
 
 
 def _tables(path: Path) -> list[Path]:
-    if path.is_dir():
-        files = sorted(file for file in path.iterdir() if is_table(file) and not file.name.startswith("."))
-        if not files:
-            raise DatasetError(path, "a folder with tables (.csv, .parquet, .jsonl, .feather)", "none in it")
-        return files
-    return [path]
+    files = tables_in(path) if path.is_dir() else [path]
+    if not files:
+        raise DatasetError(path, "a folder with tables (.csv, .parquet, .jsonl, .feather)", "none in it")
+    return files
 
 
 def _plain(text: str) -> str:
@@ -224,7 +222,7 @@ def _plain(text: str) -> str:
 
 
 def _stem(file: Path) -> str:
-    return file.name.split(".")[0]
+    return file.absolute().name.split(".")[0]
 
 
 def _truth_of(tables: Sequence[ObjectTable], key: str, file: Path) -> tuple[ObjectTable, str] | None:

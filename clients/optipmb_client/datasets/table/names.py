@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from optipmb_client.detector_files import BOX_LISTS
+
 __all__ = ["ALIASES", "Column", "find_columns"]
 
 
@@ -49,11 +51,11 @@ def _turn(bases: str, part: str, place: int) -> tuple[str, ...]:
 ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
     "stamp": ("stamp", "t", "time", "timestamp", "ts", "sec", "secs", "seconds", "nanoseconds", "sim_time", "datetime",
               "header_stamp", "header_timestamp"),
-    "nanosec": ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds", "nanosec_part", "nanoseconds_part"),
+    "nanosec": ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds"),
     "frame": ("frame", "frame_id", "frame_index", "frame_idx", "frame_number", "frame_no", "frame_nr"),
-    "x": ("x", "cx", "px", "x_center", *_vector(_CENTER, "x", 0)),
-    "y": ("y", "cy", "py", "y_center", *_vector(_CENTER, "y", 1)),
-    "z": ("z", "cz", "pz", "z_center", *_vector(_CENTER, "z", 2)),
+    "x": ("x", "cx", "px", "x_center", "tx", *_vector(_CENTER, "x", 0)),
+    "y": ("y", "cy", "py", "y_center", "ty", *_vector(_CENTER, "y", 1)),
+    "z": ("z", "cz", "pz", "z_center", "tz", *_vector(_CENTER, "z", 2)),
     "l": ("l", "length", "box_length", "dx", *_vector(_SIZE, "x", 0), *_vector(_SIZE, "l", 0), "size_length"),
     "w": ("w", "width", "box_width", "dy", *_vector(_SIZE, "y", 1), *_vector(_SIZE, "w", 1), "size_width"),
     "h": ("h", "height", "box_height", "dz", *_vector(_SIZE, "z", 2), *_vector(_SIZE, "h", 2), "size_height"),
@@ -63,16 +65,18 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
     "qx": ("qx", *_vector(_BOX_TURN, "x", 1)),
     "qy": ("qy", *_vector(_BOX_TURN, "y", 2)),
     "qz": ("qz", *_vector(_BOX_TURN, "z", 3)),
-    "score": ("score", "confidence", "conf", "prob", "probability", "detection_score", "det_score", "tracking_score"),
+    "score": ("score", "confidence", "conf", "prob", "probability", "detection_score", "det_score", "tracking_score",
+              "score_3d", "scores_3d", "pred_score", "pred_scores", "scores"),
     "class": ("class", "class_name", "cls", "label", "label_name", "category", "category_name", "type", "object_type",
-              "obj_type", "class_id", "label_id", "classification", "object_class", "name", "tracking_name"),
+              "obj_type", "class_id", "label_id", "classification", "object_class", "name", "tracking_name",
+              "detection_name", "label_3d", "labels_3d", "pred_label", "pred_labels", "names", "labels"),
     "vx": _vector(_SPEED, "x", 0),
     "vy": _vector(_SPEED, "y", 1),
     "cov_xx": ("cov_xx", "cov_x_x", "covariance_xx", "covariance_x_x", "var_x", "variance_x", "x_var", "x_variance"),
     "cov_xy": ("cov_xy", "cov_x_y", "covariance_xy", "covariance_x_y"),
     "cov_yy": ("cov_yy", "cov_y_y", "covariance_yy", "covariance_y_y", "var_y", "variance_y", "y_var", "y_variance"),
     "id": ("id", "track_id", "object_id", "obj_id", "tracking_id", "instance_id", "instance",
-           "instance_token", "track"),
+           "instance_token", "track", "track_uuid", "object_uuid", "instance_uuid", "uuid", "track_label"),
     "recording": ("recording", "recording_id", "sequence", "sequence_id", "sequence_name", "scene", "scene_name",
                   "scene_id", "session", "log", "log_id", "run", "run_id", "drive", "segment", "bag", "stream"),
     "sensor": ("sensor", "sensor_id", "sensor_name", "node", "lidar", "device"),
@@ -87,12 +91,13 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Names of each column, the most telling first."""
 
+_LISTED: Final = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")
+"""Meanings of the numbers of a list of `BOX_LISTS`."""
 _UNITS: Final[Mapping[str, str]] = {
     "deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad",
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us",
     "ns": "ns", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanosecs": "ns", "nanoseconds": "ns",
 }  # fmt: skip
-_SECONDS: Final = ("sec", "secs", "seconds")
 _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
 
 
@@ -104,7 +109,6 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, C
         chosen: meanings whose column the user has named.
     """
     known = [_normalised(name) for name in names]
-    nanosec = _nanosec([one.name for one in known])
     taken: dict[str, Column] = {}
     used = set(chosen.values())
     for role, aliases in ALIASES.items():
@@ -112,33 +116,32 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, C
             unit = next((one.unit for one in known if one.name == chosen[role]), None)
             taken[role] = Column(chosen[role], unit, "")
             continue
+        if role in _LISTED:
+            place = _LISTED.index(role)
+            first, last = ([f"{name}_{place}" for name in lists] for lists in (BOX_LISTS, ("bbox", "box")))
+            aliases = (*first, *aliases, *last)  # noqa: PLW2901
         fitting = [one for one in known if one.base in aliases and one.name not in used]
-        if role == "stamp":
-            fitting = [one for one in fitting if one.name not in nanosec.values()]
-        elif role == "nanosec":
-            part = nanosec.get(taken["stamp"].name) if "stamp" in taken else None
-            fitting = [Column(one.name, "ns", aliases[0]) for one in known if one.name == part]
+        if role == "nanosec":
+            bases = {
+                one.base for one in known if "stamp" in taken and one.name == taken["stamp"].name and one.unit == "s"
+            }
+            parts = [one for one in known if bases and _is_second_half(one)]
+            fitting = [Column(one.name, "ns", aliases[0]) for one in parts if one.base in bases or one.base in aliases]
         if fitting:
-            best = min(fitting, key=lambda one: aliases.index(one.base))
+            best = min(fitting, key=lambda one: (aliases.index(one.base), _is_second_half(one)))
             taken[role] = best
             used.add(best.name)
     return taken
 
 
-def _nanosec(names: Iterable[str]) -> dict[str, str]:
-    """Return the column of nanoseconds that belongs to each column of whole seconds: `stamp.sec`, `stamp.nanosec`."""
-    known = {_plain(name): name for name in names}
-    found: dict[str, str] = {}
-    for base, name in known.items():
-        head, _, tail = base.rpartition("_")
-        if tail in _SECONDS:
-            parts = [f"{head}_{part}" if head else part for part in ALIASES["nanosec"]] + list(ALIASES["nanosec"])
-            found.update((name, known[part]) for part in parts[::-1] if part in known)
-    return found
+def _is_second_half(column: Column) -> bool:
+    """Tell whether a column may be the rest of a stamp, as `stamp.nanosec` beside `stamp.sec`; `stamp_ns` is not."""
+    return column.unit == "ns" and not _plain(column.name).endswith("ns")
 
 
 def _plain(name: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "_", re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()).strip("_")
+    words = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", re.sub(r"3D(?![a-z])", "3d", name))
+    return re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
 
 
 def _normalised(name: str) -> Column:

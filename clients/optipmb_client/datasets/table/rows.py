@@ -125,7 +125,7 @@ def read_tables(
 
     Tables without rows give no boxes; those that were `loaded` are not read again. Raises as `read_boxes` does.
     """
-    tables = loaded or {path: read_table(path) for path in paths}
+    tables = loaded or {path: read_table(path, reading.options) for path in paths}
     groups: dict[tuple[str, ...], list[Path]] = {}
     for path, columns in tables.items():
         groups.setdefault(tuple(sorted(columns)), []).append(path)
@@ -569,7 +569,7 @@ def _poses_at(reading: Reading, path: Path, stamp: Ints) -> Floats:
     Raises:
         DatasetError: a stamp lies before the first or after the last pose.
     """
-    columns = read_table(path)
+    columns = read_table(path, reading.options)
     column = find_columns(columns, {}).get("stamp", Column("", None, ""))
     time = reading.options.get("time")
     options = {"time": time} if time in SECONDS and column.unit is None else {}

@@ -18,13 +18,14 @@ from optipmb_client.datasets.table.rows import NO_ID, Boxes, read_tables
 from optipmb_client.datasets.table.values import Reading
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Ints, Pose, stack_poses, to_world
-from optipmb_client.table_files import read_table
+from optipmb_client.table_files import line_of, read_table
 
 __all__ = ["ObjectTable", "TableOptions", "match_stamps", "read_objects", "truth_at"]
 
 SPARSE: Final = 1.5
 _WRITTEN: Final = frozenset({"existence", "age", "time_since_detection", "detection_row"})
 """Columns by which a table of tracks that OptiPMB wrote is known."""
+_HEAD: Final = 4096
 _PLACES: Final = ("time", "rate", "column.stamp", "column.frame", "column.recording", "column.sensor")
 
 
@@ -50,6 +51,7 @@ class ObjectTable:
 
     path: Path
     boxes: Boxes
+    options: Mapping[str, str]
     notes: tuple[str, ...] = ()
 
     def times(self, stamps: Ints, numbers: NDArray[Any] | None) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -94,7 +96,7 @@ class ObjectTable:
 
     def line(self, box: int) -> int:
         """Return the line of a box, counted from 1."""
-        return Reading(self.path, {}).place(int(self.boxes.row[box]))[1]
+        return line_of(self.path, int(self.boxes.row[box]), self.options)
 
     def in_world(self, rows: Ints) -> tuple[Floats, Floats, Floats]:
         """Return centre (R, 3), yaw (R,) and velocity (R, 2) of some boxes in the world frame."""
@@ -117,8 +119,9 @@ def read_objects(path: Path, files: Sequence[Path], tables: TableOptions) -> lis
     Raises:
         DatasetError: a column is missing or a value is wrong; names the line.
     """
-    columns = {file: read_table(file) for file in files}
-    options, written = tables.options, all(one.keys() >= _WRITTEN for one in columns.values())
+    options = tables.options
+    columns = {file: read_table(file, {} if _is_written(file) else options) for file in files}
+    written = all(one.keys() >= _WRITTEN for one in columns.values())
     if written:
         results = {f"class.{value}" for name, value in options.items() if name.startswith("class.")}
         kept = {*_PLACES, *(name for name in options.keys() - results if name.startswith("class."))}
@@ -126,7 +129,16 @@ def read_objects(path: Path, files: Sequence[Path], tables: TableOptions) -> lis
     reading = Reading(path, options, named=tables.named)
     found = read_tables(files, reading, scored=False, loaded=columns)
     notes = () if written else tuple(f"{path}: {note}" for note in reading.notes)
-    return [ObjectTable(file, boxes, notes) for file, boxes in found]
+    return [ObjectTable(file, boxes, options, notes) for file, boxes in found]
+
+
+def _is_written(file: Path) -> bool:
+    """Tell by its first bytes whether a file is a text table that OptiPMB wrote, in its own encoding."""
+    if not file.is_file():
+        return False
+    with file.open("rb") as opened:
+        head = opened.read(_HEAD)
+    return all(name.encode() in head for name in _WRITTEN)
 
 
 def match_stamps(stamps: NDArray[Any], wanted: NDArray[Any]) -> Ints:

@@ -12,10 +12,11 @@ from typing import Final
 
 import numpy as np
 
-from optipmb import common_name
+from optipmb_client.class_names import class_like
 from optipmb_client.datasets.motion import SAME_DIRECTION, Moves
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Ints, wrap_angle
+from optipmb_client.table_files import line_of
 
 __all__ = [
     "COUNTED_HZ",
@@ -150,8 +151,7 @@ class Reading:
     def place(self, row: int) -> tuple[Path, int]:
         """Return the file of a row and its line there, counted from 1."""
         path, first = next((one for one in reversed(self.files) if one[1] <= row), (self.path, 0))
-        headed = any(ending in path.name.lower() for ending in (".csv", ".tsv", ".txt"))
-        return path, row - first + (2 if headed else 1)
+        return path, line_of(path, row - first, self.options)
 
     def chosen(self, name: str, known: Mapping[str, object] | tuple[str, ...]) -> str | None:
         """Return the value of an option; None where it is not given.
@@ -411,7 +411,7 @@ def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bo
     """
     order = reading.chosen("sizes", ("lwh", "wlh", "hwl"))
     if order is None:
-        long = {name for name in np.unique(names).tolist() if common_name(name) in LONG}
+        long = {name for name in np.unique(names).tolist() if class_like(name, LONG)}
         vehicles = sizes[np.isin(names, list(long))]
         median = np.median(vehicles, axis=0) if len(vehicles) else np.array([3.0, 2.0, 1.0])
         longest = int(np.argmax(median))
@@ -427,7 +427,7 @@ def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bo
     return sizes[:, [order.index(letter) for letter in "lwh"]]
 
 
-LONG: Final = frozenset({"car", "truck", "bus", "trailer"})
+LONG: Final = ("car", "truck", "bus", "trailer")
 _SIDES: Final = {"l": "length", "w": "width", "h": "height"}
 
 

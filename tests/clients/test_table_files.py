@@ -1,0 +1,295 @@
+"""Files as people have them: text tables of other countries, dates, and the results of detectors."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import run_here
+from optipmb_client.camera import kitti_from_sensor
+from optipmb_client.datasets import DatasetError, open_dataset
+from optipmb_client.table_files import Columns, line_of, read_table, write_table
+from own_tables import FRAMES, boxes
+
+PLAIN = "t,x,class\n0.0,1.5,car\n0.1,-2.25,Fuß\n"
+
+
+def same(one: Columns, other: Columns) -> None:
+    """Check that two tables have the same columns."""
+    assert list(one) == list(other)
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, other[name])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "encoding", "options"),
+    [
+        ("semicolons.csv", PLAIN.replace(",", ";"), "utf-8", {}),
+        ("decimals.csv", PLAIN.replace(",", ";").replace(".", ","), "utf-8", {}),
+        ("quoted.csv", 't,x,class\n"0,0","1,5",car\n"0,1","-2,25",Fuß\n', "utf-8", {}),
+        ("said.csv", PLAIN.replace(",", ";").replace(".", ","), "utf-8", {"decimal": ","}),
+        ("comments.csv", "# made by hand\n\n" + PLAIN.replace("0.1", "# half\n0.1"), "utf-8", {}),
+        ("numpy.txt", "# " + PLAIN.replace(",", " "), "utf-8", {}),
+        ("trailing.csv", PLAIN.replace("\n", ",\n"), "utf-8", {}),
+        ("trailing_rows.csv", PLAIN.replace("\n", ",\n").replace("class,", "class"), "utf-8", {}),
+        ("trailing_names.csv", PLAIN.replace("class", "class,"), "utf-8", {}),
+        ("blanks.txt", PLAIN.replace(",", "   ").replace("\n", "  \n  "), "utf-8", {}),
+        ("tabs.txt", PLAIN.replace(",", "\t"), "utf-8", {}),
+        ("windows.csv", PLAIN.replace("\n", "\r\n"), "utf-8-sig", {}),
+        ("utf16.csv", PLAIN, "utf-16", {}),
+        ("utf16le.csv", PLAIN, "utf-16-le", {"encoding": "utf-16-le"}),
+        ("latin.csv", PLAIN, "latin-1", {"encoding": "latin-1"}),
+    ],
+)
+def test_text_tables_of_other_countries(
+    name: str, text: str, encoding: str, options: dict[str, str], tmp_path: Path
+) -> None:
+    """A text table reads the same with other separators, decimals, comments, line ends and encodings."""
+    (tmp_path / "plain.csv").write_text(PLAIN, encoding="utf-8")
+    (tmp_path / name).write_bytes(text.encode(encoding))
+    same(read_table(tmp_path / name, options), read_table(tmp_path / "plain.csv"))
+
+
+ISO = ("2024-05-01T10:00:00.100Z", "2024-05-01T10:00:00.200Z")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".tsv", ".jsonl", ".json", ".parquet", ".feather"])
+@pytest.mark.parametrize(
+    ("texts", "options"),
+    [
+        (ISO, {}),
+        ([text.replace("T", " ").removesuffix("Z") for text in ISO], {}),
+        ([text.replace("T10", "T12").replace("Z", "+02:00") for text in ISO], {}),
+        ([text.replace("T", " ").replace("Z", " UTC") for text in ISO], {}),
+        ([text.replace("2024-05-01T", "01/05/2024 ").removesuffix("Z") for text in ISO], {"date": "dmy"}),
+        ([text.replace("2024-05-01T", "5/1/2024 ").removesuffix("Z") for text in ISO], {"date": "mdy"}),
+        ([text.replace("2024-05-01T", "01.05.2024 ").removesuffix("Z") for text in ISO], {}),
+        ([text.replace("2024-05-01T", "2024/05/01 ").removesuffix("Z") for text in ISO], {}),
+    ],
+)
+def test_dates_are_stamps_in_every_format(
+    suffix: str, texts: list[str], options: dict[str, str], tmp_path: Path
+) -> None:
+    """Dates as text are read to the nanosecond in every format, with a zone or without."""
+    path = tmp_path / f"d{suffix}"
+    if suffix == ".json":
+        path.write_text(json.dumps([{"t": text} for text in texts]))
+    else:
+        write_table(path, {"t": np.array(texts)})
+    stamps = read_table(path, options)["t"]
+    assert stamps.astype(np.int64).tolist() == [1714557600100000000, 1714557600200000000]
+
+
+def test_the_day_is_found_where_a_number_exceeds_twelve(tmp_path: Path) -> None:
+    """13/01/2025 has the day first and 01/13/2025 the month; 03/01/2025 is refused with the option."""
+    found = []
+    for text in ("13/01/2025 10:00:00", "01/13/2025 10:00:00"):
+        (tmp_path / "d.csv").write_text(f"t,x\n03/01/2025 10:00:00,1\n{text},2\n")
+        found.append(read_table(tmp_path / "d.csv")["t"].astype("datetime64[D]").astype(str).tolist())
+    assert found == [["2025-01-03", "2025-01-13"], ["2025-03-01", "2025-01-13"]]
+    (tmp_path / "d.csv").write_text("t,x\n03/01/2025 10:00:00,1\n")
+    with pytest.raises(DatasetError, match="--option date=dmy"):
+        read_table(tmp_path / "d.csv")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "options", "said"),
+    [
+        ("d.csv", "t,x\n2024-05-01 10:00:00.1,1\n2024-05-01 10:00,2\nsoon,3\n", {}, ":4: expected a date as YYYY"),
+        ("d.jsonl", '{"t": "2024-05-01T10:00:00.1Z"}\n{"t": "2024-05-01T10:00:00.2"}\n', {}, ":2: expected a date as"),
+        ("d.csv", b"t,class\n1,Fu\xdf\n", {}, ":2: expected text in UTF-8 (--option encoding=latin-1"),
+        ("d.csv", "t,x\n1,2\n".encode("utf-16-le"), {}, "--option encoding=latin-1, cp1252 or utf-16-le"),
+        ("d.csv", "t,x\n", {"encoding": "klingon"}, "--option encoding: expected latin-1"),
+        (
+            "d.csv",
+            "t;x;y\n1,5;2.5;1\n",
+            {},
+            "(--option decimal=. or decimal=, says which), received commas in column t",
+        ),
+        ("d.csv", "t,x\n", {"decimal": ";"}, "--option decimal: expected a comma or a point"),
+        ("d.jsonl", '{"t": "1/5/2024 10:00"}\n', {"date": "ymd"}, "--option date=dmy (day first) or date=mdy, received 'ymd' for column t"),
+        ("d.csv", "t,x\n1,2\n3\n", {}, "Row #3: Expected 2 columns, got 1"),
+        ("d.pkl", "anything", {}, "docs/own-data.md, Recipes"),
+        ("d.npy", "anything", {}, "a table (.csv, .tsv, .parquet, .jsonl, .ndjson, .feather, .arrow, .json, .txt)"),
+        ("d.xlsx", "anything", {}, "a table (.csv, .tsv, .parquet, .jsonl, .ndjson, .feather, .arrow, .json, .txt)"),
+        ("d.json", '{"meta": {}, "results": {"a": []}}', {}, "--dataset nuscenes --root ROOT --detections"),
+        ("d.json", '[{"x": 1},\n {"x": }]', {}, ":2: expected JSON"),
+        ("d.json", '{"x": 1}', {}, "an array of objects, or an object with a list bboxes_3d"),
+        ("d.txt", "Car 0 0 0 1 2 3 4 1.5 1.6 4.2 1 1.6 20 1.57 0.9\n", {}, "name their folder"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_with_what_can(
+    name: str, content: Any, options: dict[str, str], said: str, tmp_path: Path
+) -> None:
+    """A file that is no table, or can be read in two ways, is refused with the row and the option that reads it."""
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(DatasetError) as refused:
+        read_table(path, options)
+    assert said in str(refused.value)
+    assert "np." not in str(refused.value)
+
+
+def test_a_pickle_and_results_of_nuscenes_are_known_by_the_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`optipmb track` says of a pickle and of nuScenes results how they can be read."""
+    (tmp_path / "result.pkl").write_bytes(b"\x80\x04")
+    (tmp_path / "results.json").write_text(json.dumps({"meta": {}, "results": {"token": [{"translation": [1, 2, 3]}]}}))
+    for name, said in (("result.pkl", "Recipes"), ("results.json", "--dataset nuscenes --root ROOT --detections")):
+        done = run_here(capsys, "track", tmp_path / name, "--out", tmp_path / "t.csv")
+        assert done.returncode == 2
+        assert said in done.stderr.splitlines()[-1]
+
+
+def test_a_header_alone_gives_columns_without_rows(tmp_path: Path) -> None:
+    """A table without rows has its columns, with a line end and without."""
+    for text in ("t,x,class\n", "t,x,class"):
+        (tmp_path / "d.csv").write_text(text)
+        assert {name: len(values) for name, values in read_table(tmp_path / "d.csv").items()} == dict.fromkeys(
+            ("t", "x", "class"), 0
+        )
+
+
+def test_lines_are_counted_with_comments_and_blank_lines(tmp_path: Path) -> None:
+    """The line of a row is that of the file, whatever was left out before it."""
+    (tmp_path / "d.csv").write_text("# made by hand\nt,x\n\n1,2\n# later\n3,4\n")
+    assert [line_of(tmp_path / "d.csv", row) for row in (0, 1)] == [4, 6]
+    (tmp_path / "d.txt").write_text("# t x\n1 2\n3 4\n")
+    assert [line_of(tmp_path / "d.txt", row) for row in (0, 1)] == [2, 3]
+
+
+def frames_of(path: Path, **options: str) -> list[tuple[Any, ...]]:
+    """Give what the frames of the one recording of a table have, rounded."""
+    (sequence,) = open_dataset("table", path, **options).sequences(["all"])
+    return [
+        (
+            *(np.round(getattr(one, name), 4).tolist() for name in ("center", "size", "yaw", "score")),
+            [one.labels[i] for i in one.label],
+            None if one.velocity is None else one.velocity.tolist(),
+        )
+        for one in sequence.frames()
+    ]
+
+
+def lists() -> list[dict[str, Any]]:
+    """Give the boxes of each frame as lists, as detectors write them."""
+    columns = boxes(vx=np.tile([8.0, -6.0, 1.0], FRAMES), vy=np.zeros(3 * FRAMES))
+    rows = np.column_stack([columns[name] for name in ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")])
+    return [
+        {
+            "name": columns["class"][3 * i : 3 * i + 3].tolist(),
+            "score": columns["score"][3 * i : 3 * i + 3].tolist(),
+            "boxes_lidar": rows[3 * i : 3 * i + 3].tolist(),
+        }
+        for i in range(FRAMES)
+    ]
+
+
+def flat(tmp_path: Path, **changed: Any) -> list[tuple[Any, ...]]:
+    """Give the frames of the same boxes in a flat table."""
+    velocity = {"vx": np.tile([8.0, -6.0, 1.0], FRAMES), "vy": np.zeros(3 * FRAMES)}
+    write_table(tmp_path / "flat.parquet", boxes(**(velocity | changed)))
+    return frames_of(tmp_path / "flat.parquet")
+
+
+@pytest.mark.parametrize("suffix", [".jsonl", ".json"])
+def test_a_row_may_hold_the_boxes_of_a_frame(suffix: str, tmp_path: Path) -> None:
+    """Frames of OpenPCDet with lists of boxes, some empty, give the frames of a flat table."""
+    frames = [{"t": i / 10, **one} for i, one in enumerate(lists())]
+    frames.insert(7, {"t": 0.65, "name": [], "score": [], "boxes_lidar": []})
+    lines = "\n".join(map(json.dumps, frames))
+    (tmp_path / f"d{suffix}").write_text(lines if suffix == ".jsonl" else json.dumps(frames))
+    found = frames_of(tmp_path / f"d{suffix}")
+    assert found[7][0] == []
+    assert found[:7] + found[8:] == flat(tmp_path)
+
+
+def test_lists_of_different_lengths_are_told_as_not_used(tmp_path: Path) -> None:
+    """A column of lists that have no common length is no number, and is named."""
+    rows = [{name: values[i].item() for name, values in boxes().items()} | {"hits": [1] * (i % 3)} for i in range(9)]
+    (tmp_path / "d.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    assert any("columns not used: hits" in note for note in open_dataset("table", tmp_path / "d.jsonl").notes)
+
+
+def test_objects_of_a_file_are_its_rows(tmp_path: Path) -> None:
+    """JSON arrays of records, and an object with a list of them, read as a flat table does."""
+    columns = {name: values.tolist() for name, values in boxes(vx=np.ones(3 * FRAMES), vy=np.ones(3 * FRAMES)).items()}
+    records = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    expected = flat(tmp_path, vx=np.ones(3 * FRAMES), vy=np.ones(3 * FRAMES))
+    for content in (records, {"version": 1, "detections": records}):
+        (tmp_path / "d.json").write_text(json.dumps(content))
+        assert frames_of(tmp_path / "d.json") == expected
+
+
+def test_a_folder_of_mmdetection3d_is_one_recording(tmp_path: Path) -> None:
+    """`preds/*.json` are the frames of one recording by the numbers in their names; boxes stand on their bottoms."""
+    (tmp_path / "preds").mkdir()
+    for i, one in enumerate(lists()):
+        bottoms = [[*box[:2], box[2] - 0.5 * box[5], *box[3:]] for box in one["boxes_lidar"]]
+        frame = {"labels_3d": [0, 0, 1], "scores_3d": one["score"], "bboxes_3d": bottoms, "box_type_3d": "LiDAR"}
+        if i == 5:
+            frame |= {"labels_3d": [], "scores_3d": [], "bboxes_3d": []}
+        (tmp_path / "preds" / f"{i + 95}.json").write_text(json.dumps(frame))
+    found = frames_of(tmp_path / "preds", rate="10", **{"class.0": "Car", "class.1": "Pedestrian"})
+    expected = flat(tmp_path)
+    assert found[5][0] == []
+    assert found[:5] + found[6:] == expected[:5] + expected[6:]
+    columns = read_table(tmp_path / "preds")
+    assert columns["frame"][[0, -1]].tolist() == [95, 94 + FRAMES]
+    assert set(columns["labels_3d"].tolist()) == {"0", "1", ""}
+
+
+def test_stamps_in_the_names_of_files_are_stamps(tmp_path: Path) -> None:
+    """Names of files that end with a time give a column of stamps."""
+    (tmp_path / "preds").mkdir()
+    for stamp in (1532402927647951, 1532402928147847):
+        frame = {"labels_3d": [0], "scores_3d": [0.5], "bboxes_3d": [[1, 2, 0, 4, 2, 1.5, 0]], "box_type_3d": "LiDAR"}
+        (tmp_path / "preds" / f"n015-2018__LIDAR_TOP__{stamp}.json").write_text(json.dumps(frame))
+    assert read_table(tmp_path / "preds")["timestamp"].tolist() == [1532402927647951, 1532402928147847]
+
+
+def test_a_folder_of_kitti_object_results_is_one_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`.txt` files of KITTI's object benchmark are frames by their numbers, with the axes of a camera."""
+    (tmp_path / "pred").mkdir()
+    for i, one in enumerate(lists()):
+        rows = np.array(one["boxes_lidar"])
+        bottom, hwl, turn = kitti_from_sensor(rows[:, :3], rows[:, 3:6], rows[:, 6])
+        values = np.column_stack((hwl, bottom, turn, one["score"]))
+        lines = [
+            f"{name} -1 -1 0.0 0 0 10 10 {' '.join(map(str, row))}\n"
+            for name, row in zip(one["name"], values.tolist(), strict=True)
+        ]
+        (tmp_path / "pred" / f"{i:06d}.txt").write_text("" if i == 5 else "".join(lines) + "DontCare" + " -1" * 15)
+    found = frames_of(tmp_path / "pred", rate="10")
+    expected = [(*one[:5], None) for one in flat(tmp_path)]
+    assert found[5][0] == []
+    assert found[:5] + found[6:] == expected[:5] + expected[6:]
+    done = run_here(capsys, "track", tmp_path / "pred", "--option", "rate=10", "--out", tmp_path / "t.csv")
+    assert done.returncode == 0, done.stderr
+    (tmp_path / "pred" / "000003.txt").write_text("Car 0 0 0 1 2\n")
+    with pytest.raises(DatasetError, match=r"000003.txt:1: expected 8 fields"):
+        read_table(tmp_path / "pred")
+
+
+def test_a_folder_reads_its_tables_and_no_notes(tmp_path: Path) -> None:
+    """A text or JSON file beside tables is no recording."""
+    (tmp_path / "many").mkdir()
+    write_table(tmp_path / "many" / "a.csv", boxes())
+    (tmp_path / "many" / "README.txt").write_text("Boxes of a car park.\n")
+    (tmp_path / "many" / "settings.json").write_text("{}")
+    assert [one.name for one in open_dataset("table", tmp_path / "many").sequences(["all"])] == ["a"]
+
+
+@pytest.mark.parametrize("name", ["x.json", "x.xlsx", "x.csv.gz", "x.txt"])
+@pytest.mark.parametrize("command", ["track", "replay"])
+def test_results_are_refused_in_an_unknown_format_before_tracking(
+    command: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`--out` with the suffix of an unknown format ends with status 2 and the formats that are written."""
+    write_table(tmp_path / "d.csv", boxes())
+    done = run_here(capsys, command, tmp_path / "d.csv", "--out", tmp_path / name)
+    assert done.returncode == 2
+    assert "a folder, or a table (.csv, .tsv, .parquet" in done.stderr.splitlines()[-1]
+    assert [file.name for file in tmp_path.iterdir()] == ["d.csv"]
