@@ -43,12 +43,6 @@ class Recording:
     full: FullTable | None
     """Everything known of the same tracks, where it was kept."""
 
-    @property
-    def frames(self) -> int:
-        """Number of frames that are compared."""
-        labelled = self.truth.labelled
-        return len(self.sequence) if labelled is None else int(labelled.sum())
-
 
 @dataclass(frozen=True)
 class Settings:
@@ -208,7 +202,11 @@ class _Cases:
         self._centres = world(self.near)
         self._cutoff = default_rules(dataset, "distance", settings.cutoff)
         self._sets = world(self._cutoff)
-        self._frames = [one.frames for one in recordings]
+        labelled = [one.truth.labelled for one in recordings]
+        self._frames = [
+            len(one.sequence) if mask is None else int(mask.sum())
+            for one, mask in zip(recordings, labelled, strict=True)
+        ]
         self._order = settings.order
 
     def evaluate(self, threshold: float) -> TrackFigures:

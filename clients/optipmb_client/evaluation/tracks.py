@@ -1,9 +1,8 @@
 """The tracks of a run, read for evaluation: a table of anybody's, or the result files of a dataset in a folder."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from optipmb_client.table_files import SUFFIXES, is_table
 
 __all__ = ["read_compared", "read_full_tracks", "read_tracks"]
 
-_Labelled = TypeVar("_Labelled", Truth, ResultTable)
 _OTHERS = ("Van", "Truck", "Person_sitting", "Person", "Tram")
 """Classes of KITTI that are no other names of those that are evaluated."""
 
@@ -64,7 +62,14 @@ def read_compared(
     if warn is not None:
         for note in notes:
             warn(note)
-    return [(_relabelled(truth, renamed[0]), _relabelled(tracks, renamed[1])) for truth, tracks in pairs]
+    true_names, track_names = renamed
+    return [
+        (
+            replace(truth, labels=tuple(true_names[label] for label in truth.labels)),
+            replace(tracks, labels=tuple(track_names[label] for label in tracks.labels)),
+        )
+        for truth, tracks in pairs
+    ]
 
 
 def _alike(labels: Iterable[str], known: Sequence[str]) -> dict[str, str]:
@@ -76,10 +81,6 @@ def _alike(labels: Iterable[str], known: Sequence[str]) -> dict[str, str]:
     found = {label: class_like(label, known) or label for label in labels}
     same = {name for label, name in found.items() if label.lower() == name.lower()}
     return {label: label if name in same and label.lower() != name.lower() else name for label, name in found.items()}
-
-
-def _relabelled(table: _Labelled, names: Mapping[str, str]) -> _Labelled:
-    return replace(table, labels=tuple(names[label] for label in table.labels))
 
 
 def read_tracks(results: Path, sequence: DataSequence) -> ResultTable:
@@ -128,7 +129,7 @@ def _from_table(path: Path, sequence: DataSequence) -> ResultTable:
     stamps = getattr(sequence, "stamps", None)
     if stamps is None:
         stamps = np.array([frame.stamp_ns for frame in sequence.frames()], dtype=np.int64)
-    rows, frame, notes = table.at(key, *table.times(stamps, getattr(sequence, "numbers", None)))
+    rows, frame, _, notes = table.at(key, stamps, getattr(sequence, "numbers", None))
     boxes = table.boxes
     if (frame < 0).any():
         line = table.line(int(rows[np.flatnonzero(frame < 0)[0]]))

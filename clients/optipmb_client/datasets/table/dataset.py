@@ -42,17 +42,11 @@ class TableSequence:
 
     has_clouds = False
 
+    tables: TableOptions
+
     def __init__(
-        self,
-        name: str,
-        stem: str,
-        boxes: Boxes,
-        key: str,
-        truth: tuple[ObjectTable, str] | None,
-        tables: TableOptions,
-        origin: int = 0,
+        self, name: str, stem: str, boxes: Boxes, key: str, truth: tuple[ObjectTable, str] | None, origin: int = 0
     ) -> None:
-        self.tables = tables
         self.name = name
         self.key_columns: dict[str, str] = dict(zip(boxes.key_columns, boxes.keys[key], strict=True))
         self.time_column = boxes.time_column
@@ -179,7 +173,8 @@ class TableDataset:
                 if len(files) == 1 and key:
                     name = _plain(key)
                 where = _truth_of(others or own, key, file)
-                sequence = TableSequence(name, _plain(_stem(file)), boxes, key, where, shared, origin)
+                sequence = TableSequence(name, _plain(_stem(file)), boxes, key, where, origin)
+                sequence.tables = shared
                 if name in self._sequences:
                     raise DatasetError(file, "names of recordings that differ", f"{name!r} twice")
                 self._sequences[name] = sequence

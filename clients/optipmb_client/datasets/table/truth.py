@@ -17,7 +17,7 @@ from optipmb_client.datasets.interface import Regions, Truth
 from optipmb_client.datasets.table.rows import NO_ID, Boxes, read_tables
 from optipmb_client.datasets.table.values import Reading
 from optipmb_client.files import DatasetError
-from optipmb_client.geometry import Floats, Ints, Pose, stack_poses, to_world
+from optipmb_client.geometry import Bools, Floats, Ints, Pose, stack_poses, to_world
 from optipmb_client.table_files import line_of, read_table
 
 __all__ = ["ObjectTable", "TableOptions", "match_stamps", "read_objects", "truth_at"]
@@ -26,6 +26,8 @@ SPARSE: Final = 1.5
 _WRITTEN: Final = frozenset({"existence", "age", "time_since_detection", "detection_row"})
 """Columns by which a table of tracks that OptiPMB wrote is known."""
 _HEAD: Final = 4096
+_UNITS: Final = {"yaw": "radians", "heading": "x", "sizes": "lwh", "axes": "z-up"}
+"""Options that such a table is read with, beside those of the user about its times and classes."""
 _PLACES: Final = ("time", "rate", "column.stamp", "column.frame", "column.recording", "column.sensor")
 
 
@@ -54,45 +56,44 @@ class ObjectTable:
     options: Mapping[str, str]
     notes: tuple[str, ...] = ()
 
-    def times(self, stamps: Ints, numbers: NDArray[Any] | None) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return what frames (F,) and rows (R,) are matched by: numbers of frames if the table has no stamps."""
-        boxes = self.boxes
-        if numbers is None or boxes.frame_number is None or not np.array_equal(boxes.frame_number, boxes.frame_time):
-            return stamps, boxes.frame_stamp
-        return numbers, boxes.frame_number
-
-    def at(self, key: str, frames: NDArray[Any], times: NDArray[Any]) -> tuple[Ints, Ints, list[str]]:
-        """Return the boxes (R,) of a recording, ordered by frame, their frames (R,), -1 where at none, and notes.
+    def at(self, key: str, stamps: Ints, numbers: NDArray[Any] | None) -> tuple[Ints, Ints, Bools, list[str]]:
+        """Return the boxes of a recording at the frames of a sequence.
 
         Args:
             key: of the recording.
-            frames: as `times` gives it.
-            times: likewise.
+            stamps: (F,) of the frames.
+            numbers: (F,) of the frames, by which tables without stamps are matched.
+
+        Returns:
+            Boxes (R,) ordered by frame; their frames (R,), -1 where at none; the frames (F,) with rows; notes.
 
         Raises:
             DatasetError: the table has no ids, or one id twice at a stamp.
         """
-        boxes = self.boxes
+        boxes, times, frames = self.boxes, self.boxes.frame_stamp, stamps
         if boxes.id is None:
             raise DatasetError(self.path, "a column of ids (id, track_id …; --option column.id=NAME)", "none")
+        if numbers is not None and boxes.frame_number is not None and (boxes.frame_number == boxes.frame_time).all():
+            times, frames = boxes.frame_number, numbers
         rows = np.flatnonzero(boxes.frame_key[boxes.row] == key)
         known = boxes.id[rows] != NO_ID
         notes = [] if known.all() else [f"{self.path}: {int((~known).sum())} rows with no id, or -1, are left out"]
         rows = rows[known]
-        stamp, identity = times[boxes.row[rows]], boxes.id[rows]
-        order = np.lexsort((identity, stamp))
-        twice = order[1:][(np.diff(stamp[order]) == 0) & (np.diff(identity[order]) == 0)]
+        time, identity = times[boxes.row[rows]], boxes.id[rows]
+        order = np.lexsort((identity, time))
+        twice = order[1:][(np.diff(time[order]) == 0) & (np.diff(identity[order]) == 0)]
         if len(twice):
             line = self.line(int(rows[twice.min()]))
             raise DatasetError(self.path, "an id once per frame", "an id again at the same stamp", line=line)
-        frame = match_stamps(frames, stamp)
-        order = np.lexsort((np.abs(frames[frame] - stamp), identity, frame))
+        frame = match_stamps(frames, time)
+        order = np.lexsort((np.abs(frames[frame] - time), identity, frame))
         again = (np.diff(frame[order]) == 0) & (np.diff(identity[order]) == 0) & (frame[order[1:]] >= 0)
         if again.any():
             notes.append(f"{self.path}: of several rows of an object at a frame the nearest counts, in time")
         kept = np.sort(order[np.append(True, ~again)[: len(order)]])
         kept = kept[np.argsort(frame[kept], kind="stable")]
-        return rows[kept], frame[kept], notes
+        seen = np.isin(np.arange(len(frames)), match_stamps(frames, times[boxes.frame_key == key]))
+        return rows[kept], frame[kept], seen, notes
 
     def line(self, box: int) -> int:
         """Return the line of a box, counted from 1."""
@@ -125,7 +126,7 @@ def read_objects(path: Path, files: Sequence[Path], tables: TableOptions) -> lis
     if written:
         results = {f"class.{value}" for name, value in options.items() if name.startswith("class.")}
         kept = {*_PLACES, *(name for name in options.keys() - results if name.startswith("class."))}
-        options = {name: value for name, value in options.items() if name in kept}
+        options = _UNITS | {name: value for name, value in options.items() if name in kept}
     reading = Reading(path, options, named=tables.named)
     found = read_tables(files, reading, scored=False, loaded=columns)
     notes = () if written else tuple(f"{path}: {note}" for note in reading.notes)
@@ -154,22 +155,19 @@ def match_stamps(stamps: NDArray[Any], wanted: NDArray[Any]) -> Ints:
 
 
 def truth_at(name: str, stamps: Ints, numbers: NDArray[Any] | None, table: ObjectTable, key: str) -> Truth:
-    """Return the objects of a recording at the frames (F,) of its detections.
+    """Return the objects of a recording at the frames of its detections; arguments as for `ObjectTable.at`.
 
     Raises:
         DatasetError: none of them is at a frame, or as for `ObjectTable.at`.
     """
     boxes, path = table.boxes, table.path
-    frames, times = table.times(stamps, numbers)
-    rows, frame, notes = table.at(key, frames, times)
-    outside = int((frame < 0).sum())
+    rows, frame, seen, notes = table.at(key, stamps, numbers)
+    outside, count, steps = int((frame < 0).sum()), int(seen.sum()), np.diff(stamps[seen])
     if outside == len(rows):
         raise DatasetError(path, f"boxes at the stamps of {name}", "none of its stamps")
     if outside:
         notes.append(f"{path}: {outside} rows are at no frame of {name}: left out")
     rows, frame = rows[outside:], frame[outside:]
-    labelled = np.isin(np.arange(len(stamps)), match_stamps(frames, times[boxes.frame_key == key]))
-    count, steps = int(labelled.sum()), np.diff(stamps[labelled])
     sparse = count < len(stamps) and (not len(steps) or np.median(steps) >= SPARSE * np.median(np.diff(stamps)))
     if count < len(stamps):
         meaning = "only these are compared" if sparse else "the others count as frames without objects"
@@ -193,6 +191,6 @@ def truth_at(name: str, stamps: Ints, numbers: NDArray[Any] | None, table: Objec
         box2d=np.full((len(rows), 4), np.nan),
         ignored=np.zeros(len(rows), dtype=np.bool_),
         regions=Regions(np.empty(0, dtype=np.int64), np.empty((0, 4))),
-        labelled=labelled if sparse else None,
+        labelled=seen if sparse else None,
         notes=tuple(notes),
     )
