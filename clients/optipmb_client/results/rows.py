@@ -99,6 +99,8 @@ class ResultTable:
     """(R,)"""
     box2d: Floats
     """(R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image."""
+    notes: tuple[str, ...] = ()
+    """Assumptions about them, a line each."""
 
     def __len__(self) -> int:
         return len(self.frame)
