@@ -1,13 +1,19 @@
 """All figures together: from files, by the command, and of the real truth."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from commands import result_of, run_here
 from evaluation_cases import write_kitti
 from optipmb_client.cli import run
 from optipmb_client.datasets import DatasetError, open_dataset
+from optipmb_client.datasets.kitti import KittiSequence
 from optipmb_client.evaluation.figures import Settings, evaluate_figures, load_recordings
+from optipmb_client.results import read_kitti_results
+from optipmb_client.results.kitti import LEAST_SHOWN
 from real_data import kitti_root, nuscenes_root
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
@@ -113,6 +119,95 @@ def test_the_command_shows_and_prints_the_figures_of_kitti(
     assert chosen["gospa"]["all"]["OSPA"] < 1.0
 
 
+def rewritten(kitti: tuple[Path, Path], folder: Path, change: Callable[[list[str]], list[str]]) -> Path:
+    """Write the results anew with changed fields, and give their folder."""
+    folder.mkdir()
+    for path in kitti[1].glob("*.txt"):
+        lines = [" ".join(change(line.split())) for line in path.read_text().splitlines()]
+        (folder / path.name).write_text("\n".join(lines))
+    return folder
+
+
+def figures_of(kitti: tuple[Path, Path], results: Path, capsys: pytest.CaptureFixture[str]) -> tuple[Any, str]:
+    """Give the figures by class, without the thresholds, and what was said."""
+    asked = ("evaluate", "--dataset", "kitti", "--root", kitti[0], "--tracks", results, "--class", *CLASSES, "--json")
+    done = run_here(capsys, *asked)
+    classes = result_of(done)["classes"]
+    for one in classes.values():
+        one["best"].pop("score")
+        for result in one["ab3dmot"].values():
+            result.pop("score")
+    return classes, done.stderr
+
+
+def test_results_without_image_boxes_are_projected(
+    kitti: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With -1 or 0 in the place of all image boxes the figures are those of projected boxes, and a line says so."""
+    shown = tmp_path / "shown"
+    shown.mkdir()
+    for one in open_dataset("kitti", kitti[0]).sequences(["all"]):
+        assert isinstance(one, KittiSequence)
+        lines = (kitti[1] / f"{one.name}.txt").read_text().splitlines()
+        lines.sort(key=lambda line: int(line.split()[0]))
+        boxes = read_kitti_results(kitti[1] / f"{one.name}.txt")
+        image, _ = one.camera.boxes(boxes.center, boxes.size, boxes.yaw, least_shown=LEAST_SHOWN)
+        parts = [(line.split(), box.tolist()) for line, box in zip(lines, image, strict=True)]
+        text = "\n".join(" ".join([*line[:6], *(f"{pixel:.6f}" for pixel in box), *line[10:]]) for line, box in parts)
+        (shown / f"{one.name}.txt").write_text(text)
+    expected, said = figures_of(kitti, shown, capsys)
+    assert said == ""
+    assert expected["Car"]["ab3dmot"]["0.25"]["FP"] > 0
+    for text in ("-1", "0"):
+        bare = rewritten(kitti, tmp_path / text, lambda line, text=text: [*line[:6], *[text] * 4, *line[10:]])  # type: ignore[misc]  # its default
+        found, said = figures_of(kitti, bare, capsys)
+        assert "boxes without an image box: their 3D boxes are projected into the image" in said
+        for name in CLASSES:
+            for limit, result in expected[name]["ab3dmot"].items():
+                assert found[name]["ab3dmot"][limit] == result
+            assert found[name]["hota_2d"]["all"] == pytest.approx(expected[name]["hota_2d"]["all"], abs=1e-4)
+
+
+def test_classes_of_kitti_are_matched_without_case(
+    kitti: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Results of `car` and `bicycle` have the figures of `Car` and `Cyclist`; vans stay vans."""
+    names = {"Car": "car", "Cyclist": "bicycle", "Pedestrian": "PEDESTRIAN"}
+    other = rewritten(kitti, tmp_path / "other", lambda line: [*line[:2], names.get(line[2], line[2]), *line[3:]])
+    found, said = figures_of(kitti, other, capsys)
+    assert found == figures_of(kitti, kitti[1], capsys)[0]
+    assert "car as Car" in said
+    vans = rewritten(kitti, tmp_path / "vans", lambda line: [*line[:2], "Van", *line[3:]])
+    assert figures_of(kitti, vans, capsys)[0]["Car"]["all"]["TP"] == 0
+
+
+def test_a_shift_of_all_scores_changes_no_figure_of_kitti(
+    kitti: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No track is deleted at its own threshold: 1e-6 more for every score changes the thresholds alone.
+
+    Tracks of one score and of several lengths have means that differ in the last place unless they are rounded.
+    """
+
+    def figures(shift: float) -> Any:
+        def change(line: list[str]) -> list[str]:
+            return [*line[:-1], f"{0.1 + 0.1 * (int(line[1]) % 7) + shift:.6f}"]
+
+        return figures_of(kitti, rewritten(kitti, tmp_path / f"{shift}", change), capsys)[0]
+
+    assert figures(0.0) == figures(1e-6) == figures(2e-6)
+
+
+def test_a_track_at_its_own_threshold_is_kept(kitti: tuple[Path, Path], tmp_path: Path) -> None:
+    """A threshold of more decimals than means are rounded to keeps the tracks that have it as their mean."""
+    score = 0.1234567890123456
+    even = rewritten(kitti, tmp_path / "even", lambda line: [*line[:-1], str(score)])
+    recordings = load_recordings("kitti", open_dataset("kitti", kitti[0]).sequences(["all"]), even)
+    (cars,) = evaluate_figures("kitti", recordings, ("Car",), thresholds={"Car": score})
+    assert cars.best is not None
+    assert cars.best.hota.summary() == cars.everything.hota.summary()
+
+
 def test_the_command_tests_the_calibration_of_full_tracks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Of tracks that were written with --full the NEES and the reliability are shown."""
     data = ("--dataset", "scene", "--option", "frames=30", "--option", "clouds=0")
@@ -132,7 +227,9 @@ def test_the_command_knows_the_benchmark_of_nuscenes(tmp_path: Path, capsys: pyt
     assert run(["track", *data, "--option", "clouds=0", "--out", str(tmp_path), "--full", "--json"]) == 0
     capsys.readouterr()
     assert run(["evaluate", *data, "--tracks", str(tmp_path), "--class", "car", "pedestrian"]) == 0
-    assert "AMOTA" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "AMOTA" in shown
+    assert "class average" in shown
     assert run(["evaluate", *data, "--tracks", str(tmp_path), "--class", "car", "pedestrian", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     car = report["classes"]["car"]
@@ -140,6 +237,10 @@ def test_the_command_knows_the_benchmark_of_nuscenes(tmp_path: Path, capsys: pyt
     assert 0.5 < car["nuscenes"]["amota"] < 1.0
     assert 0.3 < car["hota_centre"]["all"]["HOTA"] < car["hota_centre"]["best"]["HOTA"] < 1.0
     assert car["calibration"]["samples"] > 100
+    for key in ("all", "best"):
+        parts = [one["hota_centre"][key] for one in report["classes"].values()]
+        for name, value in report["overall"]["hota_centre"][key].items():
+            assert value == pytest.approx(sum(part[name] for part in parts) / 2)
     assert run(["evaluate", *data, "--tracks", str(tmp_path), "--iou", "0.5"]) == 2
 
 

@@ -1,7 +1,9 @@
 """`optipmb evaluate`: result files against the truth."""
 
+from collections.abc import Callable
 from collections.abc import Sequence as Many
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -84,11 +86,17 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     from optipmb_client.commands.tables import comparison_tables  # noqa: PLC0415  loads the solvers of scipy
 
     asked = asked_for(data, dataset, root, detections, option, truth)
+    if asked.name == "table":
+        asked = replace(asked, options=(*asked.options, ("tracks", " ".join(map(str, tracks)))))
     _, chosen = open_sequences(asked, sequences)
-    names = tuple(classes or labels_of(chosen))
-    how = _How(iou, distance, cutoff, order)
+    labels = labels_of(chosen)
+    spelt = {label.lower(): label for label in labels}
+    names = tuple(one if one in labels else spelt.get(one.lower(), one) for one in classes or labels)
+    how = _How(iou, distance, cutoff, order, cache(warn))
     with executor_of(jobs, ray, chosen, max(1, len(names))) as executor:
         reports = {str(one): _judge(asked, chosen, one, names, how, executor) for one in tracks}
+    for tables in (one.tables for one in chosen if hasattr(one, "tables")):
+        tables.check()
     report = {"command": "evaluate", "dataset": asked.name, "sequences": [sequence.name for sequence in chosen]}
     (first, *others) = reports.values()
     if as_json and others:
@@ -109,6 +117,8 @@ class _How:
     distance: float | None
     cutoff: float
     order: float
+    warn: Callable[[str], None]
+    """Prints each assumption once."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +144,7 @@ def _judge(
         nuscenes_table,
     )
     from optipmb_client.evaluation import evaluate_files  # noqa: PLC0415  as above
-    from optipmb_client.evaluation.figures import Settings  # noqa: PLC0415  as above
+    from optipmb_client.evaluation.figures import Settings, class_average  # noqa: PLC0415  as above
     from optipmb_client.evaluation.jobs import Evaluation, FiguresTask, figures_of  # noqa: PLC0415  as above
     from optipmb_client.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
 
@@ -150,19 +160,23 @@ def _judge(
         parts = {name: {"nuscenes": one.to_json()} for name, one in scores.classes.items() if name in names}
         best = {name: scores.classes[name].best.threshold for name in parts}
     else:
-        results = evaluate_files(chosen, tracks, names, _rules(asked.name, how.iou, how.distance))
+        results = evaluate_files(chosen, tracks, names, _rules(asked.name, how.iou, how.distance), how.warn)
         parts = {one.name: _figures(one) for one in results}
         best = {} if asked.name == "kitti" else {one.name: one.sweep.thresholds[one.sweep.best] for one in results}
         if asked.name != "kitti" or how.distance is not None:  # AB3DMOT's protocol gives them at its own threshold
             head = [clear_table(results, metres=how.iou is None)]
     recordings = tuple(sequence.name for sequence in chosen)
-    executor.start(figures_of, Evaluation(asked, recordings, settings, chosen if executor.here else None))
+    executor.start(figures_of, Evaluation(asked, recordings, settings, names, chosen if executor.here else None))
     tasks = [FiguresTask(tracks, name, best.get(name)) for name in names]
     figures = [one for found in values(executor, tasks, str, warn) for one in found]
     if not figures:
         raise UsageError(f"{tracks}: neither the truth nor the tracks have objects of these classes")
     by_class = {one.name: {**parts.get(one.name, {}), **one.summary()} for one in figures}
-    return _Judgement({**overall, "classes": by_class}, figures, (*head, *figure_tables(figures, how.cutoff)))
+    average = class_average(figures) if overall else None
+    if average is not None:
+        overall["overall"]["hota_centre"] = average
+    tables = (*head, *figure_tables(figures, how.cutoff, average))
+    return _Judgement({**overall, "classes": by_class}, figures, tables)
 
 
 def labels_of(sequences: Many[DataSequence]) -> tuple[str, ...]:

@@ -66,8 +66,10 @@ def nuscenes_table(scores: "NuScenesScores", names: Sequence[str]) -> Renderable
     )
 
 
-def figure_tables(figures: "Sequence[ClassFigures]", cutoff: float) -> Iterator[RenderableType]:
-    """Yield the tables of all other figures that there are."""
+def figure_tables(
+    figures: "Sequence[ClassFigures]", cutoff: float, average: "Mapping[str, Mapping[str, float | None]] | None" = None
+) -> Iterator[RenderableType]:
+    """Yield the tables of all other figures that there are, with HOTA's average over classes where it is given."""
     if any(one.ab3dmot for one in figures):
         yield _titled(
             "AB3DMOT's protocol: averages over 40 recall points, then the threshold with the highest MOTA",
@@ -75,7 +77,7 @@ def figure_tables(figures: "Sequence[ClassFigures]", cutoff: float) -> Iterator[
         )
     yield _titled(
         f"All tracks, and those from that score on: HOTA in percent; means over frames in metres, cut-off {cutoff:g} m",
-        _sets(figures),
+        _sets(figures, average or {}),
     )
     if any(one.calibration for one in figures):
         yield _titled(
@@ -114,7 +116,7 @@ def _protocol(figures: "Sequence[ClassFigures]") -> Table:
     return table
 
 
-def _sets(figures: "Sequence[ClassFigures]") -> Table:
+def _sets(figures: "Sequence[ClassFigures]", average: "Mapping[str, Mapping[str, float | None]]") -> Table:
     image = any(one.everything.hota_2d for one in figures)
     heads = [*(f"2D {name}" for name in _HOTA if image), *(f"centre {name}" for name in (*_HOTA, "LocA")), *_GOSPA]
     table = _empty(("class", SCORE, *heads))
@@ -130,6 +132,8 @@ def _sets(figures: "Sequence[ClassFigures]") -> Table:
                 *(_shown(part.hota.summary()[name]) for name in (*_HOTA, "LocA")),
                 *(_shown(part.gospa.summary()[name], plain=True) for name in _GOSPA),
             )
+    for key, values in average.items():
+        table.add_row("class average" if key == "all" else "", key, *(_shown(values[name]) for name in _HOTA))
     return table
 
 

@@ -119,6 +119,10 @@ class Truth:
     """(R,) neither to be found nor wrong to find: hardly visible, or cut by the border of the image."""
     regions: Regions
     """Where detections count as neither right nor wrong."""
+    labelled: Bools | None = None
+    """(F,) frames that are compared; None: all."""
+    notes: tuple[str, ...] = ()
+    """Assumptions about it, a line each."""
 
     def __len__(self) -> int:
         return len(self.frame)

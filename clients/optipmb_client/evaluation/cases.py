@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from optipmb_client.datasets import Truth
+from optipmb_client.datasets import DatasetError, Truth
 from optipmb_client.evaluation.overlap import iou_2d, iou_3d
 from optipmb_client.geometry import Bools, Floats, Ints
 from optipmb_client.results import ResultTable
@@ -102,11 +102,19 @@ def prepare(truth: Truth, tracks: ResultTable, name: str, rules: Rules, sequence
         rules: how to compare.
         sequence: the name of the sequence, for reports.
 
+    Raises:
+        DatasetError: overlaps are asked for of boxes without size or heading.
+
     """
+    shapes = (truth.size, truth.yaw, tracks.size, tracks.yaw)
+    if rules.measure == "iou_3d" and any(np.isnan(one).any() for one in shapes):
+        raise DatasetError("--iou", "truth and tracks with sizes and headings (--distance compares centres)", "centres")
     alike = (name, *rules.neighbours.get(name, ()))
     wanted = truth.take(np.isin(truth.names, alike))
     wanted = wanted.take(np.argsort(wanted.frame, kind="stable"))
     found = tracks.of_class(name)
+    if truth.labelled is not None:
+        found = found.take(truth.labelled[found.frame])
     found = found.take(np.argsort(found.frame, kind="stable"))
     truth_row, track_row = _same_frame(wanted.frame, found.frame)
     if rules.measure == "iou_3d":

@@ -202,7 +202,8 @@ def sweep(cases: list[Case], rules: Rules, steps: int = 40) -> Sweep:
     """
     means = [case.mean_scores() for case in cases]
     scores = np.concatenate([np.unique(mean) for mean in means]) if means else np.empty(0)
-    levels = np.quantile(scores, np.arange(steps) / steps) if len(scores) else np.zeros(1)
+    # A threshold is a score, not a value between two, so that a track at its own threshold is kept.
+    levels = np.quantile(scores, np.arange(steps) / steps, method="higher") if len(scores) else np.zeros(1)
     thresholds = np.unique(levels)
     results = tuple(
         combine(clear(case.keep(mean >= level), rules) for case, mean in zip(cases, means, strict=True))

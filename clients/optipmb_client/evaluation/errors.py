@@ -189,6 +189,7 @@ def _backward(values: Floats) -> float | None:
 
 
 def _mean(values: np.ndarray, *, root: bool = False) -> float | None:
+    values = values[~np.isnan(values)]
     if not len(values):
         return None
     mean = float(values.mean())

@@ -4,7 +4,7 @@ Conventions: metres, z up. Figures that need centres in the plane are taken in t
 taken where KITTI has its boxes, in the sensor frame of each frame and in its image.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,14 +19,16 @@ from optipmb_client.evaluation.errors import ErrorResult, evaluate_errors
 from optipmb_client.evaluation.gospa import CUTOFF, ORDER, GospaResult, evaluate_gospa
 from optipmb_client.evaluation.hota import HotaResult, evaluate_hota
 from optipmb_client.evaluation.hota_2d import hota_2d_rules
+from optipmb_client.evaluation.nuscenes_figures import plain
 from optipmb_client.evaluation.run import default_rules
-from optipmb_client.evaluation.tracks import read_full_tracks, read_tracks
+from optipmb_client.evaluation.tracks import read_compared, read_full_tracks
 from optipmb_client.results import ResultTable
 from optipmb_client.results.full import FullTable, full_path, read_full
 from optipmb_client.results.nuscenes import read_nuscenes_results, result_table
 
 CENTRE_DISTANCE = 2.0
 """Centres farther apart than this, in metres, have no similarity (D_0 of the OptiPMB paper)."""
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -96,26 +98,40 @@ class ClassFigures:
         }
 
 
-def load_recordings(dataset: str, sequences: Sequence[DataSequence], results: Path) -> list[Recording]:
+def load_recordings(
+    dataset: str, sequences: Sequence[DataSequence], results: Path, names: Sequence[str] = ()
+) -> list[Recording]:
     """Return the sequences with their truth and their tracks.
 
     Args:
         dataset: its name, which says what the result files look like.
         sequences: what to compare with; each must have a truth.
         results: the folder of the result files.
+        names: as for `read_compared`.
 
     Raises:
         DatasetError: a sequence has no truth, or its results are missing or wrong.
 
     """
-    read = _nuscenes_reader(results) if dataset == "nuscenes" else _reader(results)
-    recordings = []
-    for sequence in sequences:
-        truth = sequence.truth()
-        if truth is None:
-            raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
-        recordings.append(Recording(sequence, truth, *read(sequence)))
-    return recordings
+    if dataset == "nuscenes":
+        return _nuscenes_recordings(sequences, results)
+    pairs = zip(sequences, read_compared(sequences, results, names), strict=True)
+    return [
+        Recording(one, truth, tracks.to_world(one.poses), read_full_tracks(results, one))
+        for one, (truth, tracks) in pairs
+    ]
+
+
+def class_average(figures: Sequence[ClassFigures]) -> dict[str, dict[str, float | None]]:
+    """Return HOTA of centres as means over classes (TrackEval: `cls_comb_cls_av`), of all tracks and of the best.
+
+    A class without a best threshold has no tracks and counts 0 among the best.
+    """
+    found = {}
+    for key, parts in (("all", [one.everything for one in figures]), ("best", [one.best for one in figures])):
+        values = [(one.hota.hota, one.hota.deta, one.hota.assa) if one else (0.0, 0.0, 0.0) for one in parts]
+        found[key] = dict(zip(("HOTA", "DetA", "AssA"), map(plain, np.nanmean(values, axis=0).tolist()), strict=True))
+    return found
 
 
 def evaluate_figures(
@@ -186,7 +202,11 @@ class _Cases:
         self._centres = world(self.near)
         self._cutoff = default_rules(dataset, "distance", settings.cutoff)
         self._sets = world(self._cutoff)
-        self._frames = [len(one.sequence) for one in recordings]
+        labelled = [one.truth.labelled for one in recordings]
+        self._frames = [
+            len(one.sequence) if mask is None else int(mask.sum())
+            for one, mask in zip(recordings, labelled, strict=True)
+        ]
         self._order = settings.order
 
     def evaluate(self, threshold: float) -> TrackFigures:
@@ -201,7 +221,8 @@ class _Cases:
 
 
 def _from_score(cases: Sequence[Case], threshold: float) -> list[Case]:
-    return [case.keep(case.mean_scores() >= threshold) for case in cases]
+    # The benchmark of nuScenes sums up scores in another order: a track at its own threshold is kept all the same.
+    return [case.keep(case.mean_scores() >= threshold - _ROUNDING) for case in cases]
 
 
 def _to_sensor(one: Recording) -> tuple[Truth, ResultTable, str]:
@@ -213,24 +234,20 @@ def _names(tracks: ResultTable) -> np.ndarray:
     return np.asarray(tracks.labels, dtype=np.str_)[np.unique(tracks.label)] if len(tracks) else np.empty(0, np.str_)
 
 
-def _reader(results: Path) -> Callable[[DataSequence], tuple[ResultTable, FullTable | None]]:
-    def read(sequence: DataSequence) -> tuple[ResultTable, FullTable | None]:
-        return read_tracks(results, sequence).to_world(sequence.poses), read_full_tracks(results, sequence)
-
-    return read
-
-
-def _nuscenes_reader(results: Path) -> Callable[[DataSequence], tuple[ResultTable, FullTable | None]]:
+def _nuscenes_recordings(sequences: Sequence[DataSequence], results: Path) -> list[Recording]:
     submission = read_nuscenes_results(results)
-
-    def read(sequence: DataSequence) -> tuple[ResultTable, FullTable | None]:
+    recordings = []
+    for sequence in sequences:
         if not isinstance(sequence, NuScenesSequence):
             raise TypeError(f"a sequence of nuScenes is wanted, received {type(sequence).__name__}")
+        truth = sequence.truth()
+        if truth is None:
+            raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
         table = result_table(submission, sequence.name, sequence.samples)
         # The benchmark compares only what is near, by class; truth farther away is ignored already.
         reach = np.array([CLASS_RANGE.get(name, 0.0) for name in table.labels] or [0.0])
         near = sequence.ego_distance(table.frame, table.center) < reach[table.label]
         beside = full_path(submission.path.parent / "scenes" / f"{sequence.name}.json")
-        return table.take(near), read_full(beside) if beside.is_file() else None
-
-    return read
+        full = read_full(beside) if beside.is_file() else None
+        recordings.append(Recording(sequence, truth, table.take(near), full))
+    return recordings

@@ -62,7 +62,7 @@ def evaluate_gospa(parts: Iterable[tuple[Case, int]], rules: Rules, order: float
     """Return the figures of one class over all sequences.
 
     Args:
-        parts: the class in each sequence and the number of frames of the sequence.
+        parts: the class in each sequence and the number of frames of the sequence that are compared.
         rules: those by which the cases were prepared; centres, and their limit is the cut-off c.
         order: p, at least 1.
 
@@ -75,7 +75,7 @@ def gospa(case: Case, frames: int, cutoff: float = CUTOFF, order: float = ORDER)
 
     Args:
         case: truth, tracks, and the pairs up to the cut-off with their distance as cost.
-        frames: how many there are; those of the case are below.
+        frames: how many are compared.
         cutoff: c, metres.
         order: p, at least 1.
 
@@ -87,11 +87,12 @@ def gospa(case: Case, frames: int, cutoff: float = CUTOFF, order: float = ORDER)
     # A pair is worth what it saves: either of the two metrics charges c^p for two that are left alone or far apart.
     taken = assign_frames(case.truth_frame[truth], truth, track, limit - power, best_pairs)
     when = case.truth_frame[truth[taken]]
-    paired = np.bincount(when, minlength=frames)
-    objects = np.bincount(case.truth_frame, minlength=frames)
-    tracks = np.bincount(case.track_frame, minlength=frames)
+    stop = 1 + max(case.truth_frame.max(initial=-1), case.track_frame.max(initial=-1))
+    paired = np.bincount(when, minlength=stop)
+    objects = np.bincount(case.truth_frame, minlength=stop)
+    tracks = np.bincount(case.track_frame, minlength=stop)
     parts = [
-        np.bincount(when, power[taken], frames),
+        np.bincount(when, power[taken], stop),
         0.5 * limit * (objects - paired),
         0.5 * limit * (tracks - paired),
     ]

@@ -19,6 +19,8 @@ class Evaluation:
     names: tuple[str, ...]
     """Of the sequences."""
     settings: Settings
+    classes: tuple[str, ...] = ()
+    """By whose names those of truth and tracks are called."""
     here: Sequence[DataSequence] | None = None
     """The sequences, where this process has opened them."""
     _loaded: dict[Path, Sequence[Recording]] = field(default_factory=dict)
@@ -32,7 +34,7 @@ class Evaluation:
         """Return truth and tracks; those of the last tracker are kept."""
         if tracks not in self._loaded:
             self._loaded.clear()
-            self._loaded[tracks] = load_recordings(self.data.name, self.sequences, tracks)
+            self._loaded[tracks] = load_recordings(self.data.name, self.sequences, tracks, self.classes)
         return self._loaded[tracks]
 
 

@@ -4,14 +4,14 @@ Conventions: truth is carried to the sensor frame of each frame, where the resul
 the sensor changes nothing.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from optipmb_client.datasets import DataSequence, DatasetError
+from optipmb_client.datasets import DataSequence
 from optipmb_client.evaluation.cases import Case, Measure, Rules, prepare
 from optipmb_client.evaluation.clear import ClearResult, Sweep, clear, combine, sweep
-from optipmb_client.evaluation.tracks import read_tracks
+from optipmb_client.evaluation.tracks import read_compared
 
 _ALIKE = {"Car": ("Van",), "Pedestrian": ("Person", "Person_sitting")}
 
@@ -46,7 +46,11 @@ class ClassResult:
 
 
 def evaluate_files(
-    sequences: Sequence[DataSequence], results: Path, names: Sequence[str], rules: Rules
+    sequences: Sequence[DataSequence],
+    results: Path,
+    names: Sequence[str],
+    rules: Rules,
+    warn: Callable[[str], None] | None = None,
 ) -> list[ClassResult]:
     """Return the figures of each class from the tracks of each sequence.
 
@@ -55,17 +59,15 @@ def evaluate_files(
         results: the folder of the result files, or a table of tracks.
         names: classes; those that occur neither in the truth nor in the results are left out.
         rules: how to compare.
+        warn: is called with each assumption.
 
     Raises:
         DatasetError: a sequence has no truth, or its result file is missing or wrong.
 
     """
     cases: dict[str, list[Case]] = {name: [] for name in names}
-    for sequence in sequences:
-        truth = sequence.truth()
-        if truth is None:
-            raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
-        table = read_tracks(results, sequence)
+    pairs = read_compared(sequences, results, names, warn)
+    for sequence, (truth, table) in zip(sequences, pairs, strict=True):
         local = truth.to_sensor(sequence.poses)
         for name in names:
             cases[name].append(prepare(local, table, name, rules, sequence.name))

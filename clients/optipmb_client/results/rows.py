@@ -52,6 +52,10 @@ class TrackRows(Protocol):
     def existence(self) -> Floats:
         """(N,) probability."""
 
+    @property
+    def confirmed(self) -> Bools | Ints | None:
+        """(N,) flags; None where unknown."""
+
 
 class ResultWriter(Protocol):
     """Takes the tracks of one sequence frame by frame; the file appears complete at `close`, or not at all."""
@@ -95,6 +99,8 @@ class ResultTable:
     """(R,)"""
     box2d: Floats
     """(R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image."""
+    notes: tuple[str, ...] = ()
+    """Assumptions about them, a line each."""
 
     def __len__(self) -> int:
         return len(self.frame)

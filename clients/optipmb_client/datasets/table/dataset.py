@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from optipmb_client.datasets.interface import DataSequence, DetectionFrame, Regions, Truth
+from optipmb_client.datasets.interface import DataSequence, DetectionFrame, Truth
 from optipmb_client.datasets.table.names import ALIASES
-from optipmb_client.datasets.table.rows import Boxes, read_boxes, read_tables
+from optipmb_client.datasets.table.rows import Boxes, read_tables
+from optipmb_client.datasets.table.truth import ObjectTable, TableOptions, read_objects, truth_at
 from optipmb_client.datasets.table.values import Finding, Reading
 from optipmb_client.files import DatasetError
-from optipmb_client.geometry import Ints, Pose, stack_poses, to_world
+from optipmb_client.geometry import Ints, Pose
 from optipmb_client.results import ResultWriter
 from optipmb_client.results.table import TableResultWriter
 from optipmb_client.table_files import SUFFIXES, tables_in
@@ -29,9 +30,9 @@ __all__ = ["OPTIONS", "TableDataset", "TableSequence"]
 
 OPTIONS: Final = (
     *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
-    *("poses", "truth", "decimal", "encoding", "date"),
+    *("poses", "truth", "tracks", "decimal", "encoding", "date"),
 )
-"""Options beside `column.MEANING=NAME` and `class.NAME=NAME`."""
+"""Options beside `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them."""
 GAP: Final = 1.5
 _HERE: Final = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
@@ -41,8 +42,10 @@ class TableSequence:
 
     has_clouds = False
 
+    tables: TableOptions
+
     def __init__(
-        self, name: str, stem: str, boxes: Boxes, key: str, truth: tuple[Boxes, str, Path] | None, origin: int = 0
+        self, name: str, stem: str, boxes: Boxes, key: str, truth: tuple[ObjectTable, str] | None, origin: int = 0
     ) -> None:
         self.name = name
         self.key_columns: dict[str, str] = dict(zip(boxes.key_columns, boxes.keys[key], strict=True))
@@ -117,64 +120,9 @@ class TableSequence:
         """Return the objects of the table of truth, at the stamps of these frames.
 
         Raises:
-            DatasetError: none of them is at one.
+            DatasetError: as `truth_at`.
         """
-        if self._truth is None:
-            return None
-        boxes, key, path = self._truth
-        if boxes.id is None:
-            raise DatasetError(path, "a column of object ids (id, track_id …)", "none")
-        member = np.flatnonzero(boxes.frame_key[boxes.row] == key)
-        stamp = boxes.frame_stamp[boxes.row[member]]
-        frame = match_stamps(self._stamps, stamp)
-        inside = frame >= 0
-        if not inside.any():
-            raise DatasetError(path, f"boxes at the stamps of {self.name}", "none of its stamps")
-        chosen = member[inside]
-        order = np.argsort(frame[inside], kind="stable")
-        return _truth(boxes, chosen[order], frame[inside][order])
-
-
-def match_stamps(stamps: Ints, wanted: Ints) -> Ints:
-    """Return the frame nearest to each `wanted` stamp (R,), -1 where it is more than half a frame away."""
-    if not len(stamps):
-        return np.full(len(wanted), -1, dtype=np.int64)
-    period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 2e9
-    after = np.clip(np.searchsorted(stamps, wanted), 1, max(1, len(stamps) - 1))
-    before = after - 1
-    after = np.minimum(after, len(stamps) - 1)
-    nearest = np.where(abs(stamps[after] - wanted) < abs(wanted - stamps[before]), after, before)
-    return np.where(abs(stamps[nearest] - wanted) <= 0.5 * period, nearest, -1)
-
-
-def _truth(boxes: Boxes, rows: Ints, frame: Ints) -> Truth:
-    center, yaw = boxes.center[rows], boxes.yaw[rows]
-    velocity = np.full((len(rows), 2), np.nan) if boxes.velocity is None else boxes.velocity[rows]
-    if boxes.frame_pose is not None:
-        pose = boxes.frame_pose[boxes.row[rows]]
-        rotation, translation = stack_poses([Pose(row[:3], row[3:]) for row in pose])
-        center, yaw = to_world(rotation, translation, center, yaw)
-        velocity = np.einsum("nij,nj->ni", rotation[:, :2, :2], velocity)
-    labels = tuple(dict.fromkeys(boxes.name[rows].tolist()))
-    count = len(rows)
-    zero = np.zeros(count, dtype=np.int64)
-    return Truth(
-        labels=labels,
-        frame=frame,
-        id=np.zeros(0, np.int64) if boxes.id is None else boxes.id[rows],
-        label=np.array([labels.index(name) for name in boxes.name[rows].tolist()], dtype=np.int64),
-        center=center,
-        size=boxes.size[rows],
-        yaw=yaw,
-        velocity=velocity,
-        occlusion=zero,
-        truncation=zero,
-        covered=np.full(count, np.nan),
-        points=np.full(count, -1, dtype=np.int64),
-        box2d=np.full((count, 4), np.nan),
-        ignored=np.zeros(count, dtype=np.bool_),
-        regions=Regions(np.empty(0, dtype=np.int64), np.empty((0, 4))),
-    )
+        return None if self._truth is None else truth_at(self.name, self._stamps, self.numbers, *self._truth)
 
 
 class TableDataset:
@@ -205,8 +153,10 @@ class TableDataset:
         self._sequences: dict[str, TableSequence] = {}
         self._notes: list[str] = []
         self.path = path
-        others = _read_truth(Path(truth), options, self._notes) if truth is not None else None
-        reading = Reading(path, options, lenient)
+        shared, tracks = TableOptions(options), options.pop("tracks", None)
+        others = read_objects(Path(truth), _tables(Path(truth)), shared) if truth is not None else []
+        self._notes += [note for one in others for note in one.notes]
+        reading = Reading(path, options, lenient, named=shared.named)
         tables = read_tables(files, reading, scored=True)
         self.findings: tuple[Finding, ...] = tuple(reading.findings)
         """What was assumed about the table, and what is wrong with it."""
@@ -215,7 +165,7 @@ class TableDataset:
         if not any(len(boxes.frame_stamp) for _, boxes in tables):
             raise DatasetError(path, "rows", "none")
         for file, boxes in tables:
-            own = (boxes, file) if boxes.id is not None else None
+            own = [ObjectTable(file, boxes, options)] if boxes.id is not None else []
             if not len(boxes.frame_stamp):
                 self._notes.append(f"{file}: no rows, a recording without frames")
             for key in dict.fromkeys(boxes.frame_key.tolist()) or boxes.keys:
@@ -224,10 +174,14 @@ class TableDataset:
                     name = _plain(key)
                 where = _truth_of(others or own, key, file)
                 sequence = TableSequence(name, _plain(_stem(file)), boxes, key, where, origin)
+                sequence.tables = shared
                 if name in self._sequences:
                     raise DatasetError(file, "names of recordings that differ", f"{name!r} twice")
                 self._sequences[name] = sequence
                 self._notes += _gaps(sequence)
+                shared.recordings |= {name, key}
+        if tracks is None:
+            shared.check()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -266,24 +220,17 @@ def _stem(file: Path) -> str:
     return file.absolute().name.split(".")[0]
 
 
-def _read_truth(path: Path, options: Mapping[str, str], notes: list[str]) -> tuple[Boxes, Path]:
-    reading = Reading(
-        path, {name: value for name, value in options.items() if not name.startswith(("column.", "class."))}
-    )
-    boxes = read_boxes(reading, scored=False)
-    notes += [f"{path}: {note}" for note in reading.notes]
-    return boxes, path
-
-
-def _truth_of(found: tuple[Boxes, Path] | None, key: str, file: Path) -> tuple[Boxes, str, Path] | None:
-    if found is None:
-        return None
-    boxes, path = found
-    keys = dict.fromkeys(boxes.frame_key.tolist())
-    for one in (key, _stem(file), key.split(".", maxsplit=1)[0]):
-        if one in keys:
-            return boxes, one, path
-    return (boxes, next(iter(keys)), path) if len(keys) == 1 else None
+def _truth_of(tables: Sequence[ObjectTable], key: str, file: Path) -> tuple[ObjectTable, str] | None:
+    """Return the table with the truth of a recording, and its key there."""
+    names = (key, _stem(file), key.split(".", maxsplit=1)[0])
+    fitting = [one for one in tables if _stem(one.path) in names] or tables
+    only = len(fitting) == 1
+    for table in fitting:
+        keys = list(table.boxes.keys)
+        for one in (*names, *keys[: only and len(keys) == 1]):
+            if one in keys and (one or only):
+                return table, one
+    return None
 
 
 def _gaps(sequence: TableSequence) -> list[str]:

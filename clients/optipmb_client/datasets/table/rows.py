@@ -32,10 +32,12 @@ from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Bools, Floats, Ints
 from optipmb_client.table_files import Columns, read_table
 
-__all__ = ["NO_CLASS", "Boxes", "read_boxes", "read_tables"]
+__all__ = ["NO_CLASS", "NO_ID", "Boxes", "read_boxes", "read_tables"]
 
 NO_CLASS: Final = "object"
 """Class of all boxes of a table without classes."""
+NO_ID: Final = -1
+"""Id of a box that has none."""
 _UNIT: Final = 1e-3
 _MOST_SHOWN: Final = 6
 _CROWDED: Final = 0.5
@@ -68,9 +70,9 @@ class Boxes:
     center: Floats
     """(B, 3)"""
     size: Floats
-    """(B, 3)"""
+    """(B, 3); NaN in a table of objects that has neither l nor w."""
     yaw: Floats
-    """(B,)"""
+    """(B,); NaN in a table of objects that has none."""
     velocity: Floats | None
     """(B, 2); rows of NaN where unknown."""
     position_covariance: Floats | None
@@ -80,7 +82,7 @@ class Boxes:
     name: NDArray[np.str_]
     """(B,) class"""
     id: Ints | None
-    """(B,) object; None where the table has no such column."""
+    """(B,) object, `NO_ID` where the cell has none; None where the table has no such column."""
     time_column: str
     key_columns: tuple[str, ...]
     sensor_column: str
@@ -106,7 +108,7 @@ def read_boxes(reading: Reading, *, scored: bool) -> Boxes:
 
     Args:
         reading: the file and the options of the user.
-        scored: whether boxes are detections, which have a score.
+        scored: whether boxes are detections, which have a score, a size and a heading.
 
     Raises:
         DatasetError: a column is missing or a value is not allowed; names the line.
@@ -116,12 +118,14 @@ def read_boxes(reading: Reading, *, scored: bool) -> Boxes:
     return boxes
 
 
-def read_tables(paths: Sequence[Path], reading: Reading, *, scored: bool) -> list[tuple[Path, Boxes]]:
+def read_tables(
+    paths: Sequence[Path], reading: Reading, *, scored: bool, loaded: Mapping[Path, Columns] | None = None
+) -> list[tuple[Path, Boxes]]:
     """Read the tables of a recording; units and conventions are those of all tables with the same columns together.
 
-    Tables without rows give no boxes. Raises as `read_boxes` does.
+    Tables without rows give no boxes; those that were `loaded` are not read again. Raises as `read_boxes` does.
     """
-    tables = {path: read_table(path, reading.options) for path in paths}
+    tables = loaded or {path: read_table(path, reading.options) for path in paths}
     groups: dict[tuple[str, ...], list[Path]] = {}
     for path, columns in tables.items():
         groups.setdefault(tuple(sorted(columns)), []).append(path)
@@ -164,15 +168,16 @@ class _Table:
             key.removeprefix("column."): name for key, name in reading.options.items() if key.startswith("column.")
         }
         for role, name in chosen.items():
-            if name not in columns:
-                raise DatasetError(f"--option column.{role}", f"a column: {', '.join(columns)}", repr(name))
-        self._found = find_columns(columns, chosen)
+            reading.name(f"column.{role}", columns, "a column", name)
+        self._found = find_columns(columns, {role: name for role, name in chosen.items() if name in columns})
 
     def _numbers(self, role: str, otherwise: float | None = None) -> Floats:
         """Return a column of numbers, NaN where there is none."""
         column = self._found.get(role)
         if column is None:
             if otherwise is None:
+                if error := self._reading.named.get(f"column.{role}"):
+                    raise error
                 have = f"the columns {', '.join(self._columns)}"
                 raise DatasetError(self._reading.path, f"a column {role} (--option column.{role}=NAME)", have)
             return np.full(self._rows, otherwise)
@@ -193,14 +198,19 @@ class _Table:
         series = np.unique(key, return_inverse=True)[1] * (len(reading.files) + 1) + file
         stamp, time, time_column = self._stamps(series)
         center = np.column_stack([self._numbers("x"), self._numbers("y"), self._numbers("z", 0.0)])
-        size = np.column_stack([self._numbers("l"), self._numbers("w"), self._numbers("h", 1.5)])
-        yaw, yaw_unit = self._yaw()
+        centres = not scored and not {"l", "w"} & found.keys()
+        side = 1.0 if centres else None
+        size = np.column_stack([self._numbers("l", side), self._numbers("w", side), self._numbers("h", 1.5)])
+        yaw, yaw_unit = self._yaw(otherwise=None if scored else 0.0)
+        turned = yaw_unit != "none"
+        if centres or not turned:
+            reading.note("sizes", "no columns for the size or the heading: only centres can be compared")
         score = self._numbers("score", 1.0)
         names, id_ = self._names(), self._ids()
         for role, text in (("z", "z = 0"), ("h", "a height of 1.5 m"), ("score", "a score of 1")):
             if role not in found and (scored or role != "score"):
                 reading.note(role, f"no column for {role}: {text} for every box")
-        empty = np.isnan(center[:, :2]).all(axis=1) & np.isnan(size[:, :2]).all(axis=1)
+        empty = np.isnan(center[:, :2]).all(axis=1) & (centres | np.isnan(size[:, :2]).all(axis=1))
         kept = self._valid(np.asarray(~empty), center, size, yaw, score, names)
         if "score" in found and scored:
             score[kept] = read_scores(reading, score[kept], np.flatnonzero(kept))
@@ -210,11 +220,11 @@ class _Table:
         row = np.flatnonzero(kept)
         center, size, yaw, names = center[row], size[row], yaw[row], names[row]
         kind = np.unique(names, return_inverse=True)[1].astype(np.int64)
-        stated = found["l"].base == "l" or found["l"].base.endswith(("_l", "length"))
+        stated = centres or found["l"].base == "l" or found["l"].base.endswith(("_l", "length"))
         size = read_sizes(reading, size, names, stated=stated)
         camera = read_axes(reading, center)
         if camera:
-            yaw = yaw if yaw_unit == "quaternion" else read_angle(reading, "yaw", yaw, yaw_unit)
+            yaw = yaw if yaw_unit in {"quaternion", "none"} else read_angle(reading, "yaw", yaw, yaw_unit)
             center, size, yaw = sensor_from_kitti(center, np.ascontiguousarray(size[:, ::-1]), yaw)
             yaw_unit = "rad"
         read_digits(reading, center)
@@ -222,7 +232,7 @@ class _Table:
         pose = self._poses(stamp)
         moves = find_moves(series[row], stamp[row] / 1e9, _world(center, row, pose)[:, :2], kind)
         motion = _Motion(row, pose, moves)
-        yaw = self._heading(motion, size, yaw, yaw_unit, strict=scored)
+        yaw = self._heading(motion, size, yaw, yaw_unit if turned else "none", strict=scored)
         velocity = self._velocity(motion, row)
         if reading.lenient:
             self._suspicious(size, center, stamp[row])
@@ -240,8 +250,8 @@ class _Table:
             frame_number=self._columns[found["frame"].name] if "frame" in found else None,
             row=row,
             center=center,
-            size=size,
-            yaw=yaw,
+            size=np.full_like(size, np.nan) if centres else size,
+            yaw=yaw if turned else np.full_like(yaw, np.nan),
             velocity=velocity,
             position_covariance=None if covariance is None else covariance[row],
             score=score[row],
@@ -342,11 +352,11 @@ class _Table:
         joined = [".".join(row) for row in zip(*parts, strict=True)]
         return np.array(joined, dtype=np.str_), names, dict(zip(joined, zip(*parts, strict=True), strict=True))
 
-    def _yaw(self) -> tuple[Floats, str | None]:
-        """Return headings as the table has them, and the unit that is stated for them."""
+    def _yaw(self, otherwise: float | None) -> tuple[Floats, str | None]:
+        """Return headings as the table has them, and the unit that is stated for them; `none` where there are none."""
         quaternion = self._quaternion("q", "yaw") if "yaw" not in self._found else None
         if quaternion is None:
-            return self._numbers("yaw"), self._unit("yaw")
+            return self._numbers("yaw", otherwise), self._unit("yaw") if "yaw" in self._found else "none"
         w, x, y, z = quaternion.T
         return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z), "quaternion"
 
@@ -364,7 +374,9 @@ class _Table:
         long = moves.take(size[moves.start, :2].max(axis=1) > 1.3 * size[moves.start, :2].min(axis=1))
         unposed = motion.pose is None
         moving = unposed and moves.common > _CROWDED
-        found = read_heading(reading, yaw, unit, long, motion.carry, strict=strict and not moving)
+        found = yaw
+        if unit != "none":
+            found = read_heading(reading, yaw, unit, long, motion.carry, strict=strict and not moving)
         if unposed:
             reading.note("pose", "no columns for the pose of the sensor: boxes are assumed to be in the world frame")
             if moving and (
@@ -409,10 +421,8 @@ class _Table:
         }
         have = sorted(set(names.tolist()))
         folded = {name.lower(): name for name in renamed}
-        known = ", ".join(have)
-        for name in renamed:
-            if self._rows and name.lower() not in {one.lower() for one in have}:
-                raise DatasetError(f"--option class.{name}", f"a class of the table: {known}", repr(name))
+        for name in renamed if self._rows else ():
+            self._reading.name(f"class.{name}", have, "a class of the table", name)
         new = {one: renamed[folded[one.lower()]] if one.lower() in folded else one for one in have}
         return np.array([new[name] for name in names.tolist()], dtype=np.str_)
 
@@ -423,7 +433,9 @@ class _Table:
         values = self._columns[column.name]
         if values.dtype.kind == "i":
             return values.astype(np.int64)
-        return np.unique(values.astype(np.str_), return_inverse=True)[1].astype(np.int64)
+        texts = values.astype(np.str_)
+        numbers = np.unique(texts, return_inverse=True)[1].astype(np.int64)
+        return np.where(np.isin(texts, ("", "nan", "-1", "-1.0")), NO_ID, numbers)
 
     def _poses(self, stamp: Ints) -> Floats | None:
         """Return the poses (R, 7) of the table, or those of another one at its stamps."""

@@ -5,7 +5,7 @@ frames, the directions in which boxes move, the classes. Each assumption is a fi
 the option that resolves it. Results: nanoseconds, metres, radians, z up.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -112,6 +112,7 @@ class Reading:
         options: of the dataset.
         lenient: what is wrong becomes a finding; the reader goes on as if nothing were known.
         files: each file with the first of its rows; empty: all rows are those of `path`.
+        named: options `column.*` and `class.*`, with the error where they name nothing in the tables read so far.
     """
 
     path: Path
@@ -119,6 +120,7 @@ class Reading:
     lenient: bool = False
     files: tuple[tuple[Path, int], ...] = ()
     findings: list[Finding] = field(default_factory=list)
+    named: dict[str, DatasetError | None] = field(default_factory=dict)
 
     @property
     def notes(self) -> list[str]:
@@ -138,6 +140,13 @@ class Reading:
             raise DatasetError(path, f"{expected} ({option})" if option else expected, received, line=line)
         where = "" if line is None else f"{path.name}:{line}: "
         self.findings.append(Finding(topic, f"{where}expected {expected}, received {received}", option, wrong=True))
+
+    def name(self, option: str, known: Collection[str], expected: str, name: str) -> None:
+        """Record whether a table has the column or class that an option names."""
+        error = DatasetError(f"--option {option}", f"{expected}: {', '.join(known)}", repr(name))
+        if name in known or name.lower() in map(str.lower, known):
+            self.named[option] = None
+        self.named.setdefault(option, error)
 
     def place(self, row: int) -> tuple[Path, int]:
         """Return the file of a row and its line there, counted from 1."""

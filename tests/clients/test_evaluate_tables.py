@@ -1,0 +1,285 @@
+"""Evaluation of anybody's tables: options, rates of the truth, ids, names of classes and boxes without sizes."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import result_of, run_here
+from optipmb_client.table_files import write_table
+
+FRAMES, CARS = 50, 2
+
+
+def cars(stamps: Any = None, scale: float = 1.0, **changed: Any) -> dict[str, np.ndarray]:
+    """Give two cars that drive side by side, one row each at every stamp; columns may be changed."""
+    seconds = np.repeat(np.arange(FRAMES) / 10 if stamps is None else np.asarray(stamps), CARS)
+    many = len(seconds) // CARS
+    columns: dict[str, Any] = {
+        "t": (seconds * scale).round(6) if scale == 1.0 else np.round(seconds * scale).astype(np.int64),
+        "id": np.tile([1, 2], many),
+        "x": seconds * np.tile([10.0, 5.0], many),
+        "y": np.tile([0.0, 8.0], many),
+        "z": np.full(len(seconds), 0.8),
+        "l": np.full(len(seconds), 4.5),
+        "w": np.full(len(seconds), 1.9),
+        "h": np.full(len(seconds), 1.6),
+        "yaw": np.full(len(seconds), 0.3),
+        "class": np.full(len(seconds), "car"),
+        **changed,
+    }
+    return {name: np.asarray(values) for name, values in columns.items() if values is not None}
+
+
+def take(columns: Mapping[str, np.ndarray], rows: Any) -> dict[str, np.ndarray]:
+    """Give some rows of a table."""
+    return {name: values[rows] for name, values in columns.items()}
+
+
+class Bench:
+    """Runs `optipmb evaluate` on tables in a folder."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder, self._capsys = folder, capsys
+
+    def table(self, name: str, columns: Mapping[str, np.ndarray]) -> Path:
+        """Write a table and give its path."""
+        path = self.folder / name
+        write_table(path, columns)
+        return path
+
+    def run(self, *arguments: object, options: Sequence[str] = ()) -> Any:
+        """Run a command with options of the dataset."""
+        return run_here(self._capsys, *arguments, *(word for one in options for word in ("--option", one)))
+
+    def evaluate(
+        self,
+        truth: Mapping[str, np.ndarray],
+        tracks: Mapping[str, np.ndarray],
+        *arguments: object,
+        detections: Mapping[str, np.ndarray] | None = None,
+        options: Sequence[str] = (),
+    ) -> Any:
+        """Evaluate tracks; detections are those of the two cars unless others are given."""
+        found = detections or cars(id=None, score=np.full(FRAMES * CARS, 0.9))
+        paths = [self.table(f"{name}.csv", one) for name, one in (("d", found), ("truth", truth), ("tracks", tracks))]
+        asked = (paths[0], "--truth", paths[1], "--tracks", paths[2], *arguments)
+        return self.run("evaluate", *asked, "--json", options=options)
+
+
+@pytest.fixture
+def bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Bench:
+    """A folder for tables."""
+    return Bench(tmp_path, capsys)
+
+
+def counts(done: Any, name: str = "car") -> tuple[float | None, int, int, int]:
+    """Give MOTA in percent, truth boxes, false and missed ones of all tracks."""
+    found = result_of(done)["classes"][name]["all"]
+    return None if found["MOTA"] is None else round(100 * found["MOTA"], 3), found["GT"], found["FP"], found["FN"]
+
+
+RIGHT = (100.0, FRAMES * CARS, 0, 0)
+
+
+def test_the_unit_of_time_reaches_truth_and_own_tracks(bench: Bench) -> None:
+    """Microseconds from 0 with `time=us` are tracked and evaluated alike."""
+    data = bench.table("d.csv", cars(scale=1e6, id=None, score=np.full(FRAMES * CARS, 0.9)))
+    truth = bench.table("truth.csv", cars(scale=1e6))
+    out = bench.folder / "t.csv"
+    assert bench.run("track", data, "--out", out, options=["time=us"]).returncode == 0
+    done = bench.run("evaluate", data, "--truth", truth, "--tracks", out, "--json", options=["time=us"])
+    assert counts(done) == RIGHT
+
+
+def test_own_tracks_keep_their_units(bench: Bench) -> None:
+    """Options of degrees and of the order of sizes are those of detections and truth, not of a table of OptiPMB."""
+    other = {"x": cars()["y"], "y": cars()["x"], "yaw": np.full(100, 90.0), "l": cars()["w"], "w": cars()["l"]}
+    data = bench.table("d.csv", cars(id=None, score=np.full(FRAMES * CARS, 90.0), **other))
+    truth = bench.table("truth.csv", cars(**other))
+    out, options = bench.folder / "t.csv", ["yaw=degrees", "sizes=wlh", "score=percent", "class.car=Auto"]
+    assert bench.run("track", data, "--out", out, options=options).returncode == 0
+    asked = ("evaluate", data, "--truth", truth, "--tracks", out, "--json", "--iou", "0.8")
+    assert counts(bench.run(*asked, options=[*options, "time=s"]), "Auto") == RIGHT
+
+
+def test_all_options_reach_tracks_of_others(bench: Bench) -> None:
+    """Degrees and sizes in another order are read in the tracks of another tracker, and said to be."""
+    other = {"yaw": np.full(FRAMES * CARS, 3.0), "l": cars()["w"], "w": cars()["l"]}
+    detections = cars(id=None, score=np.full(FRAMES * CARS, 0.9), **other)
+    options = ["yaw=degrees", "sizes=wlh"]
+    done = bench.evaluate(cars(**other), cars(**other), "--iou", "0.9", detections=detections, options=options)
+    assert counts(done) == RIGHT
+    assert "tracks.csv: no columns for the pose" in done.stderr
+
+
+def test_an_option_applies_to_the_tables_that_have_what_it_names(bench: Bench) -> None:
+    """A class or a column of one table alone is read there; one that is in none is refused, with what there is."""
+    east = cars(east=cars()["x"], x=None)
+    other = cars(**{"class": np.full(FRAMES * CARS, "thing")})
+    assert counts(bench.evaluate(east, cars(), options=["column.x=east"])) == RIGHT
+    assert counts(bench.evaluate(cars(), east, options=["column.x=east"])) == RIGHT
+    assert counts(bench.evaluate(other, cars(), options=["class.thing=car"])) == RIGHT
+    assert counts(bench.evaluate(cars(), other, options=["class.thing=car"])) == RIGHT
+    for option, said in (("class.thing=car", "class of the table: car"), ("column.id=number", "a column: t, id, x")):
+        done = bench.evaluate(cars(), cars(), options=[option])
+        assert done.returncode == 2
+        assert f"--option {option.partition('=')[0]}: expected a" in done.stderr
+        assert said in done.stderr
+    done = bench.run("track", bench.table("d.csv", cars(score=np.full(100, 0.9))), options=["class.thing=car"])
+    assert (done.returncode, "class of the table: car" in done.stderr) == (2, True)
+
+
+def test_the_truth_of_a_folder_is_matched_by_the_names_of_files(bench: Bench) -> None:
+    """Each recording has the truth of the file of its name; a recording without one is named."""
+    for name, shift in (("one", 0.0), ("two", 500.0)):
+        moved = cars(x=cars()["x"] + shift)
+        bench.table(f"d/{name}.csv", {**moved, "score": np.full(FRAMES * CARS, 0.9)})
+        bench.table(f"truth/{name}.csv", moved)
+        bench.table(f"tracks/{name}.csv", moved)
+    asked = ("evaluate", bench.folder / "d", "--truth", bench.folder / "truth", "--tracks", bench.folder / "tracks")
+    assert counts(bench.run(*asked, "--json")) == (100.0, 2 * FRAMES * CARS, 0, 0)
+    bench.table("truth/three.csv", cars())
+    (bench.folder / "truth/two.csv").unlink()
+    done = bench.run(*asked)
+    assert done.returncode == 2
+    assert "sequence two: expected annotations" in done.stderr
+
+
+def test_only_the_frames_of_a_sparse_truth_are_compared(bench: Bench) -> None:
+    """Labels at 2 Hz compare a fifth of the frames, in every figure; a false track counts in these frames alone."""
+    truth = cars(np.arange(0, FRAMES, 5) / 10)
+    done = bench.evaluate(truth, cars())
+    assert counts(done) == (100.0, 20, 0, 0)
+    assert "truth has 10 of 50 frames of d: only these are compared" in done.stderr
+    figures = result_of(done)["classes"]["car"]
+    assert figures["hota_centre"]["all"]["HOTA"] == pytest.approx(1.0)
+    assert figures["gospa"]["all"]["GOSPA"] == pytest.approx(0.0, abs=1e-6)
+    false = cars(y=np.tile([0.0, 80.0], FRAMES))
+    found = bench.evaluate(truth, false)
+    assert counts(found) == (0.0, 20, 10, 10)
+    assert result_of(found)["classes"]["car"]["gospa"]["all"]["missed"] == pytest.approx(np.sqrt(2.0))
+
+
+def test_frames_without_objects_count_where_the_truth_is_dense(bench: Bench) -> None:
+    """A truth of every frame but a few says that these are empty: tracks in them are false; one line says so."""
+    kept = (cars()["t"] < 2.0) | (cars()["t"] > 2.45)
+    done = bench.evaluate(take(cars(), kept), cars())
+    assert counts(done)[1:] == (90, 10, 0)
+    assert "truth has 45 of 50 frames of d: the others count as frames without objects" in done.stderr
+
+
+def test_a_row_with_a_stamp_alone_labels_a_frame(bench: Bench) -> None:
+    """In a sparse truth a row without a box is a labelled frame without objects."""
+    labels = np.isin(np.arange(FRAMES * CARS) // CARS, np.arange(0, FRAMES, 5))
+    blank = (cars()["t"] == 1.0) & labels
+    truth = take(cars(), labels)
+    for name in ("x", "y", "l", "w"):
+        truth[name] = np.where(blank[labels], np.nan, truth[name])
+    assert counts(bench.evaluate(truth, cars()))[1:] == (18, 2, 0)
+
+
+def test_the_nearest_row_of_a_dense_truth_counts_once(bench: Bench) -> None:
+    """Labels and tracks at 50 Hz are compared at the frames, 10 Hz, by the row that is nearest in time."""
+    dense = cars(np.arange(0, 5 * FRAMES - 4) / 50 + 0.004)
+    done = bench.evaluate(dense, dense)
+    assert counts(done) == RIGHT
+    assert "truth.csv: of several rows of an object at a frame the nearest counts" in done.stderr
+    found = result_of(bench.evaluate(dense, cars()))["classes"]["car"]["all"]
+    assert (found["MOTA"], found["GT"]) == (1.0, FRAMES * CARS)
+    assert found["MOTP"] == pytest.approx(0.004 * 7.5)
+
+
+@pytest.mark.parametrize("twice", ["truth", "tracks"])
+def test_an_id_twice_at_a_stamp_is_refused(bench: Bench, twice: str) -> None:
+    """The line of the second row is named."""
+    doubled = take(cars(), np.r_[0:42, 40:100])
+    done = bench.evaluate(*((doubled, cars()) if twice == "truth" else (cars(), doubled)))
+    assert done.returncode == 2
+    assert f"{twice}.csv:44: expected an id once per frame" in done.stderr
+
+
+@pytest.mark.parametrize("none", [-1, np.nan, "", -1.0])
+def test_rows_without_an_id_are_no_track(bench: Bench, none: Any) -> None:
+    """Ids of -1 and empty cells are left out and counted, not followed as one track."""
+    ids = cars()["id"].astype(object)
+    ids[1::2] = none
+    kind: Any = str if none == "" else type(none)
+    done = bench.evaluate(cars(), cars(id=ids.astype(kind)))
+    assert counts(done) == (50.0, 100, 0, 50)
+    assert "tracks.csv: 50 rows with no id, or -1, are left out" in done.stderr
+
+
+def test_no_tracks_are_a_recall_of_zero(bench: Bench) -> None:
+    """A table of tracks with a header alone, and one that has no row of a recording, miss every object."""
+    assert counts(bench.evaluate(cars(), take(cars(), slice(0)))) == (0.0, 100, 0, 100)
+    twice = {name: np.tile(values, 2) for name, values in cars().items()}
+    twice["log"] = np.repeat(["a", "b"], FRAMES * CARS)
+    detections = {**twice, "score": np.full(2 * FRAMES * CARS, 0.9)}
+    done = bench.evaluate(twice, take(twice, twice["log"] == "b"), detections=detections)
+    assert counts(done) == (50.0, 200, 0, 100)
+    assert "tracks.csv: no tracks of a" in done.stderr
+
+
+@pytest.mark.parametrize("bare", ["truth", "tracks"])
+def test_centres_without_sizes_have_the_figures_of_distances(bench: Bench, bare: str) -> None:
+    """Tables without sizes and headings are compared by centres, and one line says so; overlaps are refused."""
+    centres = cars(l=None, w=None, h=None, yaw=None)
+    pair = (centres, cars()) if bare == "truth" else (cars(), centres)
+    done = bench.evaluate(*pair)
+    assert counts(done) == RIGHT
+    assert f"{bare}.csv: no columns for the size or the heading: only centres can be compared" in done.stderr
+    done = bench.evaluate(*pair, "--iou", "0.5")
+    assert done.returncode == 2
+    assert "--iou: expected truth and tracks with sizes" in done.stderr
+
+
+def test_classes_that_mean_the_same_are_one(bench: Bench) -> None:
+    """`vehicle.car` of the truth, `car` of the detections and `Car` of the tracks are compared as `car`."""
+    names = [cars(**{"class": np.full(FRAMES * CARS, name)}) for name in ("vehicle.car", "Car")]
+    done = bench.evaluate(*names)
+    assert counts(done) == RIGHT
+    assert "classes of the truth: vehicle.car as car" in done.stderr
+    assert "classes of the tracks: Car as car" in done.stderr
+    assert counts(bench.evaluate(*names, "--class", "Car")) == RIGHT
+    assert counts(bench.evaluate(*names, "--class", "vehicle.car"), "vehicle.car") == RIGHT
+
+
+def test_classes_that_are_compared_with_nothing_are_named(bench: Bench) -> None:
+    """A van beside a car of the same table is another class; where no class is in both, one line says so."""
+    mixed = cars(**{"class": np.tile(["car", "van"], FRAMES)})
+    done = bench.evaluate(mixed, cars())
+    assert counts(done)[1:] == (50, 50, 0)
+    assert "classes of the truth not compared: van" in done.stderr
+    done = bench.evaluate(cars(**{"class": np.full(FRAMES * CARS, "tree")}), cars())
+    assert counts(done)[0] is None
+    assert "no class is in both: truth has tree, tracks have car" in done.stderr
+
+
+def test_frame_numbers_are_matched(bench: Bench) -> None:
+    """Tables that count frames, of any origin and step, are matched by their numbers with the rate of detections."""
+    frames = np.repeat(371 + 5 * np.arange(FRAMES), CARS)
+    numbered = cars(t=None, frame=frames)
+    detections = {**cars(t=None, id=None, frame=frames), "score": np.full(FRAMES * CARS, 0.9)}
+    assert counts(bench.evaluate(numbered, numbered, detections=detections, options=["rate=50"])) == RIGHT
+
+
+def test_a_shift_of_all_scores_changes_no_figure(bench: Bench) -> None:
+    """No track is deleted at its own threshold: 1e-6 more for every score changes the thresholds alone.
+
+    Two tracks of a score have means that differ in the last place, by their lengths, unless they are rounded.
+    """
+    many = {name: np.concatenate([values] * 6) for name, values in cars().items()}
+    many["id"] = many["id"] + CARS * np.repeat(np.arange(6), FRAMES * CARS)
+    many["y"] = many["y"] + 20.0 * (many["id"] // 3)
+    tracks = take(many, many["t"] < 0.3 * many["id"] + 0.1)
+    reports = []
+    for shift in (0.0, 1e-6, 2e-6):
+        scores = (0.1 * (1 + (tracks["id"] - 1) // 2) + shift).round(6)
+        done = bench.evaluate(take(many, many["id"] > 4), {**tracks, "score": scores})
+        found = result_of(done)["classes"]["car"]
+        assert found["best"].pop("score") == pytest.approx(0.3 + shift, abs=1e-9)
+        reports.append(json.dumps(found))
+    assert len(set(reports)) == 1
