@@ -202,11 +202,8 @@ class _Cases:
         self._centres = world(self.near)
         self._cutoff = default_rules(dataset, "distance", settings.cutoff)
         self._sets = world(self._cutoff)
-        labelled = [one.truth.labelled for one in recordings]
-        self._frames = [
-            len(one.sequence) if mask is None else int(mask.sum())
-            for one, mask in zip(recordings, labelled, strict=True)
-        ]
+        pairs = [(one.sequence, one.truth.labelled) for one in recordings]
+        self._frames = [len(sequence) if mask is None else int(mask.sum()) for sequence, mask in pairs]
         self._order = settings.order
 
     def evaluate(self, threshold: float) -> TrackFigures:
