@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import result_of, run_here
-from optipmb_client.table_files import write_table
+from optipmb_client.table_files import read_table, write_table
 
 FRAMES, CARS = 50, 2
 
@@ -258,12 +258,37 @@ def test_classes_that_are_compared_with_nothing_are_named(bench: Bench) -> None:
     assert "no class is in both: truth has tree, tracks have car" in done.stderr
 
 
-def test_frame_numbers_are_matched(bench: Bench) -> None:
-    """Tables that count frames, of any origin and step, are matched by their numbers with the rate of detections."""
+@pytest.mark.parametrize("stamped", [False, True])
+def test_tables_without_stamps_are_matched_by_the_numbers_of_frames(bench: Bench, *, stamped: bool) -> None:
+    """Numbers of any origin and step, also of a sparse truth, are those of detections with or without stamps."""
     frames = np.repeat(371 + 5 * np.arange(FRAMES), CARS)
     numbered = cars(t=None, frame=frames)
-    detections = {**cars(t=None, id=None, frame=frames), "score": np.full(FRAMES * CARS, 0.9)}
-    assert counts(bench.evaluate(numbered, numbered, detections=detections, options=["rate=50"])) == RIGHT
+    detections = cars(id=None, frame=frames, score=np.full(FRAMES * CARS, 0.9))
+    if not stamped:
+        detections.pop("t")
+    assert counts(bench.evaluate(numbered, numbered, detections=detections)) == RIGHT
+    sparse = take(numbered, np.isin(frames, 371 + 25 * np.arange(10)))
+    assert counts(bench.evaluate(sparse, numbered, detections=detections)) == (100.0, 20, 0, 0)
+    if not stamped:
+        assert counts(bench.evaluate(numbered, numbered, detections=detections, options=["rate=50"])) == RIGHT
+        data, truth = bench.table("d.csv", detections), bench.table("truth.csv", numbered)
+        out = bench.folder / "own.csv"
+        assert bench.run("track", data, "--out", out).returncode == 0
+        assert set(read_table(out)["frame"].tolist()) <= set(frames.tolist())
+        assert counts(bench.run("evaluate", data, "--truth", truth, "--tracks", out, "--json")) == RIGHT
+
+
+def test_own_tracks_of_a_table_in_another_encoding_are_read(bench: Bench) -> None:
+    """Options of encoding and decimals are those of the tables of the user, not of a table of OptiPMB."""
+    paths = []
+    for name, columns in (("d", cars(id=None, score=np.full(FRAMES * CARS, 0.9))), ("truth", cars())):
+        text = bench.table(f"{name}.csv", columns).read_text().replace(",", ";").replace(".", ",")
+        paths.append(bench.folder / f"{name}16.csv")
+        paths[-1].write_text(text, encoding="utf-16")
+    out, options = bench.folder / "own.csv", ["encoding=utf-16", "decimal=,"]
+    assert bench.run("track", paths[0], "--out", out, options=options).returncode == 0
+    asked = ("evaluate", paths[0], "--truth", paths[1], "--tracks", out, "--json")
+    assert counts(bench.run(*asked, options=options)) == RIGHT
 
 
 def test_a_shift_of_all_scores_changes_no_figure(bench: Bench) -> None:

@@ -136,6 +136,11 @@ class KittiSequence:
                 frames |= {int(number) for _, (number, *_) in rows if number.strip().isdigit()}
         return max(frames, default=-1)
 
+    @property
+    def stamps(self) -> Ints:
+        """(F,) nanoseconds, which need no detections."""
+        return np.arange(len(self), dtype=np.int64) * PERIOD_NS
+
     @cached_property
     def poses(self) -> tuple[Pose, ...]:
         """World from sensor, one per frame, both z up."""
