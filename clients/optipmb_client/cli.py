@@ -1,6 +1,7 @@
 """The command `optipmb`. An error is one line on standard error and a status: 2 for what was asked, 1 for the rest."""
 
 import inspect
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -117,6 +118,7 @@ def run(arguments: Sequence[str]) -> int:
     """Run one command line, without the program's name; return the exit status."""
     try:
         words = filled(spread(arguments, MANY), "--ray", RAY_ADDRESS, "local")
+        words = filled(words, "--submission", re.compile(r"\d*\.?\d+"), "default")
         result = app(words or ["--help"], prog_name="optipmb", standalone_mode=False)
         return int(result or 0)
     except _OptionError as error:

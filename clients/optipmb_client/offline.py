@@ -6,6 +6,7 @@ It gives the same bytes as replaying the dataset through the service (`optipmb_c
 import functools
 import itertools
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
@@ -17,6 +18,7 @@ from optipmb_schemas import path_fields
 
 from optipmb import (
     FieldOfView,
+    Frame,
     Modules,
     OptipmbError,
     Parameters,
@@ -37,7 +39,7 @@ from optipmb import (
 )
 from optipmb_client.datasets import DataSequence, DetectionFrame
 from optipmb_client.errors import UsageError
-from optipmb_client.geometry import Floats, Ints
+from optipmb_client.geometry import Bools, Floats, Ints
 from optipmb_client.recording import selected_frames
 from optipmb_client.smoothing import Smoother
 
@@ -137,6 +139,11 @@ class NamedTracks:
         return self.tracks.score
 
     @property
+    def confirmed(self) -> Bools:
+        """(N,)."""
+        return self.tracks.confirmed
+
+    @property
     def existence(self) -> Floats:
         """(N,)."""
         return self.tracks.existence
@@ -179,8 +186,8 @@ class Tracked:
     tracks: dict[int, NamedTracks]
     clouds: int
     detections: int
-    left_out: int
-    """Detections of classes that the profile lacks."""
+    left_out: dict[str, int]
+    """Number of detections of each class that the profile lacks, or that are below its score filter."""
     steps_ns: tuple[int, ...]
     seconds: float
 
@@ -321,20 +328,21 @@ def track_sequence(
         UsageError: A frame holds values that the tracker refuses.
     """
     names = tuple(parameters.classes)
-    for given, result, left_out, took in _steps(parameters, sequence, classes, modules):
+    for given, frame, result, took in _steps(parameters, sequence, classes, modules):
+        left_out = len(given) - len(frame.score)
         yield given, NamedTracks(result.tracks, names, result.paths, result.class_probability), left_out, took
 
 
 def _steps(
     parameters: Parameters, sequence: DataSequence, classes: Sequence[str], modules: Modules | None
-) -> Iterator[tuple[DetectionFrame, StepResult, int, int]]:
-    """Yield what `track_sequence` does, with the whole result of each step."""
+) -> Iterator[tuple[DetectionFrame, Frame, StepResult, int]]:
+    """Yield what `track_sequence` does, with what the tracker was given and the whole result of each step."""
     tracker = Tracker(parameters, modules)
     density = tracker.initial()
     for given in selected_frames(sequence, classes):
         try:
             cloud = given.cloud
-            frame, left_out = make_frame(
+            frame, _ = make_frame(
                 parameters,
                 stamp_ns=given.stamp_ns,
                 labels=given.labels,
@@ -355,7 +363,7 @@ def _steps(
         result = tracker.step(density, frame)
         took = time.perf_counter_ns() - begun
         density = result.density
-        yield given, result, left_out, took
+        yield given, frame, result, took
 
 
 _warm = functools.cache(warm_up)
@@ -381,21 +389,25 @@ def track_whole(
     begun = time.monotonic()
     found: dict[int, NamedTracks] = {}
     steps: list[int] = []
-    clouds = detections = left_out = 0
+    clouds = detections = 0
+    left_out: Counter[str] = Counter()
+    least = np.array([one.score_filter for one in parameters.classes.values()])
     names = tuple(parameters.classes)
     smoother = Smoother(parameters) if smooth else None
-    for frame, result, missed, took in _steps(parameters, sequence, classes, modules):
+    for frame, taken, result, took in _steps(parameters, sequence, classes, modules):
         found[frame.index] = NamedTracks(result.tracks, names, result.paths, result.class_probability)
         if smoother is not None:
             smoother.add(frame.index, result.density, result.tracks)
         steps.append(took)
         clouds += frame.cloud is not None
         detections += len(frame)
-        left_out += missed
+        left_out.update(frame.labels[i] for i in np.delete(frame.label, taken.source).tolist())
+        low = taken.label[taken.score < least[taken.label]].tolist()
+        left_out.update(f"{names[i]} below its score_filter" for i in low)
         on_frame()
     if smoother is not None:
         found = {index: _with_paths(parameters, NamedTracks(one, names)) for index, one in smoother.tracks()}
-    return Tracked(found, clouds, detections, left_out, tuple(steps), time.monotonic() - begun)
+    return Tracked(found, clouds, detections, dict(left_out), tuple(steps), time.monotonic() - begun)
 
 
 def _with_paths(parameters: Parameters, named: NamedTracks) -> NamedTracks:

@@ -156,7 +156,7 @@ def _text(path: Path, options: Mapping[str, str]) -> str:
     if wrong >= 0:
         expected = "text in UTF-8 (--option encoding=latin-1, cp1252 or utf-16-le reads others)"
         raise DatasetError(path, expected, f"byte 0x{data[wrong]:02x}", line=data[:wrong].count(b"\n") + 1)
-    return text.replace("\r\n", "\n")
+    return re.sub(r"\Asep=.(?=\n)", "", text.replace("\r\n", "\n"))
 
 
 def line_of(path: Path, row: int, options: Mapping[str, str] | None = None) -> int:
@@ -165,8 +165,11 @@ def line_of(path: Path, row: int, options: Mapping[str, str] | None = None) -> i
         return row + 1
     lines = _text(path, options or {}).split("\n")
     filled = [number for number, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")]
-    header = not any(map(_is_number, re.split(r"[,;\s]+", lines[filled[0] - 1].strip())))
-    return filled[row + header]
+    return filled[row + _has_names(re.split(r"[,;\s]+", lines[filled[0] - 1].strip()))]
+
+
+def _has_names(fields: list[str]) -> bool:
+    return 2 * sum(map(_is_number, fields)) < len(fields)
 
 
 def _normal_text(path: Path, original: str, kind: str) -> tuple[bytes, str]:
@@ -179,14 +182,13 @@ def _normal_text(path: Path, original: str, kind: str) -> tuple[bytes, str]:
         separator = " "
         head, rest = (re.sub(r"(?m)^ +| +$", "", re.sub(r"[ \t]+", " ", part)) for part in (head, rest))
         comments = [" ".join(line.split()) for line in comments]
-    are_numbers = list(map(_is_number, head.split(separator)))
-    names = [line for line in comments if line.count(separator) == head.count(separator)]
-    if names and any(are_numbers):  # numpy writes the names of the columns into a comment
-        head, rest = names[-1], f"{head}\n{rest}"
-    elif all(are_numbers):
-        raise DatasetError(path, "a first line with the names of the columns", repr(head.strip()[:60]))
     if is_kitti_object(head):
         raise DatasetError(path, "a table", "boxes of a frame as in KITTI's object benchmark: name their folder")
+    if not _has_names(head.split(separator)):  # numpy writes the names of the columns into a comment
+        names = [line for line in comments if line.count(separator) == head.count(separator)]
+        if not names:
+            raise DatasetError(path, "a first line with the names of the columns", repr(head.strip()[:60]))
+        head, rest = names[-1], f"{head}\n{rest}"
     first = rest.split("\n", 1)[0].rstrip()
     more = first.count(separator) - head.count(separator)
     if more == 1 and first.endswith(separator):

@@ -10,10 +10,12 @@ from typing import Final
 from optipmb import Modules, Parameters
 from optipmb_client.bulk import Done, Executor, Failed, Here, Outcome, in_order, run
 from optipmb_client.datasets import DataSequence, Dataset, DatasetArguments
+from optipmb_client.datasets.nuscenes import NuScenesDataset
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.files import remove_unfinished
 from optipmb_client.offline import track_whole
 from optipmb_client.recording import Latency, Results, horizons_for, latency
+from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES
 from optipmb_client.table_files import Columns
 
 __all__ = ["RecordingsFailed", "TrackedSequence", "track"]
@@ -31,8 +33,10 @@ class TrackedSequence:
     frames: int
     clouds: int
     detections: int
-    left_out: int
-    """Detections of classes that the profile lacks."""
+    left_out: dict[str, int]
+    """Number of detections of each class that the profile lacks, or that are below its score filter."""
+    cut: tuple[int, int]
+    """Number of boxes beyond those that a benchmark accepts in a sample, and of the samples."""
     tracks: int
     confirmed: int
     """Tracks that were confirmed in some frame."""
@@ -105,6 +109,9 @@ def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Col
         on_frame=opened.on_frame,
     )
     written = Results(opened.dataset, shared.out, full=shared.full).write(sequence, found.tracks)
+    limited = isinstance(opened.dataset, NuScenesDataset) and isinstance(written, Path)
+    counts = [len(one.id) for one in found.tracks.values()] if limited else []
+    beyond = [count - NUSCENES_MAX_BOXES for count in counts if count > NUSCENES_MAX_BOXES]
     return TrackedSequence(
         name,
         written if isinstance(written, Path) else shared.out,
@@ -112,6 +119,7 @@ def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Col
         found.clouds,
         found.detections,
         found.left_out,
+        (sum(beyond), len(beyond)),
         len({int(number) for one in found.tracks.values() for number in one.id}),
         len({int(number) for one in found.tracks.values() for number in one.id[one.tracks.confirmed]}),
         found.seconds,

@@ -79,7 +79,7 @@ class Header(Message):
     seq: Count = Field(
         description="Counts the messages of this type and stream within the epoch: 0, 1, 2, without gaps."
     )
-    stamp_ns: Stamp = Field(description="Sensor time in nanoseconds, of any origin.")
+    stamp_ns: Stamp = Field(description="Sensor time in nanoseconds, not negative, of any origin.")
 
 
 class SensorMessage(Header):

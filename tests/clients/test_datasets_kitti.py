@@ -208,13 +208,15 @@ def test_the_testing_half_is_read_on_its_own_and_when_asked(tmp_path: Path) -> N
 
 
 def test_class_folders_are_matched_without_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Detections in `CAR/` are of the benchmark's `Car`, which is said; `--classes vehicle` means it, too."""
+    """Detections in `CAR/` are of the benchmark's `Car`; two folders of one class are refused."""
     write_root(tmp_path)
     (tmp_path / "detections/rcnn/Car").rename(tmp_path / "detections/rcnn/CAR")
     done = run_here(capsys, "track", tmp_path, "--out", tmp_path / "out", "--classes", "vehicle")
     assert done.returncode == 0, done.stderr
-    assert "detections/rcnn/CAR: read as detections of Car" in done.stderr
     assert (tmp_path / "out/0000.txt").read_text().split()[2] == "Car"
+    write_root(tmp_path)
+    with pytest.raises(DatasetError, match="several that differ in case"):
+        only_sequence(tmp_path)
 
 
 def test_unknown_datasets_and_options_are_reported() -> None:

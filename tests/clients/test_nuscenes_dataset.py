@@ -107,8 +107,28 @@ def test_class_names_of_others_are_matched_and_what_is_dropped_is_named(
     assert [frame.labels[label] for label in frame.label] == ["car", "car", "car", "pedestrian"]
     done = run_here(capsys, "track", tmp_path, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    assert "read with another class name: Car as car (2), vehicle.car as car (2), CAR as car (2)" in done.stderr
-    assert "lacks are left out: barrier (4), construction_vehicle (2), sign (2)" in done.stderr
+    for name in ("Car", "vehicle.car", "CAR"):
+        assert f"2 boxes of class {name}: read as car" in done.stderr
+    for name, count in {"barrier": 4, "construction_vehicle": 2, "sign": 2}.items():
+        assert f"{count} boxes of class {name}: left out" in done.stderr
+
+
+def test_boxes_beyond_500_in_a_sample_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`track` says how many boxes of how many samples the file has no room for, and what a submission holds."""
+    scene = one_scene(3)
+    write_root(tmp_path, [scene])
+    places = [[10.0 * (i % 30), 10.0 * (i // 30), 1.0] for i in range(620)]
+    boxes = {scene.token(i): [box(scene.token(i), translation=p, detection_score=0.9) for p in places] for i in (0, 1)}
+    write_detections(tmp_path, "made", [scene], boxes)
+    done = run_here(capsys, "track", tmp_path, "--out", tmp_path / "out", "--submission", "--json")
+    counts = [len(one) for one in json.loads((tmp_path / "out/tracking_results.json").read_text())["results"].values()]
+    assert max(counts) == 500
+    beyond, samples = json.loads(done.stdout)["sequences"][0]["cut"]
+    assert beyond > samples > 1
+    assert f"{beyond} boxes in {samples} samples are not written: a sample of nuScenes has 500 at most" in done.stderr
+    assert "all tracks are written, whatever their score" in done.stderr
+    table = run_here(capsys, "track", tmp_path, "--out", tmp_path / "tracks.csv")
+    assert "are not written" not in table.stderr
 
 
 def test_height_of_the_bottom_is_raised_when_the_caller_or_the_file_says_so(tmp_path: Path) -> None:

@@ -5,12 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run_here
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from optipmb_client.camera import synthetic_camera
 from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.geometry import Floats, Ints, Pose, planar_pose, wrap_angle
+from optipmb_client.offline import read_profile, track_whole
 from optipmb_client.results import KittiResultWriter, collect, empty_table, read_kitti_results
+from optipmb_client.results.kitti import SUBMISSION_SCORES
 from real_data import kitti_root
 
 LABELS = ("Car", "Pedestrian", "Cyclist")
@@ -129,6 +132,80 @@ def test_the_same_tracks_give_the_same_bytes(tmp_path: Path) -> None:
         texts.append(write(tmp_path / str(i), [(0, pose, middle)]).read_text())
     assert texts[0] == texts[1]
     assert "-0.000000" not in "".join(texts)
+
+
+def write_cars(root: Path, folder: str = "Car") -> None:
+    """Write a KITTI root with a car ahead, one that leaves the image, a doubtful one, and one that is soon missed."""
+    # x, z, speed per frame, score, number of detections
+    cars = [
+        (0.0, 20.0, 0.0, 0.95, 20),
+        (-4.0, 8.0, -0.3, 0.95, 20),
+        (5.0, 25.0, 0.0, 0.6, 20),
+        (-5.0, 30.0, 0.0, 0.95, 4),
+    ]
+    rows = [(k, x + k * speed, z, score) for x, z, speed, score, count in cars for k in range(count)]
+    lines = [f"{k},2,0,0,9,9,{score},1.5,1.6,4,{x},1.7,{z},3.14,0" for k, x, z, score in rows]
+    calibration = "P2: 700 0 600 0 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
+    for place, text in {
+        "training/calib/0000.txt": calibration + "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n",
+        "training/poses/0000.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n" * 20,
+        f"detections/made/{folder}/0000.txt": "\n".join(lines),
+    }.items():
+        (root / place).parent.mkdir(parents=True, exist_ok=True)
+        (root / place).write_text(text)
+
+
+def submitted(path: Path) -> dict[int, list[list[float]]]:
+    """Return the image box and the score of each row of a file, by id."""
+    rows: dict[int, list[list[float]]] = {}
+    for fields in map(str.split, path.read_text().splitlines()):
+        assert len(fields) == 18
+        rows.setdefault(int(fields[1]), []).append([float(field) for field in (*fields[6:10], fields[17])])
+    return rows
+
+
+@pytest.mark.parametrize("options", [[], ["0.5"], ["0.3"]])
+def test_a_submission_has_confirmed_tracks_of_high_mean_score_in_the_image(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
+) -> None:
+    """Tracks that were confirmed and whose mean score reaches the threshold, with all rows that have an image box."""
+    write_cars(tmp_path)
+    run_here(capsys, "track", tmp_path, "--out", tmp_path / "all")
+    done = run_here(capsys, "track", tmp_path, "--out", tmp_path / "cut", "--submission", *options)
+    assert done.returncode == 0, done.stderr
+    least = float(options[0]) if options else SUBMISSION_SCORES["Car"]
+    assert f"confirmed tracks from these mean scores on, in the image: Car {least:g}" in done.stderr
+    (sequence,) = open_dataset("kitti", tmp_path).sequences(["all"])
+    found = track_whole(read_profile("kitti"), sequence).tracks.values()
+    confirmed = {int(one) for tracks in found for one in tracks.id[tracks.confirmed]}
+    every, cut = submitted(tmp_path / "all/0000.txt"), submitted(tmp_path / "cut/0000.txt")
+    assert len(confirmed) == 3
+    assert len(every) > 3
+    shown = {one: [row for row in rows if any(row[:4])] for one, rows in every.items()}
+    assert any(len(shown[one]) < len(every[one]) for one in confirmed)
+    wanted = {one for one in confirmed if np.mean([row[4] for row in shown[one]]) >= least}
+    assert len(wanted) == (3 if options == ["0.3"] else 2)
+    assert cut == {one: shown[one] for one in every if one in wanted}
+    again = run_here(capsys, "track", tmp_path, "--out", tmp_path / "again", "--submission", *options)
+    assert again.returncode == 0
+    assert (tmp_path / "again/0000.txt").read_bytes() == (tmp_path / "cut/0000.txt").read_bytes()
+
+
+def test_a_submission_is_refused_where_it_would_be_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A table, all columns, a score that is none, another layout and classes that the benchmark lacks are refused."""
+    write_cars(tmp_path / "cars")
+    write_cars(tmp_path / "trucks", "Truck")
+    out = ["--out", tmp_path / "out"]
+    for arguments, says in (
+        ([tmp_path / "cars", "--submission", "--out", tmp_path / "out.csv"], "expected a folder as --out"),
+        ([tmp_path / "cars", "--submission", "--full", *out], "no --full"),
+        ([tmp_path / "cars", "--submission=1.5", *out], "--submission: expected a mean score from 0 to 1"),
+        (["--dataset", "scene", "--submission", *out], "submission"),
+        ([tmp_path / "trucks", "--submission", "--profile", "auto", *out], "received tracks of 'Truck'"),
+    ):
+        done = run_here(capsys, "track", *arguments)
+        assert (done.returncode, says in done.stderr.splitlines()[-1]) == (2, True), done.stderr
+        assert not (tmp_path / "out/0000.txt").exists()
 
 
 LINE = "0 1 Car -1 -1 0 0 0 1 1 1.5 1.6 4 0 1.7 20 0 0.9"

@@ -117,7 +117,7 @@ def test_names_of_columns_are_many(tmp_path: Path) -> None:
         "center.x": plain["x"],
         "center.y": plain["y"],
         "center.z": plain["z"],
-        "boxLength": plain["l"],
+        "dimensions.length": plain["l"],
         "Width (m)": plain["w"],
         "height_m": plain["h"],
         "Heading_rad": plain["yaw"],

@@ -1,6 +1,7 @@
 """`optipmb track`: a dataset through the tracker, in this process; or what a service saved when tracking failed."""
 
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,6 +29,8 @@ from optipmb_client.commands.options import (
 )
 from optipmb_client.errors import TrackingFailed, UsageError
 from optipmb_client.progress import FrameProgress
+from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES
+from optipmb_client.table_files import is_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence as Many
@@ -59,6 +62,10 @@ def track(  # noqa: PLR0913  these are the command's options
     keep_input: Annotated[
         bool, typer.Option("--keep-input", help="Of a bag, with --out FILE.mcap: also copy what is in it.")
     ] = False,
+    submission: Annotated[
+        str | None,
+        typer.Option(metavar="[SCORE]", help="Write a submission; of KITTI confirmed tracks from this mean score on."),
+    ] = None,
     jobs: Annotated[
         int | None,
         typer.Option(min=1, help="Recordings at once; default: one for each processor.", show_default=False),
@@ -85,11 +92,11 @@ def track(  # noqa: PLR0913  these are the command's options
         return
     from optipmb_client import offline, tracking  # noqa: PLC0415  loads the tracker and its compiler
 
-    flags = {"keep_input": keep_input, "fuse": fuse}
-    option = [*(option or ()), *(f"{name}=1" for name, given in flags.items() if given)]
+    flags = {"keep_input": keep_input and 1, "fuse": fuse and 1, "submission": submission}
+    option = [*(option or ()), *(f"{name}={given}" for name, given in flags.items() if given)]
     asked = asked_for(data, dataset, root, detections, option)
     opened, chosen = open_sequences(asked, sequences)
-    _check_out(out, asked.name, chosen)
+    _check_out(out, asked.name, chosen, alone=submission is not None, full=full)
     name = profile or opened.profile
     parameters = offline.profile_for(name, chosen)
     for doubt in offline.doubts(parameters, chosen):
@@ -142,16 +149,23 @@ def _say_result(result: "TrackedSequence") -> None:
 
 def _complain(results: "list[TrackedSequence]", profile: str) -> None:
     """Say what was left out; end with status 1 when there were detections and not one track came of them."""
-    left_out, detections = (sum(getattr(one, name) for one in results) for name in ("left_out", "detections"))
+    detections = sum(one.detections for one in results)
+    left_out: Counter[str] = sum((Counter(one.left_out) for one in results), Counter())
     if left_out:
-        warn(f"{left_out} of {detections} detections are of classes that profile {profile} lacks, and were left out")
+        named = ", ".join(f"{count} {name}" for name, count in sorted(left_out.items()))
+        warn(f"{left_out.total()} of {detections} detections are left out with profile {profile}: {named}")
+    cut, samples = map(sum, zip(*(one.cut for one in results), strict=True))
+    if cut:
+        warn(f"{cut} boxes in {samples} samples are not written: a sample of nuScenes has {NUSCENES_MAX_BOXES} at most")
     if detections and not any(one.tracks for one in results):
         warn(f"no tracks came of {detections} detections: do their scores and rate fit profile {profile}?")
         raise typer.Exit(1)
 
 
-def _check_out(out: Path, dataset: str, chosen: "Many[DataSequence]") -> None:
-    """A bag of tracks is one file, and holds those of one topic of a bag."""
+def _check_out(out: Path, dataset: str, chosen: "Many[DataSequence]", *, alone: bool, full: bool) -> None:
+    """A submission has files of its own; a bag of tracks is one file, and holds those of one topic of a bag."""
+    if alone and (full or is_table(out)):
+        raise UsageError("--submission: expected a folder as --out, and no --full: the files are for the benchmark")
     if out.suffix != ".mcap":
         return
     if dataset != "rosbag":

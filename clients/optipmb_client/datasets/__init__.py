@@ -67,10 +67,10 @@ def open_dataset(
         root: the folder of a dataset on disk, the file of a recording; a generated one takes none.
         detections: the detector whose results are used: its name, its folder or file. None when there is just one, or
             when only truth, poses and clouds are read.
-        options: of the dataset. kitti: `clouds`, `poses`, `split`; nuscenes: `clouds`, `z_bottom`; scene: the fields of
-            `SceneOptions`; mcap: none; rosbag: `points`, `odometry`, `fixed_frame`, `keep_input` and `class.NAME`;
-            table: those of `optipmb_client.datasets.table.OPTIONS`. For table and mcap also `fuse`: the sensors of a
-            recording share a density.
+        options: of the dataset. kitti: `clouds`, `poses`, `split`, `submission`; nuscenes: `clouds`, `z_bottom`,
+            `submission`; scene: the fields of `SceneOptions`; mcap: none; rosbag: `points`, `odometry`, `fixed_frame`,
+            `keep_input` and `class.NAME`; table: those of `optipmb_client.datasets.table.OPTIONS`. For table and mcap
+            also `fuse`: the sensors of a recording share a density.
 
     Raises:
         DatasetError: the name, the root, the detector or an option is not known.
@@ -97,15 +97,16 @@ _Options: TypeAlias = dict[str, float | str]
 
 
 def _kitti(root: Path, detections: str | Path | None, options: _Options) -> Dataset:
-    _known(options, {"clouds", "poses", "split"})
-    text = {name: str(options[name]) for name in ("poses", "split") if name in options}
+    _known(options, {"clouds", "poses", "split", "submission"})
+    text = {name: str(options[name]) for name in ("poses", "split", "submission") if name in options}
     return KittiDataset(root, detections, clouds=bool(options.get("clouds", True)), **text)
 
 
 def _nuscenes(root: Path, detections: str | Path | None, options: _Options) -> Dataset:
-    _known(options, {"clouds", "z_bottom"})
+    _known(options, {"clouds", "z_bottom", "submission"})
     z_bottom = bool(options["z_bottom"]) if "z_bottom" in options else None
-    return NuScenesDataset(root, detections, clouds=bool(options.get("clouds", True)), z_bottom=z_bottom)
+    clouds, submission = bool(options.get("clouds", True)), "submission" in options
+    return NuScenesDataset(root, detections, clouds=clouds, z_bottom=z_bottom, submission=submission)
 
 
 def _mcap(root: Path, _: str | Path | None, options: _Options) -> Dataset:

@@ -11,7 +11,8 @@ is `training` too, for sequences have the same names in both. Only tracking need
 read of a root with several detectors of which none is named, and of one with none.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -38,6 +39,7 @@ from optipmb_client.datasets.kitti_files import (
 from optipmb_client.files import DatasetError, read_points, read_rows
 from optipmb_client.geometry import Floats, Ints, Pose, pose_of, stack_poses, to_world
 from optipmb_client.results import KittiResultWriter, ResultWriter
+from optipmb_client.results.kitti import SUBMISSION_SCORES
 
 PERIOD_NS = 100_000_000
 
@@ -49,6 +51,7 @@ SPLITS = {
 
 _TYPE_CODES = {"Pedestrian": 1, "Car": 2, "Cyclist": 3}
 _CLASSES = tuple(sorted(_TYPE_CODES))
+_OFFICIAL = {name.lower(): name for name in _CLASSES}
 _DONT_CARE = "DontCare"
 _MAX_OCCLUSION = 2
 _SCAN_COLUMNS = 4
@@ -94,8 +97,10 @@ class KittiSequence:
         self.name = name
         self._layout = layout
         folders = [path.parent for path in sorted(layout.detector.glob(f"*/{name}.txt"))] if layout.detector else []
-        self._folders = _by_class(folders)
+        self._folders = {_OFFICIAL.get(folder.name.lower(), folder.name): folder for folder in folders}
         self.labels = tuple(self._folders) if layout.detector else _CLASSES
+        if len(self._folders) < len(folders):
+            raise DatasetError(layout.detector or "", "one folder of a class", "several that differ in case")
         if not self.labels:
             raise DatasetError(f"{layout.detector}/CLASS/{name}.txt", "detections of at least one class", "none")
 
@@ -128,12 +133,11 @@ class KittiSequence:
     def _last_frame(self) -> int:
         """Return the last frame that detections, labels, scans or images have; -1 without any."""
         images = (self._layout.base / "image_02" / self.name).glob("*.*")
-        frames = {*self._scans, *(int(path.stem) for path in images if path.stem.isdigit())}
+        frames = [*self._scans, *(int(path.stem) for path in images if path.stem.isdigit())]
         files = [(folder / f"{self.name}.txt", ",") for folder in self._folders.values()]
         for path, separator in (*files, (self._layout.text("label_02", self.name), None)):
-            if path.is_file():
-                rows = read_rows(path, "frames", separator)
-                frames |= {int(number) for _, (number, *_) in rows if number.strip().isdigit()}
+            rows = read_rows(path, "frames", separator) if path.is_file() else []
+            frames += [int(fields[0]) for _, fields in rows if fields[0].strip().isdigit()]
         return max(frames, default=-1)
 
     @property
@@ -258,6 +262,7 @@ class KittiDataset:
         clouds: bool = True,
         split: str | None = None,
         poses: str | None = None,
+        submission: str | None = None,
     ) -> None:
         halves = [name for name in (split, "training", "testing") if name and (root / name).is_dir()]
         base = root / halves[0] if halves else root
@@ -268,16 +273,13 @@ class KittiDataset:
         if poses not in {None, "none"}:
             raise DatasetError("option poses", "none: the sensor is taken to stand still", repr(poses))
         self._layout = Layout(root, base, _find_detector(root, base, detections), clouds, poses == "none")
-
-    @property
-    def notes(self) -> Iterator[str]:
-        """What was assumed about the data."""
-        layout = self._layout
-        if layout.still:
-            yield "poses=none: the sensor is taken to stand still, and tracks are in its frame"
-        for name, folder in _by_class(sorted(layout.detector.glob("*/")) if layout.detector else ()).items():
-            if name != folder.name:
-                yield f"{folder}: read as detections of {name}"
+        self._submitted = None if submission is None else _thresholds(submission)
+        self.notes = ["poses=none: the sensor is taken to stand still, and tracks are in its frame"] if poses else []
+        if self._submitted is not None:
+            least = ", ".join(f"{name} {score:g}" for name, score in self._submitted.items())
+            self.notes.append(f"submission: confirmed tracks from these mean scores on, in the image: {least}")
+            if missing := sorted({path.stem for path in (base / "calib").glob("*.txt")} - set(self._present())):
+                self.notes.append(f"submission: no detections, so no file, of {' '.join(missing)}")
 
     def sequences(self, names: Sequence[str]) -> list[KittiSequence]:
         """Return the sequences of these names; `train` and `val` are the splits.
@@ -306,7 +308,7 @@ class KittiDataset:
     def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
         """Return a writer of `out/SSSS.txt`."""
         camera = KittiSequence(sequence.name, self._layout).camera
-        return KittiResultWriter(out / f"{sequence.name}.txt", camera)
+        return KittiResultWriter(out / f"{sequence.name}.txt", camera, self._submitted)
 
     def _present(self) -> list[str]:
         calibrated = {path.stem for path in (self._layout.base / "calib").glob("*.txt")}
@@ -319,13 +321,13 @@ class KittiDataset:
         return "calib" if self._layout.detector is None else f"calib and detections ({self._layout.detector})"
 
 
-def _by_class(folders: Iterable[Path]) -> dict[str, Path]:
-    """Return folders of detections by class, with the benchmark's name for a class that it has in other letters."""
-    found: dict[str, Path] = {}
-    for folder in folders:
-        name = next((one for one in _CLASSES if one.lower() == folder.name.lower()), folder.name)
-        found[folder.name if name in found else name] = folder
-    return found
+def _thresholds(submission: str) -> dict[str, float]:
+    """Return the least mean score of a track by class, given one for all or `default`."""
+    if submission == "default":
+        return SUBMISSION_SCORES
+    if not re.fullmatch(r"0?\.\d+|[01](\.0*)?", submission):
+        raise DatasetError("--submission", "a mean score from 0 to 1", repr(submission))
+    return dict.fromkeys(SUBMISSION_SCORES, float(submission))
 
 
 def _find_detector(root: Path, base: Path, detections: str | Path | None) -> Path | None:

@@ -27,13 +27,7 @@ from optipmb_client.files import DatasetError, read_points
 from optipmb_client.geometry import Bools, Floats, Ints, Pose
 from optipmb_client.results import ResultWriter
 from optipmb_client.results.nuscenes import NuScenesResultWriter, join_scenes
-from optipmb_client.results.nuscenes_layout import (
-    NUSCENES_CLASSES,
-    Submission,
-    quaternion_yaw,
-    read_submission,
-    tracked_class,
-)
+from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES, Submission, quaternion_yaw, read_submission
 
 VERSIONS = ("v1.0-trainval", "v1.0-mini", "v1.0-test")
 
@@ -91,17 +85,6 @@ class NuScenesDetections:
         if origin not in ("center", "bottom"):
             raise DatasetError(self.path, 'meta.z_origin "center" or "bottom"', repr(origin))
         return bool(origin == "bottom")
-
-    @property
-    def notes(self) -> Iterator[str]:
-        """Classes of the file that are read as another one, or are left out, with the number of their boxes."""
-        count = self.submission.classes
-        found = {name: tracked_class(name) for name in count}
-        renamed = [f"{name} as {known} ({count[name]})" for name, known in found.items() if known not in {None, name}]
-        if renamed:
-            yield f"{self.path}: boxes are read with another class name: {', '.join(renamed)}"
-        if other := [f"{name} ({count[name]})" for name, known in found.items() if known is None]:
-            yield f"{self.path}: boxes of classes that the tracking benchmark lacks are left out: {', '.join(other)}"
 
     def frame(self, token: str, index: int, stamp_ns: int, cloud: Cloud | None) -> DetectionFrame:
         """Return the detections of one sample.
@@ -278,17 +261,22 @@ class NuScenesDataset:
         *,
         clouds: bool = True,
         z_bottom: bool | None = None,
+        submission: bool = False,
     ) -> None:
         folder = _find_tables(root)
         base = folder.parent
         detector = _find_detector(base, detections)
         found = None if detector is None else NuScenesDetections(detector, z_bottom=z_bottom)
         self._source = _Source(base, NuScenesTables(folder), found, clouds)
+        self._submission = submission
 
     @property
     def notes(self) -> Iterator[str]:
-        """What was assumed about the detections."""
-        return iter(()) if self._source.detections is None else self._source.detections.notes
+        """What was assumed about the detections, and what a submission has."""
+        if self._source.detections is not None:
+            yield from self._source.detections.submission.notes
+        if self._submission:
+            yield "submission: all tracks are written, whatever their score, as AMOTA is over all scores"
 
     @property
     def tables(self) -> NuScenesTables:

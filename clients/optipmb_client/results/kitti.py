@@ -6,15 +6,21 @@ and `occluded` are -1 (unknown). Every track is written, nothing is thresholded:
 than half of has the image box 0 0 0 0 and its 3D box as it is. Nobody can annotate what an image does not show, and the
 KITTI evaluation leaves boxes without height out of account, as it does those that are for more than half in unannotated
 regions. Numbers have six decimals, so the same tracks always give the same bytes.
+
+A submission leaves rows out: the server of the benchmark sweeps no scores, so every false track counts. It has the
+tracks that were confirmed in some frame and whose mean score is at least the threshold of their class, and of these the
+rows with an image box.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Self
 
 import numpy as np
 
 from optipmb_client.camera import Camera, alpha_of, kitti_from_sensor, sensor_from_kitti
+from optipmb_client.class_names import class_like
 from optipmb_client.files import AtomicText, DatasetError, numbers, read_rows
 from optipmb_client.geometry import PoseLike, rotation_of, to_sensor
 from optipmb_client.results.rows import ResultTable, TrackRows
@@ -22,15 +28,27 @@ from optipmb_client.results.rows import ResultTable, TrackRows
 LEAST_SHOWN = 0.5
 """Part of a projected box that must lie in the image for its line to have an image box."""
 
+SUBMISSION_SCORES = {"Car": 0.55, "Cyclist": 0.6, "Pedestrian": 0.55}
+"""Least mean score of a track in a submission, for the highest HOTA of image boxes (`docs/tuning.md`)."""
+
 _FIELDS = 18
 _TYPE = 2
 
 
 class KittiResultWriter:
-    """Writes the tracks of one sequence; use it as a context manager, or call `close` at the end."""
+    """Writes the tracks of one sequence; use it as a context manager, or call `close` at the end.
 
-    def __init__(self, path: Path, camera: Camera) -> None:
+    Args:
+        path: the file.
+        camera: the camera of the image boxes.
+        least: for a submission, the least mean score of a track by class; other classes are refused. None: all tracks.
+    """
+
+    def __init__(self, path: Path, camera: Camera, least: Mapping[str, float] | None = None) -> None:
         self._camera = camera
+        self._least = least
+        self._lines: list[tuple[int, str, float, bool, str]] = []  # id, class, score, whether the image shows it, text
+        self._confirmed: set[int] = set()
         self._file = AtomicText(path)
 
     @property
@@ -43,18 +61,34 @@ class KittiResultWriter:
         center, yaw = to_sensor(
             rotation_of(np.asarray(pose.quaternion)), np.asarray(pose.translation), tracks.center, tracks.yaw
         )
-        image, _ = self._camera.boxes(center, tracks.size, yaw, least_shown=LEAST_SHOWN)
+        image, seen = self._camera.boxes(center, tracks.size, yaw, least_shown=LEAST_SHOWN)
         bottom, hwl, rotation_y = kitti_from_sensor(center, tracks.size, yaw)
         alpha = alpha_of(bottom, rotation_y)
         values = np.column_stack([alpha, image, hwl, bottom, rotation_y, tracks.score])
         # Adding zero turns a rounded -0 into 0, so that equal numbers are written alike.
         values = np.round(values, 6) + 0.0
-        for identity, label, row in zip(tracks.id, tracks.label, values, strict=True):
+        known = tuple(self._least or ())
+        names = [class_like(name, known) or "" if known else name for name in tracks.labels]
+        if other := [tracks.labels[label] for label in tracks.label.tolist() if not names[label]]:
+            raise DatasetError("--submission", f"--classes of {', '.join(known)}", f"tracks of {other[0]!r}")
+        for identity, label, row, shown in zip(tracks.id.tolist(), tracks.label.tolist(), values, seen, strict=True):
             text = " ".join(f"{value:.6f}" for value in row)
-            self._file.write(f"{index} {identity} {tracks.labels[label]} -1 -1 {text}\n")
+            line = f"{index} {identity} {names[label]} -1 -1 {text}\n"
+            self._lines.append((identity, names[label], float(row[-1]), bool(shown), line))
+        if known and tracks.confirmed is not None:
+            self._confirmed.update(tracks.id[np.asarray(tracks.confirmed, dtype=np.bool_)].tolist())
 
     def close(self) -> None:
         """Put the file in its place; a sequence without tracks leaves an empty file."""
+        scores: dict[int, list[float]] = {}
+        for identity, _, score, shown, _ in self._lines:
+            if shown and identity in self._confirmed:
+                scores.setdefault(identity, []).append(score)
+        mean = {identity: fmean(values) for identity, values in scores.items()}
+        for identity, name, _, shown, line in self._lines:
+            if self._least is None or (shown and mean.get(identity, -1.0) >= self._least[name]):
+                self._file.write(line)
+        self._lines.clear()
         self._file.close()
 
     def discard(self) -> None:

@@ -12,7 +12,7 @@ import json
 import math
 from array import array
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -74,6 +74,14 @@ class Submission:
 
     def __contains__(self, token: str) -> bool:
         return token in self.rows
+
+    @property
+    def notes(self) -> Iterator[str]:
+        """Classes of the file that are read as another one, or are left out, with the number of their boxes."""
+        for name, count in self.classes.items():
+            if (known := tracked_class(name)) != name:
+                how = f"read as {known}" if known else "left out, for the tracking benchmark lacks it"
+                yield f"{self.path}: {count} boxes of class {name}: {how}"
 
     def boxes(self, token: str) -> Boxes:
         """Return the boxes of one sample.

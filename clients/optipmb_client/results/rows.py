@@ -52,6 +52,10 @@ class TrackRows(Protocol):
     def existence(self) -> Floats:
         """(N,) probability."""
 
+    @property
+    def confirmed(self) -> Bools | Ints | None:
+        """(N,) flags; None where unknown."""
+
 
 class ResultWriter(Protocol):
     """Takes the tracks of one sequence frame by frame; the file appears complete at `close`, or not at all."""

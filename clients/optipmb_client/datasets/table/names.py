@@ -44,6 +44,10 @@ _TURN: Final = "pose ego sensor_pose ego_pose ego_rotation pose_rotation"
 _BOX_TURN: Final = "q quat quaternion rotation rot orientation"
 
 
+def _extent(axis: str, letter: str, word: str, place: int) -> tuple[str, ...]:
+    return tuple(name for part in (axis, letter, word) for name in _vector(_SIZE, part, place))
+
+
 def _turn(bases: str, part: str, place: int) -> tuple[str, ...]:
     return (*(f"{base}_q{part}" for base in bases.split()), *_vector(bases, part, place))
 
@@ -56,9 +60,9 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
     "x": ("x", "cx", "px", "x_center", "tx", *_vector(_CENTER, "x", 0)),
     "y": ("y", "cy", "py", "y_center", "ty", *_vector(_CENTER, "y", 1)),
     "z": ("z", "cz", "pz", "z_center", "tz", *_vector(_CENTER, "z", 2)),
-    "l": ("l", "length", "box_length", "dx", *_vector(_SIZE, "x", 0), *_vector(_SIZE, "l", 0), "size_length"),
-    "w": ("w", "width", "box_width", "dy", *_vector(_SIZE, "y", 1), *_vector(_SIZE, "w", 1), "size_width"),
-    "h": ("h", "height", "box_height", "dz", *_vector(_SIZE, "z", 2), *_vector(_SIZE, "h", 2), "size_height"),
+    "l": ("l", "length", "box_length", "dx", *_extent("x", "l", "length", 0)),
+    "w": ("w", "width", "box_width", "dy", *_extent("y", "w", "width", 1)),
+    "h": ("h", "height", "box_height", "dz", *_extent("z", "h", "height", 2)),
     "yaw": ("yaw", "heading", "theta", "yaw_angle", "heading_angle", "rotation_z", "rot_z", "rz", "rotation_y", "ry",
             "rot", "rotation", "orientation", "angle"),
     "qw": ("qw", *_vector(_BOX_TURN, "w", 0)),

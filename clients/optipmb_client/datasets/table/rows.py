@@ -161,6 +161,7 @@ def _joined(tables: Sequence[Columns]) -> Columns:
 class _Table:
     def __init__(self, reading: Reading, columns: Columns) -> None:
         self._reading = reading
+        self._time = replace(reading, lenient=False)  # without stamps nothing can be found
         self._columns = columns
         self._rows = len(next(iter(columns.values())))
         chosen = {
@@ -219,7 +220,7 @@ class _Table:
         row = np.flatnonzero(kept)
         center, size, yaw, names = center[row], size[row], yaw[row], names[row]
         kind = np.unique(names, return_inverse=True)[1].astype(np.int64)
-        stated = centres or found["l"].base in {"l", "length", "box_length"} or found["l"].base.endswith("_l")
+        stated = centres or found["l"].base == "l" or found["l"].base.endswith(("_l", "length"))
         size = read_sizes(reading, size, names, stated=stated)
         camera = read_axes(reading, center)
         if camera:
@@ -233,8 +234,8 @@ class _Table:
         motion = _Motion(row, pose, moves)
         yaw = self._heading(motion, size, yaw, yaw_unit if turned else "none", strict=scored)
         velocity = self._velocity(motion, row)
-        self._suspicious(size, center, stamp[row])
         if reading.lenient:
+            self._suspicious(size, center, stamp[row])
             pairs = (role if role == one.name else f"{role} from {one.name}" for role, one in found.items())
             reading.note("columns", f"columns found: {', '.join(pairs)}")
         unused = [name for name in self._columns if name not in {one.name for one in found.values()}]
@@ -271,22 +272,22 @@ class _Table:
             return self._counted(series, rate)
         values = self._columns[column.name]
         missing = np.isnat(values) if values.dtype.kind == "M" else values != values  # noqa: PLR0124  NaN differs from itself
-        reading.first("time", missing, f"a stamp in column {column.name}", values)
+        self._time.first("time", missing, f"a stamp in column {column.name}", values)
         if values.dtype.kind == "M":
             reading.note("time", f"stamps are dates in column {column.name}")
             return values.astype("datetime64[ns]").astype(np.int64), values, column.name
         if values.dtype.kind not in "if":
             bad = np.array([not _is_number(text) or not text for text in values.tolist()], dtype=np.bool_)
             expected = f"stamps in column {column.name}: numbers, or dates as YYYY-MM-DD HH:MM:SS.ffffff"
-            reading.first("time", bad if bad.any() else ~bad, expected, values)
+            self._time.first("time", bad if bad.any() else ~bad, expected, values)
             values = np.zeros(self._rows)
         if rate is not None:
             return np.round(values * (1e9 / rate)).astype(np.int64), values, column.name
         if "nanosec" in found:
             whole = np.asarray(values == np.floor(values))
-            reading.first("time", ~whole, f"whole seconds in column {column.name}", values)
+            self._time.first("time", ~whole, f"whole seconds in column {column.name}", values)
             part = self._numbers("nanosec")
-            reading.first("time", ~np.isfinite(part), f"nanoseconds in column {found['nanosec'].name}", part)
+            self._time.first("time", ~np.isfinite(part), f"nanoseconds in column {found['nanosec'].name}", part)
             reading.note("time", f"stamps are {column.name} + {found['nanosec'].name}")
             stamp = values.astype(np.int64) * 1_000_000_000 + part.astype(np.int64)
             return stamp, stamp, "stamp_ns"
@@ -299,7 +300,7 @@ class _Table:
             expected = "a column of stamps (t, stamp_ns …; --option column.stamp=NAME) or of frames"
             raise DatasetError(reading.path, expected, f"the columns {', '.join(self._columns)}")
         numbers = self._numbers("frame")
-        reading.first("time", ~np.isfinite(numbers), f"the number of a frame in column {column.name}", numbers)
+        self._time.first("time", ~np.isfinite(numbers), f"the number of a frame in column {column.name}", numbers)
         if rate is None:
             step = median_step(numbers, series) or 1.0
             rate = COUNTED_HZ * step
@@ -317,8 +318,9 @@ class _Table:
         reading = self._reading
 
         def crowded(stamps: Ints) -> float:
-            frame = np.unique(np.column_stack([series[row], stamps[row]]), axis=0, return_inverse=True)[1]
-            return float(np.mean(overlapping(frame.astype(np.int64), center[:, :2], size, kind))) if len(row) else 0.0
+            place = np.unique(stamps[row], return_inverse=True)[1]
+            frame = np.unique(series[row] * len(stamps) + place, return_inverse=True)[1].astype(np.int64)
+            return float(np.mean(overlapping(frame, center[:, :2], size, kind))) if len(row) else 0.0
 
         asked = _positive(reading.options, "group", "seconds", zero=True)
         if asked is not None:
