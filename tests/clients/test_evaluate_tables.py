@@ -163,6 +163,15 @@ def test_only_the_frames_of_a_sparse_truth_are_compared(bench: Bench) -> None:
     assert result_of(found)["classes"]["car"]["gospa"]["all"]["missed"] == pytest.approx(np.sqrt(2.0))
 
 
+def test_a_sparse_truth_is_refused_by_tune(bench: Bench) -> None:
+    """Detections between the labels of a sparse truth are not clutter, so `tune` says what to do instead."""
+    data = bench.table("d.csv", cars(id=None, score=np.full(FRAMES * CARS, 0.9)))
+    truth = bench.table("truth.csv", cars(np.arange(0, FRAMES, 5) / 10))
+    done = bench.run("tune", data, "--truth", truth, "--profile", "auto", "--out", bench.folder / "tuned")
+    assert done.returncode == 2
+    assert "expected a truth of every frame to tune by, received labels in 10 of 50" in done.stderr
+
+
 def test_frames_without_objects_count_where_the_truth_is_dense(bench: Bench) -> None:
     """A truth of every frame but a few says that these are empty: tracks in them are false; one line says so."""
     kept = (cars()["t"] < 2.0) | (cars()["t"] > 2.45)

@@ -73,7 +73,11 @@ class ObjectTable:
         boxes, times, frames = self.boxes, self.boxes.frame_stamp, stamps
         if boxes.id is None:
             raise DatasetError(self.path, "a column of ids (id, track_id …; --option column.id=NAME)", "none")
-        if numbers is not None and boxes.frame_number is not None and (boxes.frame_number == boxes.frame_time).all():
+        if (
+            numbers is not None
+            and boxes.frame_number is not None
+            and np.array_equal(boxes.frame_number, boxes.frame_time)
+        ):
             times, frames = boxes.frame_number, numbers
         rows = np.flatnonzero(boxes.frame_key[boxes.row] == key)
         known = boxes.id[rows] != NO_ID
