@@ -85,14 +85,17 @@ def nuscenes(folder: Path) -> None:
 
 
 def argoverse_2(folder: Path) -> None:
-    """Write `detections.feather` with the columns of the dataset."""
+    """Write `detections.feather` with the columns of the dataset, and its poses, 100 m to the left."""
     plain = boxes()
     columns = {"tx_m": plain["x"], "ty_m": plain["y"], "tz_m": plain["z"]}
     columns |= {"length_m": plain["l"], "width_m": plain["w"], "height_m": plain["h"]}
     columns |= {"qw": np.cos(plain["yaw"] / 2), "qx": 0 * plain["x"], "qy": 0 * plain["x"]}
     columns |= {"qz": np.sin(plain["yaw"] / 2), "score": plain["score"], "category": plain["class"]}
     columns["timestamp_ns"] = np.round(plain["t"] * 1e9).astype(np.int64) + 315_966_265_259_836_000
-    write_table(folder / "detections.feather", columns | {"log_id": np.full(3 * FRAMES, "adcf7d18")})
+    write_table(folder / "detections.feather", columns)
+    poses = {"timestamp_ns": columns["timestamp_ns"][::3], "qw": np.ones(FRAMES)}
+    poses |= {name: np.zeros(FRAMES) for name in ("qx", "qy", "qz", "tx_m", "ty_m", "tz_m")}
+    write_table(folder / "city_SE3_egovehicle.feather", poses | {"ty_m": np.full(FRAMES, 100.0)})
 
 
 FILES = {
@@ -126,6 +129,7 @@ def test_every_recipe_gives_tracks(
     tracks = read_table(tmp_path / "tracks.csv")
     assert len(set(tracks["id"].tolist())) == 3
     assert {one.lower() for one in tracks["class"].tolist()} >= {"car", "pedestrian"}
+    assert np.median(tracks["y"]) == pytest.approx(104.0 if name == "Argoverse 2" else 4.0, abs=1.0)
     last = tracks["frame"] == tracks["frame"].max()
     assert np.sort(tracks["x"][last]) == pytest.approx(np.sort(lidar()[-1, :, 0]), abs=0.3)
     assert tracks["z"][last] == pytest.approx(0.8, abs=0.11)

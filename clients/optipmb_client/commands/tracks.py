@@ -13,7 +13,7 @@ from optipmb_client.errors import ServiceUnavailable, UsageError
 from optipmb_client.history import kept_tracks
 from optipmb_client.results.table import TrackColumns
 from optipmb_client.sessions import session_state
-from optipmb_client.table_files import is_table, write_table
+from optipmb_client.table_files import SUFFIXES, write_table
 from optipmb_client.zenoh import Connection
 
 SECOND = 1_000_000_000
@@ -47,7 +47,7 @@ def tracks(  # noqa: PLR0913  these are the command's options
     """Get the tracks of a stream that the service still has: some seconds, or an hour where there is a log."""
     if last is not None and (from_ns or to_ns is not None):
         raise UsageError("--last: not together with --from and --to")
-    if out is not None and not is_table(out):
+    if out is not None and out.suffix.lower() not in SUFFIXES:
         raise UsageError(f"--out: a table such as tracks.csv or tracks.parquet, not {out}")
     with Connection(connect, config=config, timeout=2.0) as connection:
         if last is not None:
