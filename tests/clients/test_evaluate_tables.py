@@ -148,6 +148,19 @@ def test_the_truth_of_a_folder_is_matched_by_the_names_of_files(bench: Bench) ->
     assert "sequence two: expected annotations" in done.stderr
 
 
+def test_recordings_without_rows_are_compared(bench: Bench) -> None:
+    """A truth with a header alone has no objects, detections with a header alone have no frames; both are said."""
+    for name in ("one", "two", "three"):
+        bench.table(f"d/{name}.csv", take(cars(score=np.full(100, 0.9)), slice(0 if name == "three" else 100)))
+        bench.table(f"truth/{name}.csv", take(cars(), slice(0 if name == "two" else 100)))
+        bench.table(f"tracks/{name}.csv", take(cars(), slice(0 if name == "three" else 100)))
+    asked = ("evaluate", bench.folder / "d", "--truth", bench.folder / "truth", "--tracks", bench.folder / "tracks")
+    done = bench.run(*asked, "--json")
+    assert counts(done) == (0.0, 100, 100, 0)
+    assert "two.csv: truth has 0 of 50 frames of two: the others count as frames without objects" in done.stderr
+    assert "three.csv: 100 rows are at no frame of three: left out" in done.stderr
+
+
 def test_only_the_frames_of_a_sparse_truth_are_compared(bench: Bench) -> None:
     """Labels at 2 Hz compare a fifth of the frames, in every figure; a false track counts in these frames alone."""
     truth = cars(np.arange(0, FRAMES, 5) / 10)
