@@ -77,7 +77,7 @@ DatasetName = Annotated[
 ]
 Truth = Annotated[
     Path | None,
-    typer.Option("--truth", help="Table of the true objects, for data that are a table.", show_default=False),
+    typer.Option("--truth", help="Table of the true objects, or a folder of one per recording.", show_default=False),
 ]
 Root = Annotated[Path | None, typer.Option("--root", help="File or folder of the dataset; scenes need none.")]
 Detections = Annotated[
