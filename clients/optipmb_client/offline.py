@@ -401,7 +401,8 @@ def track_whole(
         steps.append(took)
         clouds += frame.cloud is not None
         detections += len(frame)
-        left_out.update(frame.labels[i] for i in np.delete(frame.label, taken.source).tolist())
+        if len(taken.source) < len(frame):
+            left_out.update(frame.labels[i] for i in np.delete(frame.label, taken.source).tolist())
         low = taken.label[taken.score < least[taken.label]].tolist()
         left_out.update(f"{names[i]} below its score_filter" for i in low)
         on_frame()

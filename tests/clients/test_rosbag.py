@@ -211,9 +211,10 @@ def test_the_command_tells_a_bag_from_other_files(
         "detector.boxes",
         20,
     )
+    (tmp_path / "empty").mkdir()
     for arguments, text in (
         (["nothing.mcap"], "nothing.mcap: expected a table"),
-        ([tmp_path], "a bag of ROS 2 (with metadata.yaml"),
+        ([tmp_path / "empty"], "a bag of ROS 2 (with metadata.yaml"),
         ([bag, "--root", bag], "one of them names the data"),
         ([bag, "--option", "speed=1"], "option speed: expected one of fixed_frame, odometry, points"),
         ([bag, "--sequences", "other"], "topics of detections: /detector/boxes"),
