@@ -131,7 +131,7 @@ def class_average(figures: Sequence[ClassFigures]) -> dict[str, dict[str, float 
     found = {}
     for key, parts in (("all", [one.everything for one in known]), ("best", [one.best for one in known])):
         values = [(one.hota.hota, one.hota.deta, one.hota.assa) if one else (0.0, 0.0, 0.0) for one in parts]
-        means = np.mean(values or [[np.nan] * 3], axis=0).tolist()
+        means = np.mean(values or [(np.nan, np.nan, np.nan)], axis=0).tolist()
         found[key] = dict(zip(("HOTA", "DetA", "AssA"), map(plain, means), strict=True))
     return found
 
