@@ -94,15 +94,26 @@ def test_the_unit_of_time_reaches_truth_and_own_tracks(bench: Bench) -> None:
     assert counts(done) == RIGHT
 
 
-def test_own_tracks_keep_their_units(bench: Bench) -> None:
-    """Options of degrees and of the order of sizes are those of detections and truth, not of a table of OptiPMB."""
-    other = {"x": cars()["y"], "y": cars()["x"], "yaw": np.full(100, 90.0), "l": cars()["w"], "w": cars()["l"]}
-    data = bench.table("d.csv", cars(id=None, score=np.full(FRAMES * CARS, 90.0), **other))
-    truth = bench.table("truth.csv", cars(**other))
-    out, options = bench.folder / "t.csv", ["yaw=degrees", "sizes=wlh", "score=percent", "class.car=Auto"]
+NORTH = {"x": cars()["y"], "y": cars()["x"]}
+"""The cars drive along y."""
+
+
+@pytest.mark.parametrize(
+    ("changed", "options"),
+    [
+        ({"yaw": np.full(100, 90.0)}, ["yaw=degrees", "time=s"]),
+        ({"yaw": np.full(100, np.pi / 2), "l": cars()["w"], "w": cars()["l"]}, ["sizes=wlh", "class.car=Auto"]),
+        ({"yaw": np.zeros(100)}, ["heading=y", "score=percent"]),
+    ],
+)
+def test_own_tracks_keep_their_units(bench: Bench, changed: dict[str, np.ndarray], options: list[str]) -> None:
+    """Options of headings and of the order of sizes are those of detections and truth, not of a table of OptiPMB."""
+    scores = np.full(FRAMES * CARS, 90.0 if "score=percent" in options else 0.9)
+    data = bench.table("d.csv", cars(id=None, score=scores, **NORTH, **changed))
+    truth, out = bench.table("truth.csv", cars(**NORTH, **changed)), bench.folder / "t.csv"
     assert bench.run("track", data, "--out", out, options=options).returncode == 0
-    asked = ("evaluate", data, "--truth", truth, "--tracks", out, "--json", "--iou", "0.8")
-    assert counts(bench.run(*asked, options=[*options, "time=s"]), "Auto") == RIGHT
+    done = bench.run("evaluate", data, "--truth", truth, "--tracks", out, "--json", "--iou", "0.8", options=options)
+    assert counts(done, "Auto" if "class.car=Auto" in options else "car") == RIGHT
 
 
 def test_all_options_reach_tracks_of_others(bench: Bench) -> None:
