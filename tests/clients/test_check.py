@@ -76,6 +76,7 @@ INDEX = np.round(np.repeat(np.arange(FRAMES), 2)).astype(np.int64)
         ({"timestamp": -2.0 + INDEX / 10.0}, "stamps are in seconds: frames at 10 Hz"),
         ({"timestamp": INDEX - 30}, None),
         ({"timestamp": INDEX / 10.0 + np.tile([0.0, 0.004], FRAMES)}, "stamps differ by up to 0.004 s within a frame"),
+        ({"timestamp": INDEX * 10**8 + np.tile([0, 80_000_000], FRAMES), "frame": INDEX}, "the first one of its frame"),
         ({"sec": 1_600_000_000 + INDEX // 10, "nanosec": INDEX % 10 * 100_000_000}, "stamps are sec + nanosec"),
         ({"frame": 371 + 5 * INDEX}, "frames of column frame are taken to come at 10 Hz (numbers in steps of 5)"),
     ],

@@ -283,6 +283,8 @@ class _Table:
             values = np.zeros(self._rows)
         if rate is not None:
             return np.round(values * (1e9 / rate)).astype(np.int64), values, column.name
+        if self._rows and "frame" in found and "nanosec" not in found:
+            values = self._first_of_frames(values, series)
         if "nanosec" in found:
             whole = np.asarray(values == np.floor(values))
             self._time.first("time", ~whole, f"whole seconds in column {column.name}", values)
@@ -292,6 +294,20 @@ class _Table:
             stamp = values.astype(np.int64) * 1_000_000_000 + part.astype(np.int64)
             return stamp, stamp, "stamp_ns"
         return read_stamps(reading, values, series, column.unit), values, column.name
+
+    def _first_of_frames(self, values: NDArray[Any], series: Ints) -> NDArray[Any]:
+        """Return the first time of each row's frame, where the frames of the table follow each other in time."""
+        number = np.unique(self._columns[self._found["frame"].name], return_inverse=True)[1]
+        frame = np.unique(series * len(values) + number, return_inverse=True)[1]
+        order = np.lexsort((frame, values, series))
+        begins = np.r_[True, np.diff(frame[order]) != 0]
+        first = np.empty_like(values)
+        first[order] = values[order][np.flatnonzero(begins)[np.cumsum(begins) - 1]]
+        if int(begins.sum()) > frame.max() + 1 or np.array_equal(first, values):
+            return values
+        column = self._found["frame"].name
+        self._reading.note("time", f"stamps differ within a frame: each has the first one of its {column}")
+        return first
 
     def _counted(self, series: Ints, rate: float | None) -> tuple[Ints, NDArray[Any], str]:
         """Return what `_stamps` does from the numbers of frames."""
@@ -326,7 +342,7 @@ class _Table:
         if asked is not None:
             return group_stamps(stamp, series, asked * 1e9) if asked else stamp
         found = frame_starts(stamp, series)
-        if found is not None and crowded(found) < 1.0 - _CROWDED:
+        if found is not None and crowded(found) < 0.5 * _CROWDED:
             apart = (stamp - found).max() / 1e9
             frames = len(np.unique(found))
             text = f"stamps differ by up to {apart:.3g} s within a frame: grouped into {frames} frames"
