@@ -378,6 +378,14 @@ def test_a_table_without_classes_is_of_class_object(tmp_path: Path, capsys: pyte
     ) == {"Auto"}
 
 
+def test_numbers_of_classes_are_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A class is called `1` also where an empty cell turns the numbers of the column into fractions."""
+    data = write(tmp_path / "d.csv", street(), **{"class": np.where(np.arange(2 * FRAMES) == 11, np.nan, 1.0)})
+    assert "d.csv:13: expected class" in refused(capsys, data)
+    assert set(tracked(capsys, data, "--option", "invalid=skip")[0]["class"].tolist()) == {1}
+    assert "car as car" in tracked(capsys, data, "--option", "invalid=skip", "--option", "class.1=car")[1]
+
+
 def test_check_prints_the_findings_without_tracking(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`optipmb check` names units, columns, classes and what is wrong with its option, and ends with status 1 then."""
     right = result_of(run_here(capsys, "check", write(tmp_path / "a.csv", street()), "--json"))

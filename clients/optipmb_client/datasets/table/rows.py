@@ -138,7 +138,8 @@ def read_tables(
         columns = _joined([tables[path] for path in members])
         if not columns:
             raise DatasetError(members[0], "a first line with the names of the columns", "no column")
-        boxes = _Table(reading, columns).read(scored=scored)
+        judged = reading if any(lengths) else replace(reading, findings=[])  # rows that are not there tell nothing
+        boxes = _Table(judged, columns).read(scored=scored)
         found |= {path: boxes.rows(start, end) for path, start, end in zip(members, starts, ends, strict=True)}
     return [(path, found[path]) for path in paths]
 
@@ -431,7 +432,10 @@ class _Table:
             names = np.full(self._rows, NO_CLASS)
             self._reading.note("class", f"no column for class: every box is of class {NO_CLASS}")
         else:
-            names = np.char.strip(self._columns[column.name].astype(np.str_))
+            values = self._columns[column.name]
+            if values.dtype.kind == "f":  # numbers with an empty cell
+                values = np.where(np.isnan(values), "", np.char.mod("%g", values))
+            names = np.char.strip(values.astype(np.str_))
         renamed = {
             key.removeprefix("class."): name for key, name in self._reading.options.items() if key.startswith("class.")
         }
