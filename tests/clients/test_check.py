@@ -383,7 +383,10 @@ def test_numbers_of_classes_are_names(tmp_path: Path, capsys: pytest.CaptureFixt
     data = write(tmp_path / "d.csv", street(), **{"class": np.where(np.arange(2 * FRAMES) == 11, np.nan, 1.0)})
     assert "d.csv:13: expected class" in refused(capsys, data)
     assert set(tracked(capsys, data, "--option", "invalid=skip")[0]["class"].tolist()) == {1}
-    assert "car as car" in tracked(capsys, data, "--option", "invalid=skip", "--option", "class.1=car")[1]
+    options = ("--option", "invalid=skip", "--option", "class.1=car", "--option", "class.2=bus")
+    notes = tracked(capsys, data, *options)[1]
+    assert "car as car" in notes
+    assert "no box is of class 2" in notes
 
 
 def test_check_prints_the_findings_without_tracking(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

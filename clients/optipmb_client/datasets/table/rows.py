@@ -442,7 +442,10 @@ class _Table:
         have = sorted(set(names.tolist()))
         folded = {name.lower(): name for name in renamed}
         for name in renamed if self._rows else ():
-            self._reading.name(f"class.{name}", have, "a class of the table", name)
+            if not name.isdigit():  # classes are counted: a recording need not have all of them
+                self._reading.name(f"class.{name}", have, "a class of the table", name)
+            elif name not in have:
+                self._reading.note("class", f"no box is of class {name}")
         new = {one: renamed[folded[one.lower()]] if one.lower() in folded else one for one in have}
         return np.array([new[name] for name in names.tolist()], dtype=np.str_)
 
