@@ -81,9 +81,11 @@ def _open(data: bytes) -> bytes:
         raise CheckpointError("no checkpoint: its first bytes are others")
     if len(data) > MAX_BYTES:
         raise CheckpointError(f"{len(data)} bytes: more than a checkpoint has")
-    if data[: len(_START)] != _START:
-        received, advice = int.from_bytes(data[len(MAGIC) : len(_START)], "big"), "start the release that wrote it"
-        raise CheckpointError(f"version {received}: expected {VERSION}, the only one of this release; {advice}")
+    version = int.from_bytes(data[len(MAGIC) : len(_START)], "big")
+    if version != VERSION:
+        raise CheckpointError(
+            f"version {version}: expected {VERSION}, the only one of this release; start the release that wrote it"
+        )
     body = data[HEAD:]
     if data[len(_START) : HEAD] != _digest(body):
         raise CheckpointError("torn or changed: the digest is that of other bytes")
