@@ -127,9 +127,7 @@ def _words(parts: Mapping[str, bytes], part: str, width: int) -> Array:
     return np.frombuffer(data, "<f8").astype(np.float64, copy=False)
 
 
-def density_of(
-    stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: tuple[str, ...], *, earlier: bool = False
-) -> Density:
+def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: tuple[str, ...]) -> Density:
     """Return the density of named arrays.
 
     Args:
@@ -137,15 +135,14 @@ def density_of(
         next_id: id of the next new track.
         columns: what `columns_of` or `columns_in` gave.
         labels: names of the classes of the parameters that it belongs to.
-        earlier: whether an earlier version may have stored it; columns that it lacks are then filled with zeros.
 
     Raises:
         DensityError: a column is missing, has another shape or type, or holds values that no density has.
     """
     if not NO_FRAME <= stamp_ns < 2**63:
         raise DensityError("stamp_ns", "a stamp", str(stamp_ns))
-    bernoulli = _rows(Bernoullis, columns, earlier=earlier)
-    poisson = _rows(Poissons, columns, earlier=earlier)
+    bernoulli = _rows(Bernoullis, columns)
+    poisson = _rows(Poissons, columns)
     for part, rows in (("bernoulli", bernoulli), ("poisson", poisson)):
         label = rows.label
         if label.size and not (label.min() >= 0 and label.max() < len(labels)):
@@ -171,7 +168,7 @@ def density_of(
         raise DensityError(f"bernoulli.id[{row}]", f"an id above the one before it, {ids[row - 1]}", str(ids[row]))
     if not 0 <= int(ids.max(initial=0)) < next_id < 2**63:
         raise DensityError("next_id", f"an id above {ids.max(initial=0)}", str(next_id))
-    misses = _rows(Misses, columns, earlier=False) if "misses.looked_ns" in columns else None
+    misses = _rows(Misses, columns) if "misses.looked_ns" in columns else None
     if misses is not None:
         for name, since in (("missed_from_ns", misses.missed_from_ns), ("looked_ns", misses.looked_ns)):
             if since.shape != bernoulli.seen_ns.shape:
@@ -196,13 +193,8 @@ def _class_probability(column: Any, count: int, classes: int) -> NDArray[np.floa
     return np.array(column, order="C")
 
 
-def _rows(kind: type[_Rows], columns: Mapping[str, Any], *, earlier: bool) -> _Rows:
+def _rows(kind: type[_Rows], columns: Mapping[str, Any]) -> _Rows:
     found: dict[str, Any] = {name: columns.get(f"{kind.part}.{name}") for name in kind.described}
-    first = next(iter(found.values()))
-    if earlier and isinstance(first, np.ndarray) and first.ndim:
-        for name, one in kind.described.items():
-            if found[name] is None:
-                found[name] = np.zeros((len(first), *one.shape), one.number)
     rows = kind(**found)
     for name, column in rows.columns():
         if column.dtype.kind == "f" and not np.isfinite(column).all():

@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 import numba
 from numba.core import event
 
-from optipmb.boxing import use_constant_class
-
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -56,7 +54,6 @@ class _FirstCompilation(event.Listener):
         """It has compiled the function."""
 
 
-use_constant_class()
 event.register("numba:compile", _FirstCompilation())  # type: ignore[no-untyped-call]  # numba has no types
 
 

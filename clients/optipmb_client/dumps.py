@@ -82,7 +82,9 @@ def replay(dump: Dump, tracker: Callable[[optipmb.Parameters], _Steps] = optipmb
     """
     try:
         parameters = optipmb.parse_parameters(dump.parameters)
-        density = optipmb.density_of(dump.stamp_ns, dump.next_id, dump.density, parameters.labels)
+        labels = parameters.labels
+        columns = optipmb.columns_in(dump.density, len(labels))
+        density = optipmb.density_of(dump.stamp_ns, dump.next_id, columns, labels)
     except optipmb.OptipmbError as error:
         raise UsageError(f"dump of {dump.stream}: {error}") from error
     steps = tracker(parameters)

@@ -7,7 +7,6 @@
 
 from optipmb_schemas.arrays import Array
 from optipmb_schemas.codec import MESSAGES, decode, encoding_of
-from optipmb_schemas.columns import pack_columns, read_columns
 from optipmb_schemas.control import (
     DrainRequest,
     MemberSummary,
@@ -82,7 +81,5 @@ __all__ = [
     "encode_json",
     "encoded",
     "encoding_of",
-    "pack_columns",
     "path_fields",
-    "read_columns",
 ]

@@ -5,23 +5,19 @@ which software it was. It is one msgpack map, and does not depend on the service
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgpack
 
 from optipmb_schemas.codec import decode
-from optipmb_schemas.columns import pack_columns, read_columns
 from optipmb_schemas.encoder import encode
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import Limits
 from optipmb_schemas.messages import Detections, Points
 from optipmb_schemas.structure import check_msgpack
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 FORMAT: Final = "optipmb-dump"
-VERSION: Final = 2
+VERSION: Final = 1
 MAX_BYTES: Final = 2**30
 
 STORED: Final = Limits(
@@ -59,7 +55,7 @@ class Dump:
         parameters: the profile, as nested maps.
         stamp_ns: stamp of the density; -1 before the first frame.
         next_id: its next track id.
-        density: its arrays by name.
+        density: its arrays as bytes, one string for each part.
         frames: the last frames in the order of processing; the error was raised by one of them.
     """
 
@@ -70,7 +66,7 @@ class Dump:
     parameters: dict[str, Any]
     stamp_ns: int
     next_id: int
-    density: "dict[str, NDArray[Any]]"
+    density: dict[str, bytes]
     frames: tuple[DumpedFrame, ...]
 
 
@@ -79,8 +75,7 @@ def encode_dump(dump: Dump) -> bytes:
     fields = {
         "format": FORMAT,
         "version": VERSION,
-        **{name: value for name, value in vars(dump).items() if name not in {"density", "frames"}},
-        "density": pack_columns(dump.density),
+        **{name: value for name, value in vars(dump).items() if name != "frames"},
         "frames": [
             {
                 "detections": encode(frame.detections),
@@ -98,7 +93,7 @@ def decode_dump(payload: bytes) -> Dump:
     """Return the dump that bytes hold.
 
     Raises:
-        MessageError: they hold none, or one of a later version.
+        MessageError: they hold none, or one of another version.
     """
     check_msgpack(payload, STORED)
     try:
@@ -111,18 +106,14 @@ def decode_dump(payload: bytes) -> Dump:
     if version != VERSION:
         raise MessageError("unsupported_version", "version", str(VERSION), str(version)[:20])
     kinds: dict[str, type] = {"stream": str, "error": str, "trace": str, "versions": dict, "parameters": dict}
-    kinds |= {"stamp_ns": int, "next_id": int, "frames": list}
+    kinds |= {"density": dict, "stamp_ns": int, "next_id": int, "frames": list}
     for name, kind in kinds.items():
         if not isinstance(fields.get(name), kind):
             raise invalid(name, f"a value of type {kind.__name__}", fields.get(name))
     frames = tuple(_frame(index, value) for index, value in enumerate(fields["frames"]))
-    try:
-        density = read_columns(fields.get("density"))
-    except MessageError as error:
-        raise error.under("density") from None
     versions = {str(name): str(value) for name, value in fields["versions"].items()}
     plain = {name: fields[name] for name in kinds if name not in {"frames", "versions"}}
-    return Dump(**plain, versions=versions, density=density, frames=frames)
+    return Dump(**plain, versions=versions, frames=frames)
 
 
 def _frame(index: int, value: object) -> DumpedFrame:

@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Container
 from dataclasses import dataclass
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 __all__ = ["ANSWER_S", "CacheQueries", "LateJoin"]
 
@@ -37,35 +37,7 @@ MAX_WAITING_BYTES: Final = 1 << 25
 MAX_SOURCES: Final = 16_384
 """Most publishers that are known; the cache of one that is forgotten is asked once more."""
 
-
-class _Id(Protocol):
-    @property
-    def zid(self) -> object: ...
-    @property
-    def eid(self) -> int: ...
-
-
-class _Info(Protocol):
-    @property
-    def source_id(self) -> _Id: ...
-    @property
-    def source_sn(self) -> int: ...
-
-
-class _Bytes(Protocol):
-    def __len__(self) -> int: ...
-
-
-class _Sample(Protocol):
-    @property
-    def key_expr(self) -> object: ...
-    @property
-    def payload(self) -> _Bytes: ...
-    @property
-    def source_info(self) -> _Info | None: ...
-
-
-_S = TypeVar("_S", bound=_Sample)
+_S = TypeVar("_S", bound=Any)  # as Zenoh's samples
 _Source = tuple[str, int]
 
 

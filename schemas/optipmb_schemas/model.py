@@ -36,7 +36,7 @@ class Message(BaseModel):
         try:
             super().__init__(**fields)
         except ValidationError as error:
-            raise _first(error) from None
+            raise first_error(error) from None
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -132,7 +132,7 @@ def _parts(annotation: Any) -> list[Any]:
     return [annotation]
 
 
-def _first(error: ValidationError) -> MessageError:
+def first_error(error: ValidationError) -> MessageError:
     """Return the first of pydantic's errors as ours."""
     first = error.errors(include_url=False)[0]
     path = path_of(first["loc"])

@@ -3,8 +3,6 @@
 import sys
 
 from optipmb_service.app import health_command
-from optipmb_service.app.collector import collector_paused
-from optipmb_service.app.optional import without
 
 
 def main() -> None:
@@ -12,9 +10,7 @@ def main() -> None:
     if sys.argv[1:2] == ["health"]:
         sys.exit(health_command.main(sys.argv[2:]))
     try:
-        # structlog imports rich where typer has brought it: a twentieth of the start, for colours that no log line has.
-        with collector_paused(), without("rich"):
-            from optipmb_service.app import cli  # noqa: PLC0415 - a second that `health` can do without
+        from optipmb_service.app import cli  # noqa: PLC0415 - a second that `health` can do without
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("optipmb"):
             raise

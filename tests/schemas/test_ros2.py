@@ -10,9 +10,9 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from optipmb_schemas import MessageError
+from optipmb_schemas import MessageError, Tracks
 from optipmb_schemas.ros2.arrays import CLOUD, DETECTIONS, boxes_of, points_of
-from optipmb_schemas.ros2.tracks import HORIZONS, TOPICS, TrackColumns, messages
+from optipmb_schemas.ros2.tracks import HORIZONS, TOPICS, messages
 from optipmb_schemas.ros2.transforms import TransformError, Transforms
 from optipmb_schemas.ros2.types import own_types
 
@@ -350,7 +350,7 @@ def test_predicted_objects_have_the_paths_of_tracks(more: tuple[float, ...]) -> 
         path_position=np.stack([np.c_[1 + at, 2 * np.ones(len(at))], np.c_[5 - at, at]]),
         path_yaw=np.stack([0.25 + at / 8, at / 4]).astype("f4"),
     )
-    made = dict(messages(own_types(), cast("TrackColumns", tracks), 5, "map", "a/b/c"))
+    made = dict(messages(own_types(), cast("Tracks", tracks), 5, "map", "a/b/c"))
     paths = [one.kinematics.predicted_paths for one in made["/predicted"].objects]
     for row, (path,) in enumerate(paths):
         assert (path.time_step.sec, path.time_step.nanosec, path.confidence) == (0, 500_000_000, 1.0)
@@ -362,7 +362,7 @@ def test_predicted_objects_have_the_paths_of_tracks(more: tuple[float, ...]) -> 
             assert 2 * math.atan2(pose.orientation.z, pose.orientation.w) == pytest.approx(yaw)
     for lacking in (None, at[1:]):
         tracks.horizons = lacking
-        made = dict(messages(own_types(), cast("TrackColumns", tracks), 5, "map", "a/b/c"))
+        made = dict(messages(own_types(), cast("Tracks", tracks), 5, "map", "a/b/c"))
         assert [one.kinematics.predicted_paths for one in made["/predicted"].objects] == [[], []]
 
 
@@ -382,7 +382,7 @@ def test_objects_have_the_probabilities_of_their_classes() -> None:
     )
 
     def classes() -> list[list[tuple[int, float]]]:
-        made = dict(messages(own_types(), cast("TrackColumns", tracks), 5, "map", "a/b/c"))
+        made = dict(messages(own_types(), cast("Tracks", tracks), 5, "map", "a/b/c"))
         return [[(one.label, one.probability) for one in row.classification] for row in made[""].objects]
 
     assert classes() == [[(1, 1.0)], [(2, 1.0)]]

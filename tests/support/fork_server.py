@@ -19,8 +19,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from optipmb_service.app.optional import without
-
 LARGEST = 1 << 18
 FILES = 3
 SERVICE = ("optipmb_service.app.cli", "optipmb_service.app.worker", "optipmb_service.http.page")
@@ -29,13 +27,12 @@ TASKS = Path("/proc/self/task")
 
 def load() -> None:
     """Import what a service imports until it is ready, as it does, and the client; load the kernels."""
-    with without("rich"):
-        for name in SERVICE:
-            import_module(name)
+    for name in SERVICE:
+        import_module(name)
     with suppress(ModuleNotFoundError):  # an extra that not all tests need
         import_module("optipmb_service.cluster.jetstream")
     import_module("optipmb_service.app.kernels").warm_up()
-    import_module("optipmb_client.cli")  # after the service, which does without rich
+    import_module("optipmb_client.cli")
     gc.collect()
     gc.freeze()
 

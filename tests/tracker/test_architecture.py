@@ -19,7 +19,6 @@ ALLOWED = {
     "tomllib", "types", "typing",
 }  # fmt: skip
 EXCEPTIONS = {
-    "boxing": {"llvmlite"},  # to emit the code of a conversion
     "compiled": {"logging"},  # to say why a first frame takes a minute
     "warm": {"gc"},  # to collect less often while a compiler fills the memory
     "online": {"pandas", "pyarrow"},  # to give tracks in the tables that users ask for
@@ -51,7 +50,7 @@ def own_imports(tree: ast.Module) -> set[str]:
 
 @pytest.mark.parametrize("name", MODULES)
 def test_a_module_imports_computation_only(name: str) -> None:
-    """No service, client, schemas, network, clock or randomness; logging and llvmlite only for compiling."""
+    """No service, client, schemas, network, clock or randomness; logging only for compiling."""
     assert imports(MODULES[name]) <= ALLOWED | EXCEPTIONS.get(name, set())
 
 

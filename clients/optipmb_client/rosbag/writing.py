@@ -23,7 +23,7 @@ from optipmb_client.rosbag.reading import Bag, Raw
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from optipmb_client.results.full import FullRows
+    from optipmb_schemas import Tracks
 
 __all__ = ["BagResultWriter"]
 
@@ -75,7 +75,7 @@ class BagResultWriter:
     def add(self, index: int, pose: PoseLike, tracks: TrackRows) -> None:
         """Write the tracks (world frame) of frame `index`; `pose` is not needed, tf tells it."""
         del pose
-        full = cast("FullRows", tracks)  # what tracks and what replays gives all columns
+        full = cast("Tracks", tracks)  # what tracks and what replays gives all columns
         frame = self._plan.frames[index]
         self._copy_until(frame.received_ns)
         world, types, stamp_ns = self._plan.world, self._types, frame.stamp_ns

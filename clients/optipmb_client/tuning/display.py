@@ -11,12 +11,14 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from optipmb_client.tuning.watch import Watch
+
 __all__ = ["TrialDisplay"]
 
 PLAIN_PERIOD_S = 10.0
 
 
-class TrialDisplay:
+class TrialDisplay(Watch):
     """Shows the trials of one class after the other; trials that an earlier session has done take no time."""
 
     def __init__(self, *, terminal: bool | None = None) -> None:

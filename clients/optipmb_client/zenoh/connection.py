@@ -6,7 +6,7 @@ import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import zenoh
 from optipmb_schemas import Detections, Keys, Points, Topic, encoding_of
@@ -31,10 +31,6 @@ CACHED = 2
 """Keys that a publisher with a cache declares, and a subscriber that asks caches for what was lost."""
 
 _Opened = TypeVar("_Opened", Sender, Subscription)
-
-
-class _ZenohSession(Protocol):
-    def close(self) -> object: ...
 
 
 class Connection:
@@ -196,7 +192,7 @@ def _usable() -> Iterator[None]:
         raise ConnectionFailed(f"the connection cannot be used: {reason}") from error
 
 
-def _close_all(opened: weakref.WeakSet[Sender | Subscription], session: _ZenohSession) -> None:
+def _close_all(opened: weakref.WeakSet[Sender | Subscription], session: Any) -> None:
     for one in tuple(opened):
         one.close()
     with contextlib.suppress(zenoh.ZError):

@@ -1,6 +1,6 @@
 """Publishers: what is sent with a cache for those who lost it or come late, and what is sent at a lower priority."""
 
-from typing import Protocol, cast
+from typing import Any
 
 import zenoh
 import zenoh.ext
@@ -13,33 +13,18 @@ __all__ = ["HEARTBEAT_S", "Sender", "cached_sender", "plain_sender"]
 HEARTBEAT_S = 1.0  # how long the loss of a newest message may stay unnoticed, when no other one follows
 
 
-# The parts of Zenoh's objects used here, typed: its own stubs leave some of them untyped, and one wrongly typed.
-class _ZenohPublisher(Protocol):
-    def put(self, payload: bytes) -> object: ...
-
-
-class _ZenohMatchingStatus(Protocol):
-    @property
-    def matching(self) -> bool: ...
-
-
-class _ZenohMatching(Protocol):
-    @property
-    def matching_status(self) -> _ZenohMatchingStatus: ...
-
-
 class Sender:
     """A publisher of encoded messages on one key."""
 
-    def __init__(self, publisher: _ZenohPublisher, matching: _ZenohMatching | None) -> None:
-        self._publisher: _ZenohPublisher | None = publisher
+    def __init__(self, publisher: Any, matching: Any) -> None:
+        self._publisher = publisher  # Any: Zenoh leaves parts of these untyped, and one wrongly typed
         self._matching = matching
 
     @property
     def wanted(self) -> bool:
         """Whether somebody is known to listen. Always True with a cache: that also serves those who come later."""
         matching = self._matching  # `close` may take it away meanwhile
-        return matching is None or matching.matching_status.matching
+        return matching is None or bool(matching.matching_status.matching)
 
     def pack(self, message: Message) -> bytes:
         """Return a message as it is sent."""
@@ -84,7 +69,7 @@ def plain_sender(session: zenoh.Session, key: str, encoding: str, cache: int) ->
         congestion_control=zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.DATA_LOW,
     )
-    return Sender(publisher, cast("_ZenohMatching", publisher))  # the stub calls the status a bool
+    return Sender(publisher, publisher)
 
 
 def _with_cache(

@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Protocol, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import zenoh
 import zenoh.ext
@@ -17,13 +17,6 @@ __all__ = ["Subscription", "Subscriptions", "subscribe"]
 
 CLOSE_S = 5.0  # how long closing waits for what has come to be moved
 _Result = TypeVar("_Result")
-
-
-# What is used of Zenoh's subscriber, typed: its own stubs leave parts untyped.
-class _ZenohSubscriber(Protocol):
-    def undeclare(self) -> object: ...
-
-
 _Handler: TypeAlias = "tuple[zenoh.handlers.Callback[zenoh.Sample], None]"  # the class cannot be subscripted
 
 
@@ -36,7 +29,7 @@ class Subscription:
         session: For the caches of publishers that were there before the subscription.
     """
 
-    def __init__(self, declare: Callable[[_Handler], _ZenohSubscriber], inbox: Inbox, session: zenoh.Session) -> None:
+    def __init__(self, declare: Callable[[_Handler], Any], inbox: Inbox, session: zenoh.Session) -> None:
         self._inbox = inbox
         self._session = session
         self._queries: CacheQueries[zenoh.Sample] = CacheQueries(self._ask)
@@ -118,7 +111,7 @@ def subscribe(session: zenoh.Session, pattern: str, inbox: Inbox) -> Subscriptio
     heartbeat of a publisher: for it a late subscriber is one that has lost everything so far.)
     """
 
-    def declare(handler: _Handler) -> _ZenohSubscriber:
+    def declare(handler: _Handler) -> Any:
         return zenoh.ext.declare_advanced_subscriber(
             session,
             pattern,

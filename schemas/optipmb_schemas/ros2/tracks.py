@@ -15,15 +15,16 @@ All in the world frame, under the name that the caller gives it. What the messag
 import hashlib
 import math
 from collections.abc import Iterator
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from optipmb_schemas.messages import Tracks
 from optipmb_schemas.ros2.definitions import CLASS_NAMES, UNKNOWN_CLASS
 from optipmb_schemas.ros2.types import Types
 
-__all__ = ["HORIZONS", "TOPICS", "TRACKED", "TrackColumns", "has_paths", "messages"]
+__all__ = ["HORIZONS", "TOPICS", "TRACKED", "has_paths", "messages"]
 
 TRACKED: Final = "autoware_perception_msgs/msg/TrackedObjects"
 DETECTION_ARRAY: Final = "vision_msgs/msg/Detection3DArray"
@@ -66,71 +67,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-class TrackColumns(Protocol):
-    """The N tracks of one frame in the world frame; `optipmb_schemas.Tracks` is of this shape."""
-
-    @property
-    def id(self) -> Ints:
-        """(N,)."""
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Class names."""
-
-    @property
-    def label(self) -> Ints:
-        """(N,) index into labels."""
-
-    @property
-    def center(self) -> Floats:
-        """(N, 3) m."""
-
-    @property
-    def size(self) -> Floats:
-        """(N, 3) length, width, height, m."""
-
-    @property
-    def yaw(self) -> Floats:
-        """(N,) rad."""
-
-    @property
-    def velocity(self) -> Floats:
-        """(N, 2) m/s."""
-
-    @property
-    def yaw_rate(self) -> Floats:
-        """(N,) rad/s."""
-
-    @property
-    def acceleration(self) -> Floats:
-        """(N,) m/s^2 along the heading."""
-
-    @property
-    def existence(self) -> Floats:
-        """(N,) probability."""
-
-    @property
-    def score(self) -> Floats:
-        """(N,) in [0, 1]."""
-
-    @property
-    def covariance(self) -> Floats:
-        """(N, 6, 6) of x, y, speed, heading, turn rate, acceleration."""
-
-    @property
-    def horizons(self) -> Floats | None:
-        """(H,) s; None: without paths."""
-
-    @property
-    def path_position(self) -> Floats | None:
-        """(N, H, 2) m."""
-
-    @property
-    def path_yaw(self) -> NDArray[np.float32] | None:
-        """(N, H) rad."""
-
-
-def messages(types: Types, tracks: TrackColumns, stamp_ns: int, frame: str, stream: str) -> Iterator[tuple[str, Any]]:
+def messages(types: Types, tracks: Tracks, stamp_ns: int, frame: str, stream: str) -> Iterator[tuple[str, Any]]:
     """Yield the messages of one frame with what their topics' names end with (`TOPICS`).
 
     Args:
@@ -149,7 +86,7 @@ def messages(types: Types, tracks: TrackColumns, stamp_ns: int, frame: str, stre
     yield "/predicted", types.new(PREDICTED, header=header, objects=[objects.predicted(row) for row in rows])
 
 
-def has_paths(tracks: TrackColumns) -> bool:
+def has_paths(tracks: Tracks) -> bool:
     """Tell whether the tracks have paths at all the `HORIZONS`; they may have them at others too."""
     return tracks.horizons is not None and set(HORIZONS) <= set(tracks.horizons.tolist())
 
@@ -157,7 +94,7 @@ def has_paths(tracks: TrackColumns) -> bool:
 class _Objects:
     """Makes Autoware's objects from the rows of tracks."""
 
-    def __init__(self, types: Types, tracks: TrackColumns, stream: str) -> None:
+    def __init__(self, types: Types, tracks: Tracks, stream: str) -> None:
         self._types = types
         self._tracks = tracks
         self._key = hashlib.blake2b(stream.encode(), digest_size=8).digest()
@@ -166,7 +103,7 @@ class _Objects:
         self._at = np.flatnonzero(np.isin(at, HORIZONS)) if has_paths(tracks) else None
         self._package = TRACKED.rpartition("/")[0]
         confidence = getattr(tracks, "heading_confidence", None)
-        self._pi: Floats | None = getattr(tracks, "class_probability", None)
+        self._pi = getattr(tracks, "class_probability", None)
         self._faces = np.ones(len(tracks.id), dtype=np.bool_) if confidence is None else confidence >= FACES
 
     def tracked(self, row: int) -> Any:
@@ -267,7 +204,7 @@ class _Objects:
         return pose, twist, acceleration
 
 
-def detection_array(types: Types, tracks: TrackColumns, stamp_ns: int, frame: str) -> Any:
+def detection_array(types: Types, tracks: Tracks, stamp_ns: int, frame: str) -> Any:
     """Return the tracks of one frame as `vision_msgs/Detection3DArray`: id as text, score, class by name."""
     header = _header(types, stamp_ns, frame)
     detections = []
@@ -292,7 +229,7 @@ def detection_array(types: Types, tracks: TrackColumns, stamp_ns: int, frame: st
     return types.new(DETECTION_ARRAY, header=header, detections=detections)
 
 
-def markers(types: Types, tracks: TrackColumns, stamp_ns: int, frame: str) -> Any:
+def markers(types: Types, tracks: Tracks, stamp_ns: int, frame: str) -> Any:
     """Return the tracks of one frame as markers: boxes, the way of the next second as arrows, class, id and existence.
 
     The first marker takes away all of before, so that each message shows its own frame and no other.

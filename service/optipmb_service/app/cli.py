@@ -20,7 +20,6 @@ from typer.main import get_command
 
 from optipmb_service import __version__
 from optipmb_service.app import health_command, nats, router
-from optipmb_service.app.collector import collector_paused
 from optipmb_service.app.ending import leave_or_restart
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import logs
@@ -282,8 +281,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run_one(settings: Settings) -> int:
     # It takes the tracker along: 150 MB and seconds.
-    with collector_paused():
-        from optipmb_service.app.worker import run_alone  # noqa: PLC0415 - neither a parent nor a question needs it
+    from optipmb_service.app.worker import run_alone  # noqa: PLC0415 - neither a parent nor a question needs it
 
     return run_alone(settings)
 

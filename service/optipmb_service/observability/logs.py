@@ -40,7 +40,8 @@ EVENTS: Final = {
     "stream_degraded": "A message took `took_s` of processor time; its stream is refused for `refused_s`.",
     "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` elsewhere, lacking `memory`,"
     " `evicted` for a stream of another site, or `superseded` by another instance.",
-    "checkpoint_torn": "A checkpoint cannot be read: it is set aside, the one before it is used.",
+    "checkpoint_torn": "A checkpoint cannot be read, for `reason`: it is set aside, the one before it is used."
+    " Where `reason` names another version, start the release that wrote it.",
     "checkpoint_refused": "A checkpoint was not written: another instance has taken the stream over.",
     "checkpoints_expired": "Checkpoints older than `keep_days` were deleted.",
     "checkpoint_failed": "The checkpoint of one stream cannot be made: a bug, report it."

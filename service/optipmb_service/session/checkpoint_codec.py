@@ -2,8 +2,8 @@
 
 The bytes are a head (magic, version, the first 16 bytes of the SHA-256 digest of version and body) and a body, one
 msgpack map. Equal checkpoints give equal bytes. Reading is total and bounded: it returns a checkpoint or raises
-`CheckpointError`, and the digest is compared before anything else is looked at. A service reads the versions that
-earlier ones wrote (`checkpoint_reading`), and refuses later ones by number.
+`CheckpointError`, and the digest is compared before anything else is looked at. There is one version; others are
+refused by number. `checkpoint_reading` reads the body.
 
 What depends on how messages were delivered (duplicates, the revisions of corrected tracks, crashes) is kept, but is no
 state: `state_bytes` leaves it out, so that two sessions that took the same frames can be compared.
@@ -20,25 +20,23 @@ import optipmb_schemas as schemas
 
 import optipmb
 from optipmb_service.session.checkpoint import CheckpointError
-from optipmb_service.session.checkpoint_reading import READERS
-from optipmb_service.session.document import Document
+from optipmb_service.session.checkpoint_reading import read_body
 from optipmb_service.session.values import Deliveries
 
 if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
     from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, Recorded, SensorState
+    from optipmb_service.session.timeline import Cursor
 
-VERSION: Final = 5
+VERSION: Final = 1
 MAGIC: Final = b"OPTIPMB\0"
 DIGEST: Final = 16
-HEAD: Final = len(MAGIC) + 2 + DIGEST
-SHA: Final = 4
-"""The version since which the digest is SHA-256; before it was BLAKE2b."""
+_START: Final = MAGIC + VERSION.to_bytes(2, "big")
+HEAD: Final = len(_START) + DIGEST
 MAX_BYTES: Final = 2**28
 MAX_PROFILES: Final = 64
 """Profiles whose form in checkpoints is remembered."""
 
-_PERSON: Final = b"optipmb-check"
 _msgpack: Any = msgpack  # its type information is partial
 _profiles: dict[int, tuple[optipmb.Parameters, bytes]] = {}
 """The profiles that were written last, by their ids."""
@@ -65,40 +63,38 @@ def decode_checkpoint(data: bytes) -> Checkpoint:
     """Return the checkpoint that bytes hold.
 
     Raises:
-        CheckpointError: torn, changed, of a later version, or not valid.
+        CheckpointError: torn, changed, of another version, or not valid.
     """
-    version_, body = _open(data)
     try:
-        return READERS[version_](Document.of(body))
+        return read_body(_open(data))
     except (schemas.MessageError, optipmb.OptipmbError) as error:
         raise CheckpointError(str(error)) from error
 
 
 def seal(body: bytes) -> bytes:
     """Return a body with the head that names its version and guards it."""
-    return b"".join((MAGIC, VERSION.to_bytes(2, "big"), _digest(VERSION, body), body))
+    return b"".join((_START, _digest(body), body))
 
 
-def _open(data: bytes) -> tuple[int, bytes]:
+def _open(data: bytes) -> bytes:
     if len(data) < HEAD or data[: len(MAGIC)] != MAGIC:
         raise CheckpointError("no checkpoint: its first bytes are others")
     if len(data) > MAX_BYTES:
         raise CheckpointError(f"{len(data)} bytes: more than a checkpoint has")
-    version_ = int.from_bytes(data[len(MAGIC) : len(MAGIC) + 2], "big")
-    if version_ > VERSION:
-        raise CheckpointError(f"version {version_}: from a newer service; this one reads versions up to {VERSION}")
-    if version_ not in READERS:
-        raise CheckpointError(f"version {version_}: there is none such")
+    version = int.from_bytes(data[len(MAGIC) : len(_START)], "big")
+    if version != VERSION:
+        raise CheckpointError(
+            f"version {version}: expected {VERSION}, the only one of this release; start the release that wrote it"
+        )
     body = data[HEAD:]
-    if data[len(MAGIC) + 2 : HEAD] != _digest(version_, body):
+    if data[len(_START) : HEAD] != _digest(body):
         raise CheckpointError("torn or changed: the digest is that of other bytes")
-    return version_, body
+    return body
 
 
-def _digest(version_: int, body: bytes) -> bytes:
+def _digest(body: bytes) -> bytes:
     # Processors have instructions for SHA-256: it takes a third of the time that BLAKE2b takes.
-    start = version_.to_bytes(2, "big")
-    digest = hashlib.sha256(start) if version_ >= SHA else hashlib.blake2b(start, digest_size=DIGEST, person=_PERSON)
+    digest = hashlib.sha256(_START)
     digest.update(body)
     return digest.digest()[:DIGEST]
 
@@ -113,12 +109,11 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
         "parameters": _packed_profile(checkpoint.parameters),
         "fused": checkpoint.fused,
         "cloud_wait_ns": checkpoint.cloud_wait_ns,
-        "quarantine": [list(one) for one in sorted(checkpoint.quarantine.items())],
-        "epochs": [
-            [name, seen.epoch, seen.highest, _mask(seen.mask)]
+        "quarantine": dict(sorted(checkpoint.quarantine.items())),
+        "epochs": {
+            name: [(seen.epoch, seen.highest, _mask(seen.mask)) for seen in epochs]
             for name, epochs in sorted(checkpoint.seen.items())
-            for seen in epochs
-        ],
+        },
         "base": _state(checkpoint.base),
         "window": [
             {
@@ -132,7 +127,7 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
         # Without a window the present is its beginning.
         "head": _state(checkpoint.head) if checkpoint.window else None,
         "deliveries": _table(checkpoint.deliveries),
-        "newest_cloud_ns": [list(one) for one in sorted(checkpoint.newest_cloud_ns.items())],
+        "newest_cloud_ns": dict(sorted(checkpoint.newest_cloud_ns.items())),
         "run": checkpoint.run,
     }
 
@@ -147,7 +142,7 @@ def _packed_profile(parameters: optipmb.Parameters) -> bytes:
     return known[1]
 
 
-def _table(values: FrameCounts | PoseHistory | Deliveries) -> dict[str, Any]:
+def _table(values: Cursor | FrameCounts | PoseHistory | Deliveries) -> dict[str, Any]:
     return {name: getattr(values, name) for name in values.__match_args__}
 
 
@@ -162,7 +157,7 @@ def _mask(mask: int) -> bytes:
 
 
 def _state(state: FilterState) -> dict[str, Any]:
-    density, last = state.density, state.last
+    density = state.density
     return {
         "stamp_ns": density.stamp_ns,
         "next_id": density.next_id,
@@ -170,19 +165,17 @@ def _state(state: FilterState) -> dict[str, Any]:
         "session": state.session,
         "starts": state.starts,
         "generation": state.generation,
-        "last": None if last is None else [last.epoch, last.seq, last.stamp_ns, last.sensor],
+        "last": state.last,
         "tracks": state.tracks,
         "counts": _table(state.counts),
-        "sensors": [{"sensor": name, **_sensor(one)} for name, one in sorted(state.sensors.items())],
+        "sensors": {name: _sensor(one) for name, one in sorted(state.sensors.items())},
     }
 
 
 def _sensor(one: SensorState) -> dict[str, Any]:
-    cursor = one.cursor
     return {
-        "course": [cursor.epoch, cursor.seq, cursor.era, cursor.generation, cursor.newest_ns, cursor.floor_ns],
-        "jumped": [cursor.jumped, cursor.jumped_ns],
-        "tracked": None if one.tracked is None else list(one.tracked),
+        "cursor": _table(one.cursor),
+        "tracked": one.tracked,
         "reported": sorted(one.reported),
-        "whereabouts": _table(one.pose_history),
+        "pose_history": _table(one.pose_history),
     }

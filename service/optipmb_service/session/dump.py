@@ -52,7 +52,7 @@ def dump_of(transition: Transition, base: FilterState, placed: Sequence[Entry], 
             parameters=transition.parameters.model_dump(mode="json"),
             stamp_ns=base.density.stamp_ns,
             next_id=base.density.next_id,
-            density=optipmb.columns_of(base.density),
+            density=optipmb.bytes_of(base.density),
             frames=tuple(frames),
         )
     )

@@ -7,17 +7,23 @@ two sessions that took the same frames have equal states, whatever came twice, l
 from __future__ import annotations
 
 from dataclasses import field, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import optipmb_schemas as schemas
+from pydantic import Field
 
 from optipmb.records import record
 from optipmb_service.session.timeline import Cursor, FrameId, Order, Placement
+from optipmb_service.session.values import MAX_LABELS, Count, Epoch, Whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import optipmb
+
+ClassName = Annotated[str, Field(strict=True, max_length=64)]
+_Metres = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Position = tuple[_Metres, _Metres, _Metres]
 
 
 @record
@@ -36,15 +42,15 @@ class FrameCounts:
         repaired: covariances that had lost rank in rounding and were repaired.
     """
 
-    frames: int = 0
-    gaps: int = 0
-    new_epochs: int = 0
-    clouds_used: int = 0
-    clouds_missed: int = 0
-    astray: int = 0
-    effort: int = 0
-    unconfirmed: int = 0
-    repaired: int = 0
+    frames: Count = 0
+    gaps: Count = 0
+    new_epochs: Count = 0
+    clouds_used: Count = 0
+    clouds_missed: Count = 0
+    astray: Count = 0
+    effort: Count = 0
+    unconfirmed: Count = 0
+    repaired: Count = 0
 
 
 @record
@@ -59,11 +65,11 @@ class PoseHistory:
         astray_position: and where.
     """
 
-    stamp_ns: int | None = None
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    astray: int = 0
-    astray_ns: int = 0
-    astray_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    stamp_ns: Whole | None = None
+    position: Position = (0.0, 0.0, 0.0)
+    astray: Count = 0
+    astray_ns: Whole = 0
+    astray_position: Position = (0.0, 0.0, 0.0)
 
 
 @record
@@ -78,8 +84,8 @@ class SensorState:
     """
 
     cursor: Cursor = field(default_factory=Cursor)
-    tracked: tuple[bytes, int] | None = None
-    reported: frozenset[str] = frozenset()
+    tracked: tuple[Epoch, Whole] | None = None
+    reported: Annotated[frozenset[ClassName], Field(max_length=MAX_LABELS)] = frozenset()
     pose_history: PoseHistory = field(default_factory=PoseHistory)
 
 

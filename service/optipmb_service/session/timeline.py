@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from optipmb.records import record
 from optipmb_service.session.seen_numbers import WINDOW, SeenNumbers, complete_until, number_of, remembered
+from optipmb_service.session.values import Count, Epoch, SensorName, Whole  # noqa: TC001 - pydantic reads them
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -78,10 +79,10 @@ class FrameId(NamedTuple):
         sensor: its stream, where several sensors feed one session; empty where the session is that of one stream.
     """
 
-    epoch: bytes
-    seq: int
-    stamp_ns: int
-    sensor: str = ""
+    epoch: Epoch
+    seq: Whole
+    stamp_ns: Whole
+    sensor: SensorName = ""
 
 
 Order = tuple[int, int, str, int, int]
@@ -129,14 +130,14 @@ class Cursor:
         jumped_ns: stamp of the last of these.
     """
 
-    epoch: bytes | None = None
-    seq: int = 0
-    era: int = 0
-    generation: int = 0
-    newest_ns: int = 0
-    floor_ns: int | None = None
-    jumped: int = 0
-    jumped_ns: int = 0
+    epoch: Epoch | None = None
+    seq: Whole = 0
+    era: Count = 0
+    generation: Count = 0
+    newest_ns: Whole = 0
+    floor_ns: Whole | None = None
+    jumped: Count = 0
+    jumped_ns: Whole = 0
 
     def follow(self, frame_id: FrameId, gap_limit_ns: int) -> Placement:
         """Return the place of the frame that comes next in its publisher's order."""

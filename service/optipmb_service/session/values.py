@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol
 
 import optipmb_schemas as schemas
+from pydantic import AfterValidator, Field
 
 from optipmb.records import record
 
@@ -17,6 +18,22 @@ SECOND: Final = 1_000_000_000
 
 MAX_COUNT: Final = 2**61
 """Where counters end, so that neither one more nor the sum of two leaves the 64 bits of a message."""
+
+# What checkpoints hold, as pydantic reads it.
+Whole = Annotated[int, Field(strict=True, ge=0, lt=2**63)]
+Count = Annotated[int, Field(strict=True, ge=0, le=MAX_COUNT)]
+Binary = Annotated[bytes, Field(strict=True)]
+Epoch = Annotated[bytes, Field(strict=True, min_length=16, max_length=16)]
+
+
+def _check_sensor(name: str) -> str:
+    if name:
+        schemas.Keys().tracks(name)
+    return name
+
+
+SensorName = Annotated[str, Field(strict=True), AfterValidator(_check_sensor)]
+"""Stream of a sensor; empty for the only one of a stream's own session."""
 
 MAX_CLOUD_WAIT_NS: Final = 60 * SECOND
 """The longest wait for a cloud that can be asked for."""
@@ -169,11 +186,11 @@ class Deliveries:
         corrected: tracks that were published anew because of these.
     """
 
-    duplicates: int = 0
-    late: int = 0
-    refused: int = 0
-    inserted: int = 0
-    corrected: int = 0
+    duplicates: Count = 0
+    late: Count = 0
+    refused: Count = 0
+    inserted: Count = 0
+    corrected: Count = 0
 
 
 @dataclass(slots=True)

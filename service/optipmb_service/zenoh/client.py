@@ -7,7 +7,7 @@ two apart. Everything here may be called by any thread; `ask` and `recent` wait 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import optipmb_schemas as schemas
 import zenoh
@@ -25,11 +25,6 @@ if TYPE_CHECKING:
     from optipmb_service.settings.model import Settings
     from optipmb_service.zenoh.handles import Putting
     from optipmb_service.zenoh.key_numbers import KeyCount
-
-
-class _Matching(Protocol):
-    @property
-    def matching_status(self) -> Any: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +61,7 @@ class Outgoing:
         cache_clouds: int,
         wanted: Callable[[], None],
     ) -> None:
-        self._matching: _Matching | None = None
+        self._matching: Any = None
         taken = key_numbers.take(session, key_numbers.CACHED)
         cached = cached_publisher(session, keys.detections(stream), schemas.Detections, cache)
         self._detections = Publisher(cached, (taken,))
@@ -86,7 +81,7 @@ class Outgoing:
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.DATA_LOW,
             )
-            self._points, self._matching = Publisher(cast("Putting", plain), (taken,)), cast("_Matching", plain)
+            self._points, self._matching = Publisher(cast("Putting", plain), (taken,)), cast("Any", plain)
             plain.declare_matching_listener(lambda _status: wanted())
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error

@@ -13,7 +13,7 @@ import contextlib
 import json
 import os
 import re
-from typing import TYPE_CHECKING, Final, Protocol, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import optipmb_schemas as schemas
 import structlog
@@ -54,12 +54,6 @@ MESSAGE_HEADROOM: Final = 4
 log = structlog.get_logger("optipmb_service")
 
 
-class _Closed(Protocol):
-    """What Zenoh's stubs leave untyped of a session."""
-
-    def close(self) -> object: ...
-
-
 def opened(settings: Settings) -> zenoh.Session:
     """Open a session; a client does not return before it has a router.
 
@@ -89,7 +83,7 @@ def close(session: zenoh.Session) -> None:
     """Close a session, also one that is closed."""
     key_numbers.forget(session)
     with contextlib.suppress(zenoh.ZError):
-        cast("_Closed", session).close()
+        cast("Any", session).close()
 
 
 def line(error: zenoh.ZError) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import weakref
-from typing import TYPE_CHECKING, Any, Final, Protocol, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import optipmb_schemas as schemas
 import zenoh
@@ -21,10 +21,6 @@ if TYPE_CHECKING:
 MOST_OPEN: Final = 256
 """Queries of one key expression that may be open; those beyond are refused. The thread that brings them brings
 detections, too, and must not wait for answers."""
-
-
-class _Dropped(Protocol):
-    def drop(self) -> object: ...
 
 
 class OpenQueries(Channel["Question"]):
@@ -111,5 +107,5 @@ class Question:
 
     def finish(self) -> None:
         """Tell the asker that nothing follows."""
-        cast("_Dropped", self._query).drop()
+        cast("Any", self._query).drop()
         self._ended()
