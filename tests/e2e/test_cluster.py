@@ -8,6 +8,8 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
 
 SENSORS = [Sensor(stream=f"site/node-{number}/lidar") for number in range(6)]
 FREEZE_S = 8.0
+SLACK_S = 6.0
+"""For a busy machine."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -45,12 +49,13 @@ def _compiled() -> None:
 class Cluster:
     """Two linked routers, and members that have a common folder, or a NATS server and each a folder of its own."""
 
-    def __init__(self, folder: Path, nats: NatsProcess | None, fleet: Fleet, beyond: str, node: Node) -> None:
+    def __init__(self, folder: Path, nats: NatsProcess | None, fleet: Fleet, router: RouterProcess, node: Node) -> None:
         self.nats = nats
         self.node = node
         self.endpoint = fleet.endpoint
-        self.beyond = beyond
-        """Where the router is that the node is not connected to."""
+        self.router = router
+        """The router that the node is not connected to."""
+        self.beyond = router.endpoint
         self._folder = folder
         self._fleet = fleet
 
@@ -99,7 +104,7 @@ def cluster(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Cluster]
         RouterProcess(fleet.endpoint) as beyond,
         Node(fleet.endpoint) as node,
     ):
-        yield Cluster(tmp_path, nats, fleet, beyond.endpoint, node)
+        yield Cluster(tmp_path, nats, fleet, beyond, node)
 
 
 def holds(member: ServiceProcess, partitions: int) -> None:
@@ -262,7 +267,7 @@ def test_a_site_that_is_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[st
         RouterProcess(to_router.endpoint) as beyond,
         Node(fleet.endpoint) as node,
     ):
-        cluster = Cluster(tmp_path, nats, fleet, beyond.endpoint, node)
+        cluster = Cluster(tmp_path, nats, fleet, beyond, node)
         here = cluster.member("here")
         send(node, 0, 10, sensors=SENSORS)
         sessions = {stream: state.session for stream, state in cluster.check(10, "here").items()}
@@ -288,6 +293,46 @@ def test_a_site_that_is_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert {stream: state.session for stream, state in states.items()} == sessions
     with capsys.disabled():
         print(f"\nsilent for {silent_s:.2f} s at most after a site was cut off (lease 2 s)")  # noqa: T201 - the figure
+
+
+def test_a_member_without_a_router(cluster: Cluster) -> None:
+    """The router of one member is killed: it says so, the other one goes on within a lease, and it gets its share again.
+
+    All frames are tracked, to the byte. Where no member has a router, each keeps its partitions.
+    """
+    node, address = cluster.node, free_endpoint().removeprefix("tcp/")
+
+    def ready() -> tuple[int, str]:
+        try:
+            with urllib.request.urlopen(f"http://{address}/readyz", timeout=10.0) as answer:
+                return answer.status, answer.read().decode()
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, error.read().decode()
+
+    here, away = cluster.member("here"), cluster.member("away", cluster.beyond, http=address)
+    for member in (here, away):
+        holds(member, PARTITIONS // 2)
+    send(node, 0, 10, sensors=SENSORS)
+    sessions = {stream: state.session for stream, state in cluster.check(10, "here", "away").items()}
+    assert ready()[0] == 200
+    cluster.router.kill()
+    killed_ns = time.monotonic_ns()
+    send(node, 10, 40, 0.1, sensors=SENSORS)
+    status, text = ready()
+    assert (status, '"unlinked"' in text, "no router" in text) == (503, True, True)
+    cluster.check(40, "here")
+    assert cluster.outage_s(killed_ns) < 2.0 + SLACK_S  # `lease_s`
+    members = node.ask(KEYS.status("here"), ServiceStatus).members
+    assert sorted((one.state, len(one.fences)) for one in members) == [("alive", PARTITIONS), ("unlinked", 0)]
+
+    cluster.router.start()
+    for member in (here, away):
+        holds(member, PARTITIONS // 2)
+    send(node, 40, 50, sensors=SENSORS)
+    states = cluster.check(50, "here", "away")
+    assert ready()[0] == 200
+    assert {stream: state.session for stream, state in states.items()} == sessions
 
 
 def test_a_member_drains(cluster: Cluster, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -144,7 +144,9 @@ class Service:
         """Receive, answer, and say so."""
         self._transport.watch()
         self._persistence.start(self._registry.keep)
-        self._member.start(self._intake.changed, self._registry.resume, self._registry.occupied)
+        self._member.start(
+            self._intake.changed, self._registry.resume, self._registry.occupied, self.client().linked
+        )
         self._intake.start()
         self._transport.serve(self._stream_queries.answer, self._service_queries.answer)
         self._state = "ready"
@@ -207,20 +209,22 @@ class Service:
 
     @property
     def failure(self) -> str:
-        """Why the state is `degraded`; empty while it is not."""
-        return self._member.failure or self._persistence.failure
+        """Why the state is `degraded`, `paused` or `unlinked`; empty while it is none of these."""
+        return self._member.failure or self.client().failure or self._persistence.failure
 
     @property
     def state(self) -> str:
-        """What the service is: starting, ready, degraded, paused, draining or stopping.
+        """What the service is: starting, ready, degraded, paused, unlinked, draining or stopping.
 
-        Degraded: it tracks, and cannot keep checkpoints. Paused: it may not publish, for it has no lease. Draining: it
-        leaves its streams to others, or has.
+        Degraded: it tracks, and cannot keep checkpoints. Paused: it may not publish, for it has no lease. Unlinked: it
+        has no router. Draining: it leaves its streams to others, or has.
         """
         if self._state != "ready":
             return self._state
         if self._member.failure:
             return "paused"
+        if self.client().failure:
+            return "unlinked"
         if self._member.draining:
             return "draining"
         return "degraded" if self._persistence.failure else "ready"
@@ -297,7 +301,8 @@ class Service:
             standing_by=self._intake.standing_by,
             now_ns=time.monotonic_ns(),
         )
-        yield "declared_keys_total", (), self.key_numbers.declared
+        client = self.client()
+        yield from collectors.of_network(client.key_numbers.declared, linked=client.linked())
         yield from collectors.of_sessions(sessions)
         yield from collectors.of_densities(densities)
         yield from collectors.of_streams(sessions, self._settings.http_streams)

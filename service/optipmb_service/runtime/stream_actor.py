@@ -264,8 +264,17 @@ class StreamActor:
         self._drop_session("superseded")
 
     def on_recalled(self) -> None:
-        """Another instance is to have the stream: leave it as soon as its state is kept."""
-        self.close_session("moved")
+        """Another instance is to have the stream: leave it as soon as its state is kept.
+
+        Without a router it is left as by a process that is killed: the newest tracks may not have left this process, so
+        the other one is to track their frames again.
+        """
+        if self._context.member.unlinked:
+            self._context.persistence.forget(self.stream)
+            self._drop_session("unlinked")
+            self._context.member.look()
+        else:
+            self.close_session("moved")
 
     # Sessions; to be called by the tracking thread alone
 
