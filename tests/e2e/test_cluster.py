@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Self
 import pytest
 from commands import run_here
 from fleet import Fleet, RouterProcess, freeze, thaw
+from log_process import LogProcess
 from nats_process import NatsProcess
 from optipmb_schemas import ServiceStatus
 from optipmb_service.cluster.leases import PARTITIONS
@@ -24,7 +25,7 @@ from proxy import Proxy
 from router import Node, Sensor, until
 from routers import free_endpoint
 from service_process import READY_S
-from takeovers import KEYS, check, longest_silence_s, outage_s, published_by, send
+from takeovers import KEYS, check, distinct, longest_silence_s, outage_s, published_by, send
 
 import optipmb
 
@@ -296,7 +297,7 @@ def test_a_site_that_is_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_a_member_without_a_router(cluster: Cluster) -> None:
-    """The router of one member is killed: it says so, the other one goes on within a lease, and it gets its share again.
+    """The router of one member is killed: it says so, the other one goes on within a lease; it gets its share again.
 
     All frames are tracked, to the byte. Where no member has a router, each keeps its partitions.
     """
@@ -333,6 +334,48 @@ def test_a_member_without_a_router(cluster: Cluster) -> None:
     states = cluster.check(50, "here", "away")
     assert ready()[0] == 200
     assert {stream: state.session for stream, state in states.items()} == sessions
+
+
+def test_a_cut_between_two_routers(tmp_path: Path) -> None:
+    """Frames that are in the log and do not arrive are tracked from there, also of publishers without a cache.
+
+    The way between two routers is cut, that to the NATS server is not: the member on the far side keeps its partitions.
+    Whole again, what comes twice is tracked once.
+    """
+    (tmp_path / "nats").mkdir()
+    with (
+        NatsProcess(tmp_path / "nats") as nats,
+        Fleet(tmp_path) as fleet,
+        Proxy(fleet.endpoint) as between,
+        RouterProcess(between.endpoint) as beyond,
+        Node(fleet.endpoint) as node,
+        Node(beyond.endpoint) as far,
+        LogProcess(fleet.endpoint, nats.url) as bridge,
+    ):
+        bridge.wait_receiving(node)
+        cluster = Cluster(tmp_path, nats, fleet, beyond, node)
+        here = cluster.member("here")
+        away = cluster.member("away", beyond.endpoint)
+        for member in (here, away):
+            holds(member, PARTITIONS // 2)
+
+        def send_plain(first: int, last: int) -> None:
+            for seq in range(first, last):
+                node.send_plain(*(sensor.detections(seq) for sensor in SENSORS))
+                time.sleep(0.1)  # the rate of a sensor, not a wait for anything
+
+        send_plain(0, 10)
+        owners = cluster.settled("here", "away")
+        owned = [sensor for sensor in SENSORS if owners[sensor.stream] == "away"]
+        assert owned
+        between.cut()
+        send_plain(10, 40)
+        for sensor in owned:
+            until(lambda sensor=sensor: len(distinct(far, sensor)) == 40, "all frames are tracked", 2.0 + SLACK_S)
+        assert all(len(distinct(node, sensor)) < 40 for sensor in owned)
+        between.mend()
+        send_plain(40, 50)
+        cluster.check(50, "here", "away")
 
 
 def test_a_member_drains(cluster: Cluster, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

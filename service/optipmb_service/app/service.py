@@ -144,9 +144,7 @@ class Service:
         """Receive, answer, and say so."""
         self._transport.watch()
         self._persistence.start(self._registry.keep)
-        self._member.start(
-            self._intake.changed, self._registry.resume, self._registry.occupied, self.client().linked
-        )
+        self._member.start(self._intake.changed, self._registry.resume, self._registry.occupied, self.client().linked)
         self._intake.start()
         self._transport.serve(self._stream_queries.answer, self._service_queries.answer)
         self._state = "ready"

@@ -1,8 +1,8 @@
 """How the process is, for those who ask from outside: from before the service exists until after its end.
 
 The control loop beats; whoever asks sees for how long it has not. States: `starting`, then what the service says
-(`ready`, `degraded` when it works with a part missing, `paused` when it may not publish, `unlinked` without a router, or
-`draining` when others track its streams), then `stopping`.
+(`ready`, `degraded` when it works with a part missing, `paused` when it may not publish, `unlinked` without a router,
+or `draining` when others track its streams), then `stopping`.
 """
 
 from __future__ import annotations
