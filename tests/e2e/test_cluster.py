@@ -19,7 +19,7 @@ from commands import run_here
 from fleet import Fleet, RouterProcess, freeze, thaw
 from log_process import LogProcess
 from nats_process import NatsProcess
-from optipmb_schemas import ServiceStatus
+from optipmb_schemas import ServiceStatus, decode
 from optipmb_service.cluster.leases import PARTITIONS
 from proxy import Proxy
 from router import Node, Sensor, until
@@ -66,6 +66,10 @@ class Cluster:
         if self.nats is not None:
             own = {"cluster": self.nats.url, "store": self._folder / instance}
         return self._fleet.service(instance, endpoint=endpoint, wait=True, **own | settings)
+
+    def folder_of(self, number: int) -> Path:
+        """Where a member keeps its state that shares its name with another one."""
+        return self._folder / ("common" if self.nats is None else f"own-{number}")
 
     def owners(self) -> dict[str, str]:
         """Which member tracks which stream, by what they announce."""
@@ -334,6 +338,30 @@ def test_a_member_without_a_router(cluster: Cluster) -> None:
     states = cluster.check(50, "here", "away")
     assert ready()[0] == 200
     assert {stream: state.session for stream, state in states.items()} == sessions
+
+
+def test_two_members_of_one_name(cluster: Cluster) -> None:
+    """Both track their shares, also of publishers without a cache, and each reports the other one."""
+    for number in range(2):
+        cluster.member("twin", store=cluster.folder_of(number))
+    node = cluster.node
+
+    def shared() -> bool:
+        members = decode(node.query(KEYS.status("twin"))[0][2], ServiceStatus).members
+        return [len(one.fences) for one in members] == [PARTITIONS // 2] * 2
+
+    until(shared, "each has its share")
+    for seq in range(20):
+        node.send_plain(*(sensor.detections(seq) for sensor in SENSORS))
+        time.sleep(0.05)  # the rate of a sensor, not a wait for anything
+    for sensor in SENSORS:
+        check(node, 20, owner="twin", sensor=sensor)
+
+    def reported() -> bool:
+        problems = [decode(payload, ServiceStatus).problems for _, _, payload in node.query(KEYS.status("twin"))]
+        return [any(one.code == "duplicate_name" for one in some) for some in problems] == [True, True]
+
+    until(reported, "both report the other one")
 
 
 def test_a_cut_between_two_routers(tmp_path: Path) -> None:

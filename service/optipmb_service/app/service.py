@@ -55,6 +55,9 @@ JOIN_S: Final = 0.3
 SAVE_S: Final = 0.5
 """The last checkpoints have so long even where messages took all the time."""
 
+NAMESAKE_NS: Final = 10_000_000_000
+"""How often another process of the same name is looked for."""
+
 LEASES_S: Final = 1.0
 """What is left at the end to say that the leases are free, however long the checkpoints take."""
 
@@ -87,6 +90,7 @@ class Service:
         self._settings = settings
         self._started_ns = time.time_ns()
         self._began_ns = time.monotonic_ns()
+        self._namesake_ns = 0
         self._state = "starting"
         self._metrics = metrics or Metrics()
         store, keeps_nothing = open_store(settings, private)
@@ -155,6 +159,9 @@ class Service:
         """Do what is due about once a second."""
         now_ns = time.monotonic_ns()
         self._registry.sweep(now_ns)
+        if now_ns >= self._namesake_ns:
+            self._namesake_ns = now_ns + NAMESAKE_NS
+            self._transport.look_for_namesake(self._report_namesake)
         self._reporter.flush(now_ns)
 
     def stop(self, seconds: float = math.inf) -> bool:
@@ -270,6 +277,19 @@ class Service:
             else:
                 summaries += [summary] if summary is not None else []
         return tuple(summaries)
+
+    def _report_namesake(self) -> None:
+        name = self._settings.instance
+        problem = problem_of(
+            "duplicate_name",
+            stream="",
+            instance=name,
+            path="instance",
+            expected="a name that no other process has",
+            received=name,
+            message=f"Setting instance: another process is named {name}, too; give each a name of its own.",
+        )
+        self._reporter.report(problem, time.monotonic_ns())
 
     def _unkept(self, stream: str, why: str) -> None:
         """Report that the state of a stream cannot be kept."""

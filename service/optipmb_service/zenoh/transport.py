@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 import threading
 import time
 from functools import partial
@@ -72,7 +73,9 @@ class Transport:
         self._topics: dict[str, Topic] = {}
         self._discover: Callable[[zenoh.Sample], None] = lambda _: None
         self._all = False
-        self._announcements = Announcements(self._session, self._keys, self._instance)
+        self._run = secrets.token_hex(8)
+        """Tells this process from all others, also from those of its name."""
+        self._announcements = Announcements(self._session, self._keys, self._instance, self._run)
         self._publishers: set[Publisher] = set()
         self._lock = threading.Lock()
         self._alive: Undeclared | None = None
@@ -155,15 +158,16 @@ class Transport:
         detections.pass_through(lambda: points.pass_through(then))
 
     def watch_streams(
-        self, published: Callable[[str, str, bool], None], discovered: Callable[[str, str, bool], None]
+        self, published: Callable[[str, str, bool], None], discovered: Callable[[str, bool], None]
     ) -> None:
-        """Tell of publishers of detections with a cache, by key and token, and of announcements, by token."""
+        """Tell of publishers of detections with a cache, by key and token, and of others' announcements, by token."""
+
+        def announced(key: str, present: bool) -> None:  # noqa: FBT001 - as a token is told
+            if not self._keys.discovered_by(key, self._run):
+                discovered(key, present)
+
         self._watch("publishers", self._keys.all_publishers(), lambda key, present: published(key, key, present))
-        self._watch(
-            "discovered",
-            self._keys.all_discovered(),
-            lambda key, present: discovered(key, self._keys.instance_of(key), present),
-        )
+        self._watch("discovered", self._keys.all_discovered(), announced)
 
     def discover(self, streams: set[str]) -> None:
         """Announce these streams, and no others."""
@@ -213,6 +217,25 @@ class Transport:
             ask_cache(self._session, f"{self._keys.detections(stream)}/@adv/pub/**", reply, partial(then, found))
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
+
+    def look_for_namesake(self, found: Callable[[], None]) -> None:
+        """Have `found` called, on a thread of the network, for each other process that answers by the same name."""
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                found()
+
+        with contextlib.suppress(zenoh.ZError):  # the session is closed
+            self._session.get(
+                self._keys.metrics(self._instance),
+                zenoh.handlers.Callback(take, indirect=False),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=zenoh.CongestionControl.DROP,
+                allowed_destination=zenoh.Locality.REMOTE,
+                priority=zenoh.Priority.BACKGROUND,
+                timeout=RECENT_S,
+            )
 
     def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""

@@ -89,7 +89,7 @@ def test_sessions_that_keep_little_are_not_closed_for_memory() -> None:
         SimpleNamespace(stream=name, held_bytes=round(mb * MEGABYTE), meter=SimpleNamespace(active_ns=int(name)))
         for name, mb in named
     ]
-    closed, settings = list[str](), SimpleNamespace(stale_s=1.0, idle_s=1.0, memory_mb=20)
+    closed, settings = list[str](), SimpleNamespace(stale_s=1.0, idle_s=1.0, memory_mb=20, cluster=())
     parts: Any = settings, None, None, None, lambda stream, *_, **__: closed.append(stream), lambda *_: None
     Sweep(*parts)._evict(actors)
     assert closed == ["2", "3", "4"]
