@@ -242,6 +242,11 @@ class LateJoin(Generic[_S]):
             for source in [one for one, of in known if of.key not in keys and of.waiting is None]:
                 del self._publishers[source]
 
+    def due(self, zid: str, eid: int) -> int:
+        """Return the number after the highest that was handed over of a publisher; 0 of one that is not known."""
+        publisher = self._publishers.get((zid, eid))
+        return 0 if publisher is None else publisher.due
+
     def close(self) -> None:
         """Hand over what still waits, and nothing afterwards."""
         with self._lock:

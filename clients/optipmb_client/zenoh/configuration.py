@@ -23,6 +23,7 @@ def configuration(endpoints: tuple[str, ...], config: str | Path | None, timeout
     """
     try:
         settings = zenoh.Config() if config is None else zenoh.Config.from_file(config)
+        own = json.loads(settings.get_json("id"))
         if config is None:
             values: dict[str, object] = {
                 "mode": "client",
@@ -49,4 +50,9 @@ def configuration(endpoints: tuple[str, ...], config: str | Path | None, timeout
             f"not a usable Zenoh endpoint or configuration: {where} (an endpoint looks like {DEFAULT_ENDPOINT})",
             endpoints=endpoints,
         ) from error
+    if own is not None:  # Zenoh numbers what a session sends, and drops what comes again from a session of the same id
+        raise ConnectionFailed(
+            f'{config}: id: expected none, received "{own}": nobody would hear the second run of this program, nor'
+            " another one of that id; remove it"
+        )
     return settings

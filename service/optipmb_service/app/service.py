@@ -159,6 +159,7 @@ class Service:
         """Do what is due about once a second."""
         now_ns = time.monotonic_ns()
         self._registry.sweep(now_ns)
+        self._transport.look_for_returned(self._report_returned)
         if now_ns >= self._namesake_ns:
             self._namesake_ns = now_ns + NAMESAKE_NS
             self._transport.look_for_namesake(self._report_namesake)
@@ -277,6 +278,18 @@ class Service:
             else:
                 summaries += [summary] if summary is not None else []
         return tuple(summaries)
+
+    def _report_returned(self, token: str, due: int, newest: int) -> None:
+        expected, received = f"messages numbered from {due} on by Zenoh", f"numbers that began again, now {newest}"
+        problem = problem_of(
+            "numbers_back",
+            stream=schemas.Keys(self._settings.prefix).stream_of(token),
+            instance=self._settings.instance,
+            expected=expected,
+            received=received,
+            message=f"Publisher: expected {expected}, received {received}; remove `id` from its Zenoh configuration.",
+        )
+        self._reporter.report(problem, time.monotonic_ns())
 
     def _report_namesake(self) -> None:
         name = self._settings.instance

@@ -27,7 +27,7 @@ from optipmb_service.zenoh.handles import (
     publish_problem,
     undeclare,
 )
-from optipmb_service.zenoh.inputs import Topic
+from optipmb_service.zenoh.inputs import ReturnedPublishers, Topic
 from optipmb_service.zenoh.queries import OpenQueries
 from optipmb_service.zenoh.subscription import ask_cache
 
@@ -76,6 +76,7 @@ class Transport:
         self._run = secrets.token_hex(8)
         """Tells this process from all others, also from those of its name."""
         self._announcements = Announcements(self._session, self._keys, self._instance, self._run)
+        self._returned = ReturnedPublishers(self._session, lambda *_: 0)
         self._publishers: set[Publisher] = set()
         self._lock = threading.Lock()
         self._alive: Undeclared | None = None
@@ -119,6 +120,7 @@ class Transport:
             "detections": Topic("detections", self._session, detected, answered),
             "points": Topic("points", self._session, lambda one: self._receive(one, str(one.key_expr), on_cloud)),
         }
+        self._returned = ReturnedPublishers(self._session, self._topics["detections"].due)
 
     def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
         """Receive the detections or clouds of a stream, or of all of them where it is empty; `discovery` is of all.
@@ -166,7 +168,12 @@ class Transport:
             if not self._keys.discovered_by(key, self._run):
                 discovered(key, present)
 
-        self._watch("publishers", self._keys.all_publishers(), lambda key, present: published(key, key, present))
+        def returned(key: str, present: bool) -> None:  # noqa: FBT001 - as a token is told
+            published(key, key, present)
+            if present:
+                self._returned.came(key)
+
+        self._watch("publishers", self._keys.all_publishers(), returned)
         self._watch("discovered", self._keys.all_discovered(), announced)
 
     def discover(self, streams: set[str]) -> None:
@@ -236,6 +243,13 @@ class Transport:
                 priority=zenoh.Priority.BACKGROUND,
                 timeout=RECENT_S,
             )
+
+    def look_for_returned(self, report: Callable[[str, int, int], None]) -> None:
+        """Call `report` for each publisher that came back with numbers below those that it has sent.
+
+        It is called on a thread of the network, with the key of its token, the number expected next and its newest one.
+        """
+        self._returned.look(report)
 
     def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""
