@@ -189,6 +189,8 @@ class LateJoin(Generic[_S]):
             (`CacheQueries`).
         answered: called with the key of a publisher when all has been handed over that its cache held. It must not
             raise.
+        lost: called with a key just before a sample is handed over behind others that no cache holds any more. It must
+            not raise.
     """
 
     def __init__(
@@ -196,7 +198,9 @@ class LateJoin(Generic[_S]):
         receive: Callable[[_S], object],
         ask: Callable[[str, Callable[[_S], None], Callable[[bool], None]], object],
         answered: Callable[[str], object] = lambda _: None,
+        lost: Callable[[str], object] = lambda _: None,
     ) -> None:
+        self._lost = lost
         self._receive = receive
         self._ask = ask
         self._on_answered = answered
@@ -277,9 +281,12 @@ class LateJoin(Generic[_S]):
         return None
 
     def _hand_over(self, publisher: "_Publisher[_S] | None", sample: _S) -> None:
+        number = self._number(sample)
+        if publisher is not None and number > publisher.due:
+            self._lost(str(sample.key_expr))
         self._receive(sample)
         if publisher is not None:  # else it is forgotten
-            publisher.due = max(publisher.due, self._number(sample) + 1)
+            publisher.due = max(publisher.due, number + 1)
 
     @staticmethod
     def _number(sample: _S) -> int:

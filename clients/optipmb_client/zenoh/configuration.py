@@ -12,6 +12,7 @@ __all__ = ["DEFAULT_ENDPOINT", "configuration"]
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 WAIT_BEFORE_DROP_US = 50_000  # with the defaults (1 ms) large messages are lost whenever the machine is busy
 WAIT_BEFORE_DROP_FRAGMENTS_US = 500_000
+LEASE_MS = 3000  # after so long a router takes a silent client for gone, and lets it in again; by default 10 s
 CLOUD_BATCHES = 16  # of 64 kB on the way to the network: with the default of 2 sending a cloud takes four times as long
 
 
@@ -29,6 +30,7 @@ def configuration(endpoints: tuple[str, ...], config: str | Path | None, timeout
                 "mode": "client",
                 "transport/link/tx/queue/size/data_low": CLOUD_BATCHES,
                 "scouting/multicast/enabled": False,
+                "transport/link/tx/lease": LEASE_MS,
                 "transport/shared_memory/enabled": False,
                 "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
                 "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": (

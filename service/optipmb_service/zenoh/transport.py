@@ -45,8 +45,11 @@ CHANNEL: Final = 4096
 RECENT_S: Final = 2.0
 """How long other instances may take to answer what they have received of streams that have come here."""
 
-TRACKS_CACHE: Final = 50
-"""Tracks kept per stream for subscribers that lost some or come late: 5 s at 10 Hz. Most of what a stream holds."""
+TRACKS_CACHE: Final = 100
+"""Tracks kept per stream for subscribers that lost some or come late: 5 s at 20 Hz. Most of what a stream holds.
+
+It is longer than a dead link of the client library takes to be noticed and replaced, 4 s.
+"""
 
 CACHES_S: Final = 1.0
 """How long the caches may take to answer."""
