@@ -126,7 +126,11 @@ class Settings(BaseSettings):
         description="highest speed of a sensor, m/s; poses beyond it are refused; 0: no check",
     )
     queue_frames: int = Field(
-        default=256, ge=1, le=65536, description="frames waiting per stream; then the oldest is dropped"
+        default=1024,
+        ge=1,
+        le=65536,
+        description="frames waiting per stream, as many as a publisher's cache may send at once after an outage; then"
+        " the oldest is dropped",
     )
     queue_clouds: int = Field(
         default=16,
