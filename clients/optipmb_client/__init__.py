@@ -8,7 +8,7 @@ The command `optipmb` does everything that needs no programming.
 from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
 from optipmb_client.history import kept_tracks
 from optipmb_client.publisher import Publisher
-from optipmb_client.subscriber import Received, Statistics, Subscriber
+from optipmb_client.subscriber import Missed, Received, Statistics, Subscriber
 from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "ClientError",
     "Connection",
     "ConnectionFailed",
+    "Missed",
     "Publisher",
     "Received",
     "ServiceRefused",

@@ -18,7 +18,7 @@ def kept_tracks(
 ) -> Iterator[Tracks]:
     """Yield the tracks of a stream in a range of stamps, by stamp, each frame once, as far as they are kept.
 
-    The service keeps the last 50 messages of a stream; with `--cluster` and `optipmb-service log` those of an hour, or
+    The service keeps the last 100 messages of a stream; with `--cluster` and `optipmb-service log` those of an hour, or
     of what the setting `log_tracks_s` says. The range is asked for part by part, as the iterator goes on.
 
     Args:

@@ -5,7 +5,7 @@ Payloads are bytes, keys are text, times are `time.monotonic_ns()`.
 
 import collections
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from optipmb_schemas import Message, decode
@@ -17,12 +17,16 @@ _Message = TypeVar("_Message", bound=Message)
 
 @dataclass(frozen=True)
 class Arrival:
-    """A message as it came in: key, payload, Zenoh encoding, and the monotonic time of its arrival in nanoseconds."""
+    """A message as it came in: key, payload, Zenoh encoding, and the monotonic time of its arrival in nanoseconds.
+
+    `after_loss` says whether messages of this key before it are lost.
+    """
 
     key: str
     payload: bytes
     encoding: str
     monotonic_ns: int
+    after_loss: bool = False
 
     def read(self, kind: type[_Message]) -> _Message:
         """Return the message, checked.
@@ -51,6 +55,7 @@ class Inbox:
         self._capacity = capacity
         self._changed = threading.Condition()
         self._closed = False
+        self._dropped_keys: set[str] = set()
         self.dropped = 0
 
     @property
@@ -64,7 +69,7 @@ class Inbox:
             if self._closed:
                 return
             if len(self._entries) >= self._capacity:
-                self._entries.popleft()
+                self._dropped_keys.add(self._entries.popleft().key)
                 self.dropped += 1
             self._entries.append(arrival)
             self._changed.notify()
@@ -75,7 +80,11 @@ class Inbox:
             self._changed.wait_for(lambda: self._entries or self._closed, timeout)
             if not self._entries:
                 return None
-            return self._entries.popleft()
+            arrival = self._entries.popleft()
+            if arrival.key in self._dropped_keys:
+                self._dropped_keys.discard(arrival.key)
+                arrival = replace(arrival, after_loss=True)
+            return arrival
 
     @property
     def closed(self) -> bool:

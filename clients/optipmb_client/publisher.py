@@ -25,7 +25,7 @@ from optipmb_client.links import Link, linked
 
 __all__ = ["Publisher"]
 
-CACHE = 200  # detection messages kept for recovery: 10 s of a sensor at 20 Hz
+CACHE = 400  # detection messages kept for recovery: 20 s of a sensor at 20 Hz; a link that is dead is noticed in 11 s
 
 PoseLike = Pose | tuple[ArrayLike, ArrayLike]
 
@@ -34,7 +34,7 @@ class Publisher:
     """Publishes the detections of one sensor, and its point clouds where somebody uses them.
 
     What is published is checked first: a wrong shape or value raises `MessageError`, with the path of the field, before
-    anything is sent. Detections are kept for about 10 s, so that a service that restarts or loses its link gets them
+    anything is sent. Detections are kept for some 20 s, so that a service that restarts or loses its link gets them
     still. Publishing waits for nobody. One publisher may be used from several threads.
 
     Args:

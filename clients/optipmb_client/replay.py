@@ -31,6 +31,8 @@ __all__ = ["Pace", "ReplayedSequence", "replay"]
 
 CLOUD_WAIT_S = 10.0  # a cloud may be late on a busy machine; tracking without it would change the result
 CACHED_CLOUDS = 16  # for a service that is killed and restarted meanwhile; it keeps no more of a stream by default
+CLOUDS_AHEAD = 4  # frames under way then: a successor goes back to a checkpoint, and needs the clouds since then, too
+TAKEOVER_S = 15.0  # how long a successor may take; then frames are sent whether or not their clouds will be there
 STRAGGLERS_S = 5.0  # how long frames that were overtaken by later ones may still be recovered
 POINTS_WANTED_S = 20.0  # how long to wait until the service's subscription to clouds has come to this session
 TICK_S = 0.2  # how often a waiting thread looks whether it shall stop
@@ -256,18 +258,35 @@ class _Replay:
         self.sent += 1
 
     def _until(self, due: float, tracks: Subscriber) -> bool:
-        """Take in tracks until the monotonic time `due`; False when the replay shall end."""
+        """Take in tracks until the monotonic time `due`; False when the replay shall end.
+
+        With clouds it waits longer while tracks are late, as when another service takes over.
+        """
         while self._take(tracks, 0.0):
             pass
         while (left := due - time.monotonic()) > 0.0:
             if self.task.stop.is_set():
                 return False
             self._take(tracks, min(left, TICK_S))
+        while self.sequence.has_clouds and self._under_way >= CLOUDS_AHEAD and self._silent_s < TAKEOVER_S:
+            if self.task.stop.is_set():
+                return False
+            self._take(tracks, TICK_S)
         return self._alive()
+
+    @property
+    def _under_way(self) -> int:
+        """Frames sent after the newest one that came back."""
+        return self.sent - 1 - self._newest
+
+    @property
+    def _silent_s(self) -> float:
+        """Time since something last came back."""
+        return time.monotonic() - self._progress
 
     def _until_room(self, tracks: Subscriber) -> bool:
         """Take in tracks until less than a window of frames is under way; False when the replay shall end."""
-        while self.sent - 1 - self._newest >= self.task.pace.window:
+        while self._under_way >= self.task.pace.window:
             if not self._alive():
                 return False
             self._take(tracks, TICK_S)
@@ -277,7 +296,7 @@ class _Replay:
         """Take in tracks until every frame sent has come back, or no more will come."""
         while len(self.results) < self.sent and self._alive():
             overtaken = self._newest == self.sent - 1
-            if overtaken and time.monotonic() - self._progress > STRAGGLERS_S:
+            if overtaken and self._silent_s > STRAGGLERS_S:
                 return
             self._take(tracks, TICK_S)
 
@@ -285,7 +304,7 @@ class _Replay:
         """Whether to go on: nobody has asked to stop, and tracks have come back lately or none are under way."""
         if self._newest == self.sent - 1:
             return not self.task.stop.is_set()
-        return not self.task.stop.is_set() and time.monotonic() - self._progress < self.task.pace.patience_s
+        return not self.task.stop.is_set() and self._silent_s < self.task.pace.patience_s
 
     def _take(self, tracks: Subscriber, timeout: float) -> bool:
         """Take in one tracks message, waiting for it up to `timeout` seconds; False when none came."""

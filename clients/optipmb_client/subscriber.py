@@ -3,6 +3,7 @@
 Tracks are in the fixed world frame: metres, radians, stamps in integer nanoseconds of the sensor's clock.
 """
 
+import collections
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,9 +17,10 @@ from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.links import Link, linked
 from optipmb_client.merging import Merging, Novelty
 
-__all__ = ["Received", "Statistics", "Subscriber"]
+__all__ = ["Missed", "Received", "Statistics", "Subscriber"]
 
 REMEMBERED = 65_536  # frames whose repetition is recognised
+MISSED = 1024  # ranges of lost frames that are kept
 
 
 @dataclass(frozen=True)
@@ -34,10 +36,37 @@ class Received:
 
 
 @dataclass(frozen=True)
+class Missed:
+    """Frames whose tracks were lost: the link was gone for longer than they are kept, or the program was too slow.
+
+    Where `optipmb-service log` runs, `kept_tracks(connection, missed.stream, missed.after_ns, missed.before_ns)` gets
+    them. Frames of the range that were refused or never came have no tracks.
+
+    Attributes:
+        stream: Name of the stream.
+        sensor: Whose frames, where several sensors share a session; else None.
+        epoch: Run of the publisher.
+        first: Number of the first frame.
+        last: Number of the last one; None: up to the end of that run.
+        after_ns: Stamp of the frame before.
+        before_ns: Stamp of the frame behind.
+    """
+
+    stream: str
+    sensor: str | None
+    epoch: bytes
+    first: int
+    last: int | None
+    after_ns: int
+    before_ns: int
+
+
+@dataclass(frozen=True)
 class Statistics:
     """What a subscriber has seen: messages given out, dropped (the program was too slow), repeated, unreadable.
 
-    `corrected` counts the messages that replaced an earlier one, whether they were given out or not.
+    `corrected` counts the messages that replaced an earlier one, whether they were given out or not, `missed` the
+    ranges of frames whose tracks were lost (`Subscriber.missed`).
     """
 
     delivered: int
@@ -46,6 +75,7 @@ class Statistics:
     invalid: int
     pending: int
     corrected: int = 0
+    missed: int = 0
 
 
 class Subscriber:
@@ -57,7 +87,8 @@ class Subscriber:
     of a frame holds. `corrections=False` leaves these out, for programs that act on what is new and do not look back.
 
     A subscriber that comes late first gets what the service keeps of each stream, some seconds.
-    A program that is too slow loses the oldest waiting messages, never anybody else's; `statistics` counts them.
+    A program that is too slow loses the oldest waiting messages, never anybody else's; `statistics` counts them, and
+    `missed` names the frames.
 
     Args:
         pattern: Name of a stream, `site/node/sensor`, or a pattern with `*` in the place of names: `garage/*/*`.
@@ -101,6 +132,9 @@ class Subscriber:
         self._delivered = 0
         self._repeated = 0
         self._invalid = 0
+        self._newest: dict[tuple[str, str | None], tuple[bytes, int, int]] = {}
+        self._missed: collections.deque[Missed] = collections.deque(maxlen=MISSED)
+        self._missed_count = 0
         self._inbox = Inbox(queue)
         self._own = linked(connect, config=config, timeout=connect_timeout) if connection is None else None
         link = connection or self._own
@@ -136,6 +170,7 @@ class Subscriber:
             if arrival is None:
                 return None
             if (tracks := self._read(arrival)) is not None:
+                self._look_for_missed(tracks, after_loss=arrival.after_loss)
                 novelty = self._merging.take(tracks)
                 self._repeated += novelty is Novelty.REPEATED
                 self._corrected += novelty is Novelty.CORRECTION
@@ -153,7 +188,30 @@ class Subscriber:
             invalid=self._invalid,
             pending=self._inbox.pending,
             corrected=self._corrected,
+            missed=self._missed_count,
         )
+
+    @property
+    def missed(self) -> tuple[Missed, ...]:
+        """Frames whose tracks were lost on the way, the newest 1,024 ranges of them."""
+        return tuple(self._missed)
+
+    def _look_for_missed(self, tracks: Tracks, *, after_loss: bool) -> None:
+        sensor = tracks.stream, tracks.sensor
+        known = self._newest.get(sensor)
+        if known is not None and known[0] == tracks.epoch and known[1] >= tracks.seq:
+            return
+        self._newest[sensor] = tracks.epoch, tracks.seq, tracks.stamp_ns
+        if known is None or not after_loss:
+            return
+        epoch, seq, stamp_ns = known
+        ranges: list[tuple[bytes, int, int | None]] = [(epoch, seq + 1, tracks.seq - 1)]
+        if epoch != tracks.epoch:
+            ranges = [(epoch, seq + 1, None), (tracks.epoch, 0, tracks.seq - 1)]
+        for run, first, last in ranges:
+            if last is None or first <= last:
+                self._missed.append(Missed(*sensor, run, first, last, stamp_ns, tracks.stamp_ns))
+                self._missed_count += 1
 
     def _read(self, arrival: Arrival) -> Tracks | None:
         """Return the tracks that arrived; None for problems, and what is no message of ours."""

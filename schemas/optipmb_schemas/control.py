@@ -185,7 +185,7 @@ class MemberSummary(Message):
     """A member: one run of a process that tracks, with the leases of partitions that it holds."""
 
     member: Text = Field(description="Name of the instance, `/`, and eight hexadecimal digits of this run.")
-    state: Word = Field(description="`alive`, or `draining`: it takes no partitions.")
+    state: Word = Field(description="`alive`; `draining` or `unlinked` (it has no router): it takes no partitions.")
     age_s: NonNegative = Field(description="Seconds since its last renewal.")
     partitions: tuple[Count, ...] = Field(
         default=(), max_length=4096, fail_fast=True, description="Partitions that it holds."

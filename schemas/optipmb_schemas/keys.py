@@ -4,7 +4,7 @@
 <prefix>/<stream>/q/state | q/density | q/tracks | q/reset | q/parameters    queries
 <prefix>/owner/<stream>/<instance>                            liveliness: who tracks this stream
 <prefix>/service/<instance>/alive                             liveliness: which services are there
-<prefix>/service/<instance>/discovered/<streams>              liveliness: streams whose publishers say nothing
+<prefix>/service/<instance>/discovered/<run>/<streams>        liveliness: streams whose publishers say nothing
 <prefix>/service/<instance>/q/status | q/metrics | q/move | q/drain     queries
 """
 
@@ -83,21 +83,31 @@ class Keys:
         """Return the key of the query for what an instance received lately and does not track; default: of all."""
         return f"{self.prefix}/service/{_instance(instance) if instance else '*'}/q/recent"
 
-    def discovered(self, streams: Iterable[str], instance: str) -> str:
-        """Return the liveliness key by which an instance says that streams exist, for their publishers do not."""
+    def discovered(self, streams: Iterable[str], instance: str, run: str) -> str:
+        """Return the liveliness key by which a process says that streams exist, for their publishers do not.
+
+        `run` tells it from all others, also from those of its name.
+        """
         names = ",".join(_stream(stream).replace("/", "%") for stream in streams)
-        return f"{self.prefix}/service/{_instance(instance)}/discovered/{names}"
+        return f"{self.prefix}/service/{_instance(instance)}/discovered/{_named('run', check_chunk, run)}/{names}"
 
     def all_discovered(self) -> str:
         """Return the key expression of all streams that instances have discovered."""
-        return f"{self.prefix}/service/*/discovered/*"
+        return f"{self.prefix}/service/*/discovered/*/*"
 
     def discovered_streams(self, key: str) -> list[str]:
         """Return the streams that a key of `discovered` names."""
         match self._chunks(key):
-            case ["service", _, "discovered", names]:
+            case ["service", _, "discovered", _, names]:
                 return [_named("key", check_stream, name.replace("%", "/")) for name in names.split(",")]
         raise invalid("key", f"a key of discovered streams under {self.prefix}", key)
+
+    def discovered_by(self, key: str, run: str) -> bool:
+        """Whether a key of `discovered` is that of a process."""
+        match self._chunks(key):
+            case ["service", _, "discovered", of, _]:
+                return of == run
+        return False
 
     def all_publishers(self) -> str:
         """Return the key expression of the tokens of publishers of detections with a cache, which Zenoh declares."""

@@ -161,6 +161,8 @@ class LateJoin(Generic[_S]):
             (`CacheQueries`).
         answered: called with the key of a publisher when all has been handed over that its cache held. It must not
             raise.
+        lost: called with a key just before a sample is handed over behind others that no cache holds any more. It must
+            not raise.
     """
 
     def __init__(
@@ -168,7 +170,9 @@ class LateJoin(Generic[_S]):
         receive: Callable[[_S], object],
         ask: Callable[[str, Callable[[_S], None], Callable[[bool], None]], object],
         answered: Callable[[str], object] = lambda _: None,
+        lost: Callable[[str], object] = lambda _: None,
     ) -> None:
+        self._lost = lost
         self._receive = receive
         self._ask = ask
         self._on_answered = answered
@@ -214,6 +218,11 @@ class LateJoin(Generic[_S]):
             for source in [one for one, of in known if of.key not in keys and of.waiting is None]:
                 del self._publishers[source]
 
+    def due(self, zid: str, eid: int) -> int:
+        """Return the number after the highest that was handed over of a publisher; 0 of one that is not known."""
+        publisher = self._publishers.get((zid, eid))
+        return 0 if publisher is None else publisher.due
+
     def close(self) -> None:
         """Hand over what still waits, and nothing afterwards."""
         with self._lock:
@@ -244,9 +253,12 @@ class LateJoin(Generic[_S]):
         return None
 
     def _hand_over(self, publisher: "_Publisher[_S] | None", sample: _S) -> None:
+        number = self._number(sample)
+        if publisher is not None and number > publisher.due:
+            self._lost(str(sample.key_expr))
         self._receive(sample)
         if publisher is not None:  # else it is forgotten
-            publisher.due = max(publisher.due, self._number(sample) + 1)
+            publisher.due = max(publisher.due, number + 1)
 
     @staticmethod
     def _number(sample: _S) -> int:

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -36,6 +37,14 @@ def test_a_missing_configuration_file_is_the_same_error(tmp_path: object) -> Non
     """A configuration file that is not there is named."""
     with pytest.raises(ConnectionFailed, match=r"no Zenoh configuration file at .*absent"):
         Connection(config=f"{tmp_path}/absent.json5")
+
+
+def test_a_configuration_with_an_id_is_refused(tmp_path: Path) -> None:
+    """A program that starts again with the Zenoh id of its last run would not be heard: the error names file and id."""
+    file = tmp_path / "zenoh.json5"
+    file.write_text('{id: "ab12", mode: "client"}')
+    with pytest.raises(ConnectionFailed, match=r'zenoh\.json5: id: expected none, received "ab12".*remove it'):
+        Connection(free_endpoint(), config=file)
 
 
 def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:

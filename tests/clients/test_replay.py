@@ -127,6 +127,28 @@ def test_recorded_pace_is_kept(endpoint: str, link: Connection, dataset: Dataset
     assert len(service.seen.detections) == FRAMES
 
 
+def test_at_the_recorded_rate_clouds_wait_for_a_successor(
+    endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
+) -> None:
+    """While no tracks come back only four frames with clouds are sent ahead, so that the cache holds all of them."""
+    gate, ahead = threading.Event(), list[int]()
+
+    def sent() -> int:
+        return max((cloud.seq for cloud in service.seen.points), default=-1)
+
+    def answer(message: Detections, tracks: Tracks) -> list[Tracks]:
+        if message.seq == 2:
+            until(lambda: sent() == 5, "three more frames are sent")
+            gate.wait(0.5)  # five more would be due: a wait that is never answered, on purpose
+            ahead.append(sent())
+        return [tracks]
+
+    with FakeService(endpoint, Behaviour(answer)) as service:
+        (result,) = run(link, dataset, tmp_path, pace=Pace(speed=1.0, patience_s=60.0))
+    assert ahead == [5]
+    assert (result.missing, len(service.seen.points)) == (0, FRAMES)
+
+
 def test_lost_tracks_are_reported_as_missing(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
     """Frames whose tracks never come are counted, the others are written; the replay does not wait for patience."""
     lost = {3, 4, FRAMES - 2}

@@ -8,6 +8,8 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -15,14 +17,15 @@ from typing import TYPE_CHECKING, Self
 import pytest
 from commands import run_here
 from fleet import Fleet, RouterProcess, freeze, thaw
+from log_process import LogProcess
 from nats_process import NatsProcess
-from optipmb_schemas import ServiceStatus
+from optipmb_schemas import ServiceStatus, decode
 from optipmb_service.cluster.leases import PARTITIONS
 from proxy import Proxy
 from router import Node, Sensor, until
 from routers import free_endpoint
 from service_process import READY_S
-from takeovers import KEYS, check, longest_silence_s, outage_s, published_by, send
+from takeovers import KEYS, check, distinct, longest_silence_s, outage_s, published_by, send
 
 import optipmb
 
@@ -35,6 +38,8 @@ if TYPE_CHECKING:
 
 SENSORS = [Sensor(stream=f"site/node-{number}/lidar") for number in range(6)]
 FREEZE_S = 8.0
+SLACK_S = 6.0
+"""For a busy machine."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -45,12 +50,13 @@ def _compiled() -> None:
 class Cluster:
     """Two linked routers, and members that have a common folder, or a NATS server and each a folder of its own."""
 
-    def __init__(self, folder: Path, nats: NatsProcess | None, fleet: Fleet, beyond: str, node: Node) -> None:
+    def __init__(self, folder: Path, nats: NatsProcess | None, fleet: Fleet, router: RouterProcess, node: Node) -> None:
         self.nats = nats
         self.node = node
         self.endpoint = fleet.endpoint
-        self.beyond = beyond
-        """Where the router is that the node is not connected to."""
+        self.router = router
+        """The router that the node is not connected to."""
+        self.beyond = router.endpoint
         self._folder = folder
         self._fleet = fleet
 
@@ -60,6 +66,10 @@ class Cluster:
         if self.nats is not None:
             own = {"cluster": self.nats.url, "store": self._folder / instance}
         return self._fleet.service(instance, endpoint=endpoint, wait=True, **own | settings)
+
+    def folder_of(self, number: int) -> Path:
+        """Where a member keeps its state that shares its name with another one."""
+        return self._folder / ("common" if self.nats is None else f"own-{number}")
 
     def owners(self) -> dict[str, str]:
         """Which member tracks which stream, by what they announce."""
@@ -99,7 +109,7 @@ def cluster(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Cluster]
         RouterProcess(fleet.endpoint) as beyond,
         Node(fleet.endpoint) as node,
     ):
-        yield Cluster(tmp_path, nats, fleet, beyond.endpoint, node)
+        yield Cluster(tmp_path, nats, fleet, beyond, node)
 
 
 def holds(member: ServiceProcess, partitions: int) -> None:
@@ -262,7 +272,7 @@ def test_a_site_that_is_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[st
         RouterProcess(to_router.endpoint) as beyond,
         Node(fleet.endpoint) as node,
     ):
-        cluster = Cluster(tmp_path, nats, fleet, beyond.endpoint, node)
+        cluster = Cluster(tmp_path, nats, fleet, beyond, node)
         here = cluster.member("here")
         send(node, 0, 10, sensors=SENSORS)
         sessions = {stream: state.session for stream, state in cluster.check(10, "here").items()}
@@ -288,6 +298,112 @@ def test_a_site_that_is_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert {stream: state.session for stream, state in states.items()} == sessions
     with capsys.disabled():
         print(f"\nsilent for {silent_s:.2f} s at most after a site was cut off (lease 2 s)")  # noqa: T201 - the figure
+
+
+def test_a_member_without_a_router(cluster: Cluster) -> None:
+    """The router of one member is killed: it says so, the other one goes on within a lease; it gets its share again.
+
+    All frames are tracked, to the byte. Where no member has a router, each keeps its partitions.
+    """
+    node, address = cluster.node, free_endpoint().removeprefix("tcp/")
+
+    def ready() -> tuple[int, str]:
+        try:
+            with urllib.request.urlopen(f"http://{address}/readyz", timeout=10.0) as answer:
+                return answer.status, answer.read().decode()
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, error.read().decode()
+
+    here, away = cluster.member("here"), cluster.member("away", cluster.beyond, http=address)
+    for member in (here, away):
+        holds(member, PARTITIONS // 2)
+    send(node, 0, 10, sensors=SENSORS)
+    sessions = {stream: state.session for stream, state in cluster.check(10, "here", "away").items()}
+    assert ready()[0] == 200
+    cluster.router.kill()
+    killed_ns = time.monotonic_ns()
+    send(node, 10, 40, 0.1, sensors=SENSORS)
+    status, text = ready()
+    assert (status, '"unlinked"' in text, "no router" in text) == (503, True, True)
+    cluster.check(40, "here")
+    assert cluster.outage_s(killed_ns) < 2.0 + SLACK_S  # `lease_s`
+    members = node.ask(KEYS.status("here"), ServiceStatus).members
+    assert sorted((one.state, len(one.fences)) for one in members) == [("alive", PARTITIONS), ("unlinked", 0)]
+
+    cluster.router.start()
+    for member in (here, away):
+        holds(member, PARTITIONS // 2)
+    send(node, 40, 50, sensors=SENSORS)
+    states = cluster.check(50, "here", "away")
+    assert ready()[0] == 200
+    assert {stream: state.session for stream, state in states.items()} == sessions
+
+
+def test_two_members_of_one_name(cluster: Cluster) -> None:
+    """Both track their shares, also of publishers without a cache, and each reports the other one."""
+    for number in range(2):
+        cluster.member("twin", store=cluster.folder_of(number))
+    node = cluster.node
+
+    def shared() -> bool:
+        members = decode(node.query(KEYS.status("twin"))[0][2], ServiceStatus).members
+        return [len(one.fences) for one in members] == [PARTITIONS // 2] * 2
+
+    until(shared, "each has its share")
+    for seq in range(20):
+        node.send_plain(*(sensor.detections(seq) for sensor in SENSORS))
+        time.sleep(0.05)  # the rate of a sensor, not a wait for anything
+    for sensor in SENSORS:
+        check(node, 20, owner="twin", sensor=sensor)
+
+    def reported() -> bool:
+        problems = [decode(payload, ServiceStatus).problems for _, _, payload in node.query(KEYS.status("twin"))]
+        return [any(one.code == "duplicate_name" for one in some) for some in problems] == [True, True]
+
+    until(reported, "both report the other one")
+
+
+def test_a_cut_between_two_routers(tmp_path: Path) -> None:
+    """Frames that are in the log and do not arrive are tracked from there, also of publishers without a cache.
+
+    The way between two routers is cut, that to the NATS server is not: the member on the far side keeps its partitions.
+    Whole again, what comes twice is tracked once.
+    """
+    (tmp_path / "nats").mkdir()
+    with (
+        NatsProcess(tmp_path / "nats") as nats,
+        Fleet(tmp_path) as fleet,
+        Proxy(fleet.endpoint) as between,
+        RouterProcess(between.endpoint) as beyond,
+        Node(fleet.endpoint) as node,
+        Node(beyond.endpoint) as far,
+        LogProcess(fleet.endpoint, nats.url) as bridge,
+    ):
+        bridge.wait_receiving(node)
+        cluster = Cluster(tmp_path, nats, fleet, beyond, node)
+        here = cluster.member("here")
+        away = cluster.member("away", beyond.endpoint)
+        for member in (here, away):
+            holds(member, PARTITIONS // 2)
+
+        def send_plain(first: int, last: int) -> None:
+            for seq in range(first, last):
+                node.send_plain(*(sensor.detections(seq) for sensor in SENSORS))
+                time.sleep(0.1)  # the rate of a sensor, not a wait for anything
+
+        send_plain(0, 10)
+        owners = cluster.settled("here", "away")
+        owned = [sensor for sensor in SENSORS if owners[sensor.stream] == "away"]
+        assert owned
+        between.cut()
+        send_plain(10, 40)
+        for sensor in owned:
+            until(lambda sensor=sensor: len(distinct(far, sensor)) == 40, "all frames are tracked", 2.0 + SLACK_S)
+        assert all(len(distinct(node, sensor)) < 40 for sensor in owned)
+        between.mend()
+        send_plain(40, 50)
+        cluster.check(50, "here", "away")
 
 
 def test_a_member_drains(cluster: Cluster, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

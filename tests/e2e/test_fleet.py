@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -63,6 +64,21 @@ def test_a_router_that_is_killed(tmp_path: Path) -> None:
         send(node, 40, 45)
         state = check(node, 45, owner="a")
         assert state.duplicates + state.frames == state.received
+
+
+def test_all_that_a_cache_holds_is_tracked_after_an_outage(tmp_path: Path) -> None:
+    """As many frames as come at once from a cache wait for the session, however slow that is: none is shed."""
+    frames, busy = 800, replace(SENSOR, objects=40)
+    with Fleet(tmp_path) as fleet, Node(fleet.endpoint) as node:
+        service = fleet.service("a")
+        send(node, 0, 10, sensors=[busy])
+        node.tracks(busy.stream, 10)
+        fleet.router.kill()
+        service.wait_log("peer_lost")
+        send(node, 10, frames, pace_s=0.0, sensors=[busy])
+        fleet.router.start()
+        state = check(node, frames, owner="a", sensor=busy)
+    assert (state.shed, state.gaps) == (0, 0)
 
 
 def test_killed_before_its_first_checkpoint(tmp_path: Path) -> None:

@@ -117,9 +117,9 @@ def test_a_successor_reads_what_nobody_tracked(logged: Logged) -> None:
     frames = logged.tracked(10, "a")
     first.process.kill()
     first.process.wait()
-    logged.send(frames, frames + 30)
+    logged.send(frames, frames + TRACKS_CACHE)
     logged.member("b")
-    frames = logged.tracked(frames + 30, "b")
+    frames = logged.tracked(frames + TRACKS_CACHE, "b")
 
     # What both of them published can be asked for.
     def kept(stream: str) -> list[bytes]:

@@ -19,7 +19,7 @@ def test_the_keys_of_a_stream() -> None:
     assert KEYS.owner(STREAM, "host-1") == "optipmb/v1/owner/site/node/sensor/host-1"
     assert KEYS.alive("host-1") == "optipmb/v1/service/host-1/alive"
     assert KEYS.status("host-1") == "optipmb/v1/service/host-1/q/status"
-    assert KEYS.discovered([STREAM, "a/b/c"], "m") == "optipmb/v1/service/m/discovered/site%node%sensor,a%b%c"
+    assert KEYS.discovered([STREAM, "a/b/c"], "m", "7") == "optipmb/v1/service/m/discovered/7/site%node%sensor,a%b%c"
 
 
 def test_the_key_expressions() -> None:
@@ -38,7 +38,7 @@ def test_zenoh_agrees() -> None:
     topics = {"detections", "points", "tracks", "problems"}
     keys = {topic: getattr(KEYS, topic)(STREAM) for topic in topics}
     keys |= {"state": KEYS.query(STREAM, "state"), "owner": KEYS.owner(STREAM, "i"), "status": KEYS.status("i")}
-    keys["discovered"] = KEYS.discovered([STREAM, "a/b/c"], "i")
+    keys["discovered"] = KEYS.discovered([STREAM, "a/b/c"], "i", "7")
     for topic in topics:
         expression = zenoh.KeyExpr(KEYS.all(topic))
         assert {name for name, key in keys.items() if expression.intersects(zenoh.KeyExpr(key))} == {topic}
@@ -60,7 +60,8 @@ def test_the_stream_of_every_key(prefix: list[str], site: str, node: str, sensor
     made = [keys.detections(stream), keys.points(stream), keys.tracks(stream), keys.problems(stream)]
     made += [keys.query(stream, "state"), keys.query(stream, "reset"), keys.query(stream, "parameters")]
     made.append(keys.owner(stream, instance))
-    discovered = keys.discovered([stream, "a/b/c"], instance)
+    discovered = keys.discovered([stream, "a/b/c"], instance, site)
+    assert [keys.discovered_by(discovered, one) for one in (site, f"{site}0")] == [True, False]
     assert (keys.discovered_streams(discovered), keys.instance_of(discovered)) == ([stream, "a/b/c"], instance)
     assert {keys.stream_of(key) for key in made} == {stream}
     for key in (keys.owner(stream, instance), keys.alive(instance), keys.status(instance)):

@@ -101,6 +101,21 @@ def test_a_gap_is_asked_for_once() -> None:
     assert (one.received, one.asked) == ([0, 1, 2, 3, 4, 6, 7, "a/b", 5, 8], [])
 
 
+def test_what_no_cache_holds_is_said_to_be_lost() -> None:
+    """Before the sample behind it, with its key; not what the cache still has, nor repetitions."""
+    one, found = Joined(), list[object]()
+    one.join = LateJoin(
+        lambda sample: found.append(sample.source_info and sample.source_info.source_sn),
+        lambda *query: one.asked.append(query),
+        lost=found.append,
+    )
+    one.take(0, 1, 1, 5)
+    one.answer(3, 4)
+    one.take(8, 9)
+    one.answer()
+    assert found == [0, 1, 1, "a/b", 3, 4, 5, "a/b", 8, 9]
+
+
 def test_a_cache_that_does_not_answer_is_not_said_to_have_answered() -> None:
     """What waited for it is handed over all the same, and so is what came of the answer."""
     one = Joined()

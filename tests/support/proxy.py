@@ -31,6 +31,8 @@ class Proxy:
         self._delay_s = delay_s
         self._whole = threading.Event()
         self._whole.set()
+        self._ways: list[threading.Event] = []
+        """Of each connection, whether its bytes are passed on."""
         self._sockets: list[socket.socket] = []
         self._threads: list[threading.Thread] = []
         self.delivered = 0
@@ -51,6 +53,8 @@ class Proxy:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._whole.set()
+        for way in self._ways:
+            way.set()
         self._sockets[0].shutdown(socket.SHUT_RDWR)
         self._threads[0].join()  # nothing is accepted from here on
         for one in self._sockets[1:]:
@@ -68,6 +72,11 @@ class Proxy:
     def mend(self) -> None:
         """Pass on what waited, and what comes."""
         self._whole.set()
+
+    def strand(self) -> None:
+        """Pass nothing of the connections that there are on, for ever, as a gateway that has forgotten them."""
+        for way in self._ways:
+            way.clear()
 
     def _start(self, run: object, *arguments: object) -> None:
         thread = threading.Thread(target=run, args=arguments)  # type: ignore[arg-type]  # of the methods below
@@ -87,11 +96,14 @@ class Proxy:
                     near.shutdown(socket.SHUT_RDWR)
                     continue
                 self._sockets.append(far)
+                passes = threading.Event()
+                passes.set()
+                self._ways.append(passes)
                 for source, sink in ((near, far), (far, near)):
                     source.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                     way: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
                     self._start(self._take, source, way)
-                    self._start(self._give, sink, way, sink is near)
+                    self._start(self._give, sink, way, passes, sink is near)
 
     def _take(self, source: socket.socket, way: queue.SimpleQueue[tuple[float, bytes]]) -> None:
         data = b"-"
@@ -102,12 +114,19 @@ class Proxy:
                 data = b""
             way.put((time.monotonic() + self._delay_s, data))
 
-    def _give(self, sink: socket.socket, way: queue.SimpleQueue[tuple[float, bytes]], counts: bool) -> None:  # noqa: FBT001 - of a thread
+    def _give(
+        self,
+        sink: socket.socket,
+        way: queue.SimpleQueue[tuple[float, bytes]],
+        passes: threading.Event,
+        counts: bool,  # noqa: FBT001 - of a thread
+    ) -> None:
         with contextlib.suppress(OSError):  # the other side has gone
             while True:
                 due, data = way.get()
                 time.sleep(max(0.0, due - time.monotonic()))  # the length of the way, not a wait for anything
                 self._whole.wait()
+                passes.wait()
                 if not data:
                     sink.shutdown(socket.SHUT_WR)
                     return

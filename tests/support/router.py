@@ -117,11 +117,11 @@ class Collected:
 
 
 class Node:
-    """A publisher and subscriber as users write them; a client of the router at `endpoint`."""
+    """A publisher and subscriber as users write them; a client of the router at `endpoint`, perhaps with its own id."""
 
-    def __init__(self, endpoint: str, keys: Keys | None = None) -> None:
+    def __init__(self, endpoint: str, keys: Keys | None = None, zid: str = "") -> None:
         self.keys = keys or Keys()
-        self.session = zenoh.open(_configuration(endpoint))
+        self.session = zenoh.open(_configuration(endpoint, {"id": zid} if zid else {}))
         self._publishers: dict[str, Any] = {}
         self._closing: list[Callable[[], object]] = []
         self.tracks_seen = self._collect(self.keys.all("tracks"))
@@ -288,7 +288,7 @@ class Node:
         threading.Thread(target=loop, daemon=True).start()
 
 
-def _configuration(endpoint: str) -> zenoh.Config:
+def _configuration(endpoint: str, more: dict[str, object]) -> zenoh.Config:
     """What publishers should set: without the waits messages are dropped on a busy machine."""
     waits = "transport/link/tx/queue/congestion_control/drop"
     values: dict[str, object] = {
@@ -300,7 +300,7 @@ def _configuration(endpoint: str) -> zenoh.Config:
         f"{waits}/max_wait_before_drop_fragments": 1_000_000,
     }
     config = zenoh.Config()
-    for key, value in values.items():
+    for key, value in (values | more).items():
         config.insert_json5(key, json.dumps(value))
     return config
 

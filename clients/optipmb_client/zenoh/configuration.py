@@ -12,6 +12,7 @@ __all__ = ["DEFAULT_ENDPOINT", "configuration"]
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 WAIT_BEFORE_DROP_US = 50_000  # with the defaults (1 ms) large messages are lost whenever the machine is busy
 WAIT_BEFORE_DROP_FRAGMENTS_US = 500_000
+LEASE_MS = 3000  # after so long a router takes a silent client for gone, and lets it in again; by default 10 s
 CLOUD_BATCHES = 16  # of 64 kB on the way to the network: with the default of 2 sending a cloud takes four times as long
 
 
@@ -23,11 +24,13 @@ def configuration(endpoints: tuple[str, ...], config: str | Path | None, timeout
     """
     try:
         settings = zenoh.Config() if config is None else zenoh.Config.from_file(config)
+        own = json.loads(settings.get_json("id"))
         if config is None:
             values: dict[str, object] = {
                 "mode": "client",
                 "transport/link/tx/queue/size/data_low": CLOUD_BATCHES,
                 "scouting/multicast/enabled": False,
+                "transport/link/tx/lease": LEASE_MS,
                 "transport/shared_memory/enabled": False,
                 "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
                 "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": (
@@ -49,4 +52,9 @@ def configuration(endpoints: tuple[str, ...], config: str | Path | None, timeout
             f"not a usable Zenoh endpoint or configuration: {where} (an endpoint looks like {DEFAULT_ENDPOINT})",
             endpoints=endpoints,
         ) from error
+    if own is not None:  # Zenoh numbers what a session sends, and drops what comes again from a session of the same id
+        raise ConnectionFailed(
+            f'{config}: id: expected none, received "{own}": nobody would hear the second run of this program, nor'
+            " another one of that id; remove it"
+        )
     return settings

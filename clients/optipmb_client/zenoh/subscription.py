@@ -33,7 +33,8 @@ class Subscription:
         self._inbox = inbox
         self._session = session
         self._queries: CacheQueries[zenoh.Sample] = CacheQueries(self._ask)
-        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._receive, self._queries.ask)
+        self._after_loss: set[str] = set()
+        self._late_join: LateJoin[zenoh.Sample] = LateJoin(self._receive, self._queries.ask, lost=self._after_loss.add)
         self._draining: threading.Thread | None = None
         self._drained = threading.Event()
         # Zenoh calls back on a Python thread that it starts for the handler, before it declares anything. It is a pair:
@@ -52,8 +53,10 @@ class Subscription:
 
     def _receive(self, sample: zenoh.Sample) -> None:
         arrived = time.monotonic_ns()
-        payload = sample.payload.to_bytes()
-        self._inbox.put(Arrival(str(sample.key_expr), payload, str(sample.encoding), arrived))
+        payload, key = sample.payload.to_bytes(), str(sample.key_expr)
+        after_loss = key in self._after_loss
+        self._after_loss.discard(key)
+        self._inbox.put(Arrival(key, payload, str(sample.encoding), arrived, after_loss))
 
     def _ask(self, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[bool], None]) -> None:
         errors = []

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from optipmb_service.observability.metrics import Value
     from optipmb_service.runtime.ports import Request
     from optipmb_service.settings.model import Settings
+    from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
 
@@ -71,6 +72,9 @@ class Network(Protocol):
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:
         """Hand over what comes on a stream, and the detections of a pattern of others, until the result is called."""
+
+    def client(self) -> Client:
+        """Return what says whether there is a router."""
 
 
 class AggregateView:
@@ -126,16 +130,20 @@ class AggregateView:
         return self.state() in {"ready", "degraded"} and "ready" in self._workers.states
 
     def failure(self) -> str:
-        """Return which workers are not ready; empty while all are."""
+        """Return why there is no network, or which workers are not ready; empty while all is well."""
+        if why := self._network.client().failure:
+            return why
         states = enumerate(self._workers.states)
         return ", ".join(f"worker {index}: {state}" for index, state in states if state != "ready")
 
     def state(self) -> str:
-        """Return the state of the whole: degraded when a worker is down."""
+        """Return the state of the whole: unlinked without a router, degraded when a worker is down."""
         if self._ending:
             return "stopping"
         if not self._workers.began:
             return "starting"
+        if self._network.client().failure:
+            return "unlinked"
         return "ready" if all(state == "ready" for state in self._workers.states) else "degraded"
 
     def status(self) -> schemas.ServiceStatus:
@@ -245,9 +253,13 @@ class AggregateView:
         keys = [key(f"{self._instance}-w{index}") for index in range(self._workers.count)]
         return list(self._asking.map(lambda one: self._network.ask(one, ANSWER_S), keys))
 
+    def _figures(self) -> Iterator[Value]:
+        yield from collectors.of_process(self._instance, self.state())
+        yield "linked", (), not self._network.client().failure
+
     def _families(self) -> Iterator[Metric]:
         merged: dict[str, Metric] = {}
-        own = ReadOnDemand(lambda: collectors.of_process(self._instance, self.state())).collect()
+        own = ReadOnDemand(self._figures).collect()
         parts = [("", [*own, *self._registry.collect()])]
         for index, samples in enumerate(self._ask(self._keys.samples)):
             if samples is None:

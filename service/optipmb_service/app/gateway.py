@@ -23,7 +23,6 @@ class _Gateway:
     """What a gateway reports: whether it can be used."""
 
     stuck: Final = False
-    failure: Final = ""
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -31,7 +30,12 @@ class _Gateway:
     @property
     def state(self) -> str:
         """Ready while it has a router."""
-        return "ready" if self._client.linked() else "unlinked"
+        return "unlinked" if self.failure else "ready"
+
+    @property
+    def failure(self) -> str:
+        """Why it cannot be used; empty while it can."""
+        return self._client.failure
 
     def status(self) -> None:
         """Return nothing: a gateway has no streams."""

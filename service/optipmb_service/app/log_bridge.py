@@ -72,9 +72,9 @@ class LogBridge:
 
     @property
     def failure(self) -> str:
-        """Why nothing can be written; empty while it can."""
+        """Why nothing can be received or written; empty while it can."""
         why = self._writer.failure
-        return f"log: {why}" if why else ""
+        return self._client.failure or (f"log: {why}" if why else "")
 
     def status(self) -> None:
         """Return nothing: a bridge has no streams."""

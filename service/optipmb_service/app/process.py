@@ -13,6 +13,7 @@ from optipmb_service.app.edges import monitoring
 from optipmb_service.app.ending import END_HUNG, RESTART, EndBound, longest_end_s
 from optipmb_service.app.loops import StopRequest, beat, unless, watch_keys
 from optipmb_service.cluster.store import StoreError
+from optipmb_service.observability import collectors
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh.client import Client
@@ -67,7 +68,7 @@ async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHe
         client = await unless(asked, lambda: Client.opened(settings))
         if client is None:
             return None
-        health.metrics.add(lambda: [("declared_keys_total", (), client.key_numbers.declared)])
+        health.metrics.add(lambda: collectors.of_network(client.key_numbers.declared, linked=client.linked()))
         watching = asyncio.create_task(watch_keys(asked, lambda: client.key_numbers, settings.restart_keys))
         try:
             await serve(asked, health, client)

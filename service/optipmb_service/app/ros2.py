@@ -42,7 +42,7 @@ QUEUE: Final = 2048
 QUEUE_BYTES: Final = 2**28
 """Messages that wait for the working thread, and their bytes."""
 
-CACHE: Final = 200
+CACHE: Final = 400
 """Detections of a stream kept for a service that restarts: 10 s at 20 Hz."""
 
 DIAGNOSTICS_S: Final = 1.0

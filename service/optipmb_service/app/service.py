@@ -55,6 +55,9 @@ JOIN_S: Final = 0.3
 SAVE_S: Final = 0.5
 """The last checkpoints have so long even where messages took all the time."""
 
+NAMESAKE_NS: Final = 10_000_000_000
+"""How often another process of the same name is looked for."""
+
 LEASES_S: Final = 1.0
 """What is left at the end to say that the leases are free, however long the checkpoints take."""
 
@@ -87,6 +90,7 @@ class Service:
         self._settings = settings
         self._started_ns = time.time_ns()
         self._began_ns = time.monotonic_ns()
+        self._namesake_ns = 0
         self._state = "starting"
         self._metrics = metrics or Metrics()
         store, keeps_nothing = open_store(settings, private)
@@ -144,7 +148,7 @@ class Service:
         """Receive, answer, and say so."""
         self._transport.watch()
         self._persistence.start(self._registry.keep)
-        self._member.start(self._intake.changed, self._registry.resume, self._registry.occupied)
+        self._member.start(self._intake.changed, self._registry.resume, self._registry.occupied, self.client().linked)
         self._intake.start()
         self._transport.serve(self._stream_queries.answer, self._service_queries.answer)
         self._state = "ready"
@@ -155,6 +159,10 @@ class Service:
         """Do what is due about once a second."""
         now_ns = time.monotonic_ns()
         self._registry.sweep(now_ns)
+        self._transport.look_for_returned(self._report_returned)
+        if now_ns >= self._namesake_ns:
+            self._namesake_ns = now_ns + NAMESAKE_NS
+            self._transport.look_for_namesake(self._report_namesake)
         self._reporter.flush(now_ns)
 
     def stop(self, seconds: float = math.inf) -> bool:
@@ -207,20 +215,22 @@ class Service:
 
     @property
     def failure(self) -> str:
-        """Why the state is `degraded`; empty while it is not."""
-        return self._member.failure or self._persistence.failure
+        """Why the state is `degraded`, `paused` or `unlinked`; empty while it is none of these."""
+        return self._member.failure or self.client().failure or self._persistence.failure
 
     @property
     def state(self) -> str:
-        """What the service is: starting, ready, degraded, paused, draining or stopping.
+        """What the service is: starting, ready, degraded, paused, unlinked, draining or stopping.
 
-        Degraded: it tracks, and cannot keep checkpoints. Paused: it may not publish, for it has no lease. Draining: it
-        leaves its streams to others, or has.
+        Degraded: it tracks, and cannot keep checkpoints. Paused: it may not publish, for it has no lease. Unlinked: it
+        has no router. Draining: it leaves its streams to others, or has.
         """
         if self._state != "ready":
             return self._state
         if self._member.failure:
             return "paused"
+        if self.client().failure:
+            return "unlinked"
         if self._member.draining:
             return "draining"
         return "degraded" if self._persistence.failure else "ready"
@@ -269,6 +279,31 @@ class Service:
                 summaries += [summary] if summary is not None else []
         return tuple(summaries)
 
+    def _report_returned(self, token: str, due: int, newest: int) -> None:
+        expected, received = f"messages numbered from {due} on by Zenoh", f"numbers that began again, now {newest}"
+        problem = problem_of(
+            "numbers_back",
+            stream=schemas.Keys(self._settings.prefix).stream_of(token),
+            instance=self._settings.instance,
+            expected=expected,
+            received=received,
+            message=f"Publisher: expected {expected}, received {received}; remove `id` from its Zenoh configuration.",
+        )
+        self._reporter.report(problem, time.monotonic_ns())
+
+    def _report_namesake(self) -> None:
+        name = self._settings.instance
+        problem = problem_of(
+            "duplicate_name",
+            stream="",
+            instance=name,
+            path="instance",
+            expected="a name that no other process has",
+            received=name,
+            message=f"Setting instance: another process is named {name}, too; give each a name of its own.",
+        )
+        self._reporter.report(problem, time.monotonic_ns())
+
     def _unkept(self, stream: str, why: str) -> None:
         """Report that the state of a stream cannot be kept."""
         self._report(stream, "a state that can be written down", why)
@@ -297,7 +332,8 @@ class Service:
             standing_by=self._intake.standing_by,
             now_ns=time.monotonic_ns(),
         )
-        yield "declared_keys_total", (), self.key_numbers.declared
+        client = self.client()
+        yield from collectors.of_network(client.key_numbers.declared, linked=client.linked())
         yield from collectors.of_sessions(sessions)
         yield from collectors.of_densities(densities)
         yield from collectors.of_streams(sessions, self._settings.http_streams)

@@ -17,9 +17,9 @@ higher than all before it. No clock is ever compared with another one.
 
 Every member computes from the living ones how many partitions each is to have, within one of an equal share, leaves
 what it has beyond that, and takes what is free up to it. `wish/<number>` names the instance that an operator wants to
-have a partition: while such a member lives, no other takes it, and who holds it leaves it. A member that drains says
-so in its record: its share is nothing, the others have it. Partitions are left a few at a time, so that the streams of
-one wait for nothing but their own restoring.
+have a partition: while such a member lives, no other takes it, and who holds it leaves it. A member that drains, or
+has no router, says so in its record: its share is nothing, the others have it. Partitions are left a few at a time, so
+that the streams of one wait for nothing but their own restoring.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ PARTITIONS: Final = 64
 ALIVE: Final = "alive"
 DRAINING: Final = "draining"
 """What the record of a member says that gives its partitions up."""
+UNLINKED: Final = "unlinked"
+"""The same of a member that has no router, so it neither receives nor publishes."""
 
 NOBODY: Final = ""
 
@@ -136,7 +138,7 @@ class MemberLease:
 
     Attributes:
         member: its id.
-        state: `alive` or `draining`.
+        state: `alive`, `draining` or `unlinked`.
         age_ns: since its newest renewal was seen.
         fences: the partitions that it holds, each with its fence.
     """
@@ -157,7 +159,7 @@ class LeaseTable:
         position: the highest revision seen.
         held: partitions that it holds, each with its fence; may be read by any thread.
         leaving: of these, those that it is about to leave, since when.
-        draining: whether others are to have what it holds.
+        state: what its record says; unless `alive`, others are to have what it holds.
         moving: whether it has fewer partitions than it is to have, or more.
         changed_ns: when something but a renewal was seen last.
     """
@@ -167,15 +169,15 @@ class LeaseTable:
     position: int = 0
     held: dict[int, int] = field(default_factory=dict)
     leaving: dict[int, int] = field(default_factory=dict)
-    draining: bool = False
+    state: str = ALIVE
     moving: bool = False
     changed_ns: int = 0
     _members: dict[str, _Watched] = field(default_factory=dict)
     _partitions: dict[int, tuple[int, str]] = field(default_factory=dict)
     _wishes: dict[int, str] = field(default_factory=dict)
     _looked_ns: int | None = None
-    _done_when: bool | None = None
-    """Whether it drained when there was nothing to write or to wait for; None: something has changed since."""
+    _done_when: str | None = None
+    """Its state when there was nothing to write or to wait for; None: something has changed since."""
 
     def take_in(self, records: Iterable[Record], now_ns: int) -> None:
         """Take in what has changed, or that nothing has."""
@@ -235,20 +237,19 @@ class LeaseTable:
         return tuple(self._members.items())
 
     def takers(self) -> list[str]:
-        """Return the living members that do not drain, by id."""
-        others = [name for name, one in self._all() if one.alive and one.state != DRAINING]
-        return sorted(others if self.draining else [self.member, *others])
+        """Return the living members that take partitions, by id."""
+        others = [name for name, one in self._all() if one.state == ALIVE]
+        return sorted([self.member, *others] if self.state == ALIVE else others)
 
     def leases(self, renewed_ns: int, now_ns: int) -> list[MemberLease]:
         """Return the living members, by id; this one has renewed its record at `renewed_ns`."""
         held: dict[str, dict[int, int]] = {}
         for partition, (fence, holder) in sorted(tuple(self._partitions.items())):  # noqa: C414 - in one go, for the member's thread writes it
             held.setdefault(holder, {})[partition] = fence
-        own = DRAINING if self.draining else ALIVE
         known = [(name, one.state, one.seen_ns) for name, one in self._all() if one.alive]
         return [
             MemberLease(name, state, max(0, now_ns - seen_ns), held.get(name, {}))
-            for name, state, seen_ns in sorted([(self.member, own, renewed_ns), *known])
+            for name, state, seen_ns in sorted([(self.member, self.state, renewed_ns), *known])
         ]
 
     def holds(self, partition: int) -> bool:
@@ -270,7 +271,7 @@ class LeaseTable:
             gone: whether the process of a member has ended for certain.
         """
         writes = self._endings(now_ns, gone)
-        if not writes and self._done_when is self.draining:
+        if not writes and self._done_when == self.state:
             return []  # the usual case
         self._done_when = None
         mine, others = self._wished()
@@ -299,7 +300,7 @@ class LeaseTable:
             writes.append(Write(partition_key(partition), self.member, revision))
         writes += self._leavings(now_ns, occupied)
         if not writes and not left:
-            self._done_when = self.draining
+            self._done_when = self.state
         return writes
 
     def _endings(self, now_ns: int, gone: Callable[[str], bool]) -> list[Write]:
@@ -332,7 +333,7 @@ class LeaseTable:
             self._set(int(name), revision, write.value)
 
     def _share(self) -> int:
-        """Return how many of all partitions are an equal share of this member; who drains has one where all do."""
+        """Return how many of all partitions are an equal share of this member; where none takes any, all have one."""
         members = self.takers() or self.members()
         if self.member not in members:
             return 0

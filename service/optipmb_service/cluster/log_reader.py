@@ -17,7 +17,7 @@ from nats.errors import Error as NatsError
 from optipmb_service.cluster.nats_connection import RefusedError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from optipmb_service.cluster.log_position import Missed, Position
     from optipmb_service.cluster.message_log import LogMessage, MessageLog
@@ -62,15 +62,18 @@ class LogReader:
         self._back_s = back_s
         self._turns = asyncio.Semaphore(AT_ONCE)
 
-    def missed(self, wanted: Missed, take: Callable[[list[LogMessage]], None]) -> None:
+    def missed(
+        self, wanted: Missed, take: Callable[[list[LogMessage]], None], again_s: Sequence[float] = AGAIN_S
+    ) -> None:
         """Read what a session has missed, without waiting for it.
 
         Args:
             wanted: of which streams, from where on.
             take: called, on a thread that must not be kept, with what there is, in the order of the log of each stream;
                 then a few times with what has come since. The first time it is called in any case.
+            again_s: pauses after which the log is read again.
         """
-        self._log.connection.start(self._missed(wanted, take))
+        self._log.connection.start(self._missed(wanted, take, again_s))
 
     def tracks(
         self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
@@ -92,9 +95,9 @@ class LogReader:
 
     # On the loop
 
-    async def _missed(self, wanted: Missed, take: Callable[[list[LogMessage]], None]) -> None:
+    async def _missed(self, wanted: Missed, take: Callable[[list[LogMessage]], None], again_s: Sequence[float]) -> None:
         parts: dict[str, _Part] = {}
-        for number, pause_s in enumerate((0.0, *AGAIN_S)):
+        for number, pause_s in enumerate((0.0, *again_s)):
             await asyncio.sleep(pause_s)
             messages = await self._look(wanted, parts)
             if messages or number == 0:

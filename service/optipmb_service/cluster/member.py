@@ -16,6 +16,7 @@ from optipmb_service.cluster.leases import (
     ALIVE,
     DRAINING,
     PARTITIONS,
+    UNLINKED,
     Change,
     LeaseTable,
     MemberLease,
@@ -53,6 +54,9 @@ STRAINED: Final = 4
 SLOW_LEASES: Final = 2
 """Leases in which no renewal was in time: then it is the store that is slow, and waiting does not help."""
 
+UNLINKED_PER_LEASE: Final = 4
+"""Part of a lease without a router from which on others are to have the partitions: most routers are back before."""
+
 WRITE_LEASES_PER_LEASE: Final = 2
 RETRY_S: Final = 0.1
 """At the end, between two tries to say so."""
@@ -89,7 +93,9 @@ class Member:
         self._error = "not a member yet"
         self._failing = False
         self._unwritable = False
-        self._value = ALIVE
+        self._drains = False
+        self._linked: Callable[[], bool] = lambda: True
+        self._linked_ns = clock()
         self._said = ALIVE
         self._shown: tuple[list[str], int] = ([], 0)
         self._reported: dict[int, int] = {}
@@ -108,6 +114,7 @@ class Member:
         changed: Callable[[int, Change], None],
         resumed: Callable[[], None],
         occupied: Callable[[], Container[int]],
+        linked: Callable[[], bool] = lambda: True,
     ) -> None:
         """Join the others.
 
@@ -115,8 +122,9 @@ class Member:
             changed: called with every change of a partition; must not take long.
             resumed: called when a lapsed write lease holds again.
             occupied: returns the partitions with a stream whose state is not kept yet.
+            linked: whether this process has a router; must not take long.
         """
-        self._changed, self._resumed, self._occupied = changed, resumed, occupied
+        self._changed, self._resumed, self._occupied, self._linked = changed, resumed, occupied, linked
         if not self._store.remote:
             # Who is alone has all partitions before the first message comes.
             for _ in range(FIRST_TURNS):
@@ -177,7 +185,12 @@ class Member:
     @property
     def draining(self) -> bool:
         """Whether it gives its partitions up and takes none."""
-        return self._value == DRAINING
+        return self._drains
+
+    @property
+    def unlinked(self) -> bool:
+        """Whether it gives its partitions up because it has no router."""
+        return self._table.state == UNLINKED
 
     @property
     def others(self) -> bool:
@@ -186,7 +199,7 @@ class Member:
 
     def drain(self, *, drains: bool = True) -> None:
         """Give up all partitions, each with the states of its streams, and take none; or take a share again."""
-        self._value = DRAINING if drains else ALIVE
+        self._drains = drains
         self._wake.set()
 
     def drained(self, timeout: float) -> bool:
@@ -238,7 +251,7 @@ class Member:
 
     def _turn(self) -> None:
         """Renew, look, write what is due."""
-        self._table.draining = self.draining
+        self._table.state = self._state()
         if not self._keep():
             return
         records, now_ns = self._store.follow(self._table.position), self._clock()
@@ -251,10 +264,19 @@ class Member:
             if write.value == ENDED:
                 self._wake.set()  # its partitions can be taken at once
 
+    def _state(self) -> str:
+        """Return what the record of this member is to say."""
+        now_ns = self._clock()
+        if self._linked():
+            self._linked_ns = now_ns
+        if self._drains:
+            return DRAINING
+        return UNLINKED if now_ns - self._linked_ns > self._lease_ns // UNLINKED_PER_LEASE else ALIVE
+
     def _keep(self) -> bool:
         """Renew this member's record if it is time to; False: nothing else can be done now."""
         sent_ns = self._clock()
-        value = self._value
+        value = self._table.state
         due = sent_ns - self._renewed_ns >= self._lease_ns // RENEWALS_PER_LEASE or value != self._said
         if self._revision and not due:
             return not self._unwritable
@@ -316,7 +338,8 @@ class Member:
         if self._table.held:
             log.error("lease_lost", member=self._table.member, partitions=len(self._table.held))
         self._error = "another member has taken over its partitions"
-        self._table = self._joining()
+        state, self._table = self._table.state, self._joining()
+        self._table.state = state
         self._revision = 0
 
     def _joining(self) -> LeaseTable:

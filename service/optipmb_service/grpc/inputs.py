@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from optipmb_service.grpc.selection import Selection
     from optipmb_service.zenoh.client import Outgoing
 
-CACHE: Final = 200
+CACHE: Final = 400
 """Detections that are kept for recovery unless the publisher says otherwise: 10 s of a sensor at 20 Hz."""
 
 MAX_CACHE: Final = 4096

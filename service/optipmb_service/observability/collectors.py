@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from optipmb_service.observability.metrics import Value
     from optipmb_service.session.values import MessageCounters
 
-STATES: Final = ("starting", "ready", "degraded", "paused", "draining", "stopping")
+STATES: Final = ("starting", "ready", "degraded", "paused", "unlinked", "draining", "stopping")
 SESSION_STATES: Final = ("new", "running", "stale")
 QUANTILES: Final = ("0.5", "0.99")
 
@@ -27,6 +27,12 @@ def of_process(instance: str, state: str) -> Iterator[Value]:
     yield "info", (instance, __version__), 1
     for name in (*STATES, *({state} - set(STATES))):
         yield "state", (name,), state == name
+
+
+def of_network(declared: int, *, linked: bool) -> Iterator[Value]:
+    """Give how a process is connected: the keys that it has declared, and whether it has a router."""
+    yield "declared_keys_total", (), declared
+    yield "linked", (), linked
 
 
 def of_problems(counts: dict[str, int]) -> Iterator[Value]:

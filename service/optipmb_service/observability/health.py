@@ -1,8 +1,8 @@
 """How the process is, for those who ask from outside: from before the service exists until after its end.
 
 The control loop beats; whoever asks sees for how long it has not. States: `starting`, then what the service says
-(`ready`, `degraded` when it works with a part missing, `paused` when it may not publish, or `draining` when others
-track its streams), then `stopping`.
+(`ready`, `degraded` when it works with a part missing, `paused` when it may not publish, `unlinked` without a router,
+or `draining` when others track its streams), then `stopping`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class StatusSource(Protocol):
 
     @property
     def failure(self) -> str:
-        """Why it is degraded; empty while it is not."""
+        """Why it cannot be used, or works with a part missing; empty while it works."""
 
     def status(self) -> schemas.ServiceStatus | None:
         """Return its report; None when it makes none."""
@@ -92,7 +92,7 @@ class ProcessHealth:
         return self.beat_age_s() < STUCK_S and not (service is not None and service.stuck)
 
     def failure(self) -> str:
-        """Return why the service is degraded; empty while it is not."""
+        """Return why the service cannot be used, or works with a part missing; empty while it works."""
         service = self._service
         return "" if service is None else service.failure
 

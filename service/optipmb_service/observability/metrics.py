@@ -75,6 +75,7 @@ SERVICE_METRICS: Final = {
     "declared_keys_total": MetricFamily(
         "counter", (), "Keys declared on the network; the process restarts at `restart_keys`."
     ),
+    "linked": MetricFamily("gauge", (), "1 while the process has a router, or is one."),
     "queue_frames": MetricFamily("gauge", (), "Frames waiting."),
     "oldest_data_seconds": MetricFamily("gauge", (), "Time since the last frame of the longest silent stream."),
     "tracks": MetricFamily("gauge", (), "Tracks in the newest frames."),

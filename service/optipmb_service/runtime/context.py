@@ -65,6 +65,7 @@ class ActorContext:
         mailbox_bytes: most bytes waiting per stream.
         mailboxes: bytes that may wait, over all streams.
         step_limit_ns: processor time that one message may take.
+        silent_ns: silence of a stream after which the log is read, where there is one.
         sink: where results go.
         reporter: where problems go.
         parameters_of: profile of a stream.
@@ -95,6 +96,7 @@ class ActorContext:
     mailbox_bytes: int
     mailboxes: ByteBudget
     step_limit_ns: int
+    silent_ns: int
     sink: MessageSink
     reporter: ProblemReporter
     parameters_of: Callable[[str], optipmb.Parameters]

@@ -94,9 +94,9 @@ class Inputs(Others, Protocol):
         """Receive streams no longer."""
 
     def watch_streams(
-        self, published: Callable[[str, str, bool], None], discovered: Callable[[str, str, bool], None]
+        self, published: Callable[[str, str, bool], None], discovered: Callable[[str, bool], None]
     ) -> None:
-        """Tell of the tokens of publishers, and of streams that are announced, by whom; each True: it is there."""
+        """Tell of the tokens of publishers, and of streams that others announce; each True: it is there."""
 
     def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
         """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more."""
@@ -238,9 +238,7 @@ class Intake:
         if stream is not None and self._directory.published(stream, token, time.monotonic_ns(), present=present):
             self._wake.set()
 
-    def _discovered(self, key: str, instance: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
-        if instance == self._registry.instance:
-            return
+    def _discovered(self, key: str, present: bool) -> None:  # noqa: FBT001 - as the network calls it
         now_ns = time.monotonic_ns()
         for stream in self._registry.keys.discovered_streams(key):
             if self._registry.fusion.is_session(stream):

@@ -1,12 +1,13 @@
 """What a session has missed while nobody tracked it, from the log: one more source beside the caches of publishers.
 
-What comes from several sources, or was tracked already, the session drops.
+What comes from several sources, or was tracked already, the session drops. The log is read when a session is opened,
+and when one is silent (`LogCheck`): its frames may be there and not arrive, as behind a cut between two routers.
 """
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 import structlog
 
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
+MOST_PAUSES: Final = 8
+"""Times the silence after which the log is read first: the longest pause between two looks that find nothing."""
+
 
 class MissedFrames(Protocol):
     """Where the frames are that a session has missed."""
@@ -38,6 +42,9 @@ class MissedFrames(Protocol):
 
         Both take packets, each with whether it is a frame, on a thread that they must not keep.
         """
+
+    def look(self, checkpoint: Checkpoint, then: Take) -> None:
+        """Have `then` called soon, once, with what came after the newest frames of a checkpoint."""
 
     def close(self, timeout: float) -> None:
         """End."""
@@ -50,6 +57,11 @@ class NoLog:
         """Go on at once."""
         del session, checkpoint, later
         first([])
+
+    def look(self, checkpoint: Checkpoint, then: Take) -> None:
+        """Find nothing."""
+        del checkpoint
+        then([])
 
     def close(self, timeout: float) -> None:
         """Nothing is open."""
@@ -88,6 +100,12 @@ class LoggedFrames:
             log.exception("internal_error", stream=session)
             first([])
 
+    def look(self, checkpoint: Checkpoint, then: Take) -> None:
+        """Have the log read once, for the streams that have fed the session of a checkpoint."""
+        positions = newest_of(checkpoint)
+        wanted = Missed(tuple(positions), node="", belongs=lambda _: False, positions=positions)
+        self._reader.missed(wanted, lambda messages: then(self._packets(messages)), again_s=())
+
     def close(self, timeout: float) -> None:
         """Close the connection."""
         self._reader.close(timeout)
@@ -101,6 +119,17 @@ class LoggedFrames:
             )
             for one in messages
         ]
+
+
+def newest_of(checkpoint: Checkpoint) -> dict[str, Position]:
+    """Return, for each stream of a session, the newest frame that has come."""
+    return {
+        name or checkpoint.stream: Position(
+            frozenset(one.epoch for one in epochs[:-1]), epochs[-1].epoch, epochs[-1].highest, tracked=True
+        )
+        for name, epochs in checkpoint.seen.items()
+        if epochs
+    }
 
 
 def positions_of(checkpoint: Checkpoint) -> dict[str, Position]:
@@ -122,3 +151,45 @@ def positions_of(checkpoint: Checkpoint) -> dict[str, Position]:
             at = Position(frozenset(), first.epoch, first.seq - 1, tracked=False)
         positions[name or checkpoint.stream] = at
     return positions
+
+
+class LogCheck:
+    """The looks of one session into the log.
+
+    The control loop asks when one is due; the tracking thread and the log's reader say what became of it.
+
+    Args:
+        silent_ns: silence after which the log is read.
+    """
+
+    def __init__(self, silent_ns: int) -> None:
+        self._silent_ns = self._pause_ns = silent_ns
+        self._due_ns = 0
+        self._behind = False
+        self._under_way = False
+
+    def due(self, age_ns: int, now_ns: int) -> bool:
+        """Whether to look now: a sensor is silent for too long, or the last look found frames.
+
+        Args:
+            age_ns: time since the last frame of the sensor that is silent for longest.
+            now_ns: monotonic time.
+        """
+        if self._under_way:
+            return False
+        if self._behind:
+            self._under_way = True
+            return True
+        if age_ns < self._silent_ns:
+            self._pause_ns, self._due_ns = self._silent_ns, 0
+            return False
+        if now_ns < self._due_ns:
+            return False
+        self._due_ns = now_ns + self._pause_ns
+        self._pause_ns = min(2 * self._pause_ns, MOST_PAUSES * self._silent_ns)
+        self._under_way = True
+        return True
+
+    def end(self, *, found: bool) -> None:
+        """End a look; called by any thread."""
+        self._behind, self._under_way = found, False

@@ -125,6 +125,7 @@ class Registry:
             mailbox_bytes=part_of(settings),
             mailboxes=self._mailboxes,
             step_limit_ns=round(settings.step_limit_s * SECOND),
+            silent_ns=round(settings.lease_s * SECOND),
             sink=sink,
             reporter=reporter,
             parameters_of=profiles.of,

@@ -22,6 +22,7 @@ import structlog
 from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.awaited_caches import AwaitedCaches
 from optipmb_service.runtime.mailbox import Mailbox
+from optipmb_service.runtime.missed_frames import LogCheck
 from optipmb_service.runtime.missed_queue import MissedQueue
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.session_opening import SessionOpening
@@ -73,6 +74,8 @@ class StreamActor:
         self._opening = SessionOpening(stream, context, fused=self.fused)
         self._missed = MissedQueue(stream, context.buffer)
         self._caches = AwaitedCaches(stream, context.caches)
+        self.log_check = LogCheck(context.silent_ns)
+        """When the log is read for frames that do not arrive."""
         self._waiting = context.buffer()
         self._asking: list[tuple[Callable[[StreamActor], None], bool]] = []
         self._armed_ns: int | None = None
@@ -264,8 +267,17 @@ class StreamActor:
         self._drop_session("superseded")
 
     def on_recalled(self) -> None:
-        """Another instance is to have the stream: leave it as soon as its state is kept."""
-        self.close_session("moved")
+        """Another instance is to have the stream: leave it as soon as its state is kept.
+
+        Without a router it is left as by a process that is killed: the newest tracks may not have left this process, so
+        the other one is to track their frames again.
+        """
+        if self._context.member.unlinked:
+            self._context.persistence.forget(self.stream)
+            self._drop_session("unlinked")
+            self._context.member.look()
+        else:
+            self.close_session("moved")
 
     # Sessions; to be called by the tracking thread alone
 
@@ -329,6 +341,20 @@ class StreamActor:
             self.mailbox.offer_command(self._take_missed, urgent=False)
         else:
             self._resume()
+
+    def look_in_log(self) -> None:
+        """Have the session take what the log has of its streams after their newest frames."""
+        session = self.session
+        if session is None or self._missed.buffers:
+            self.log_check.end(found=False)
+            return
+
+        def take(packets: list[tuple[Packet, bool]]) -> None:
+            if packets:
+                self._hand_over(packets, self._catch_up)
+            self.log_check.end(found=bool(packets))
+
+        self._context.missed.look(session.snapshot(), take)
 
     def close_session(self, reason: str) -> None:
         """End the session and free what it holds; the next valid message of the stream begins another, or goes on.

@@ -56,6 +56,10 @@ class StreamSensors:
                 self._stale.add(stream)
                 log.warning("stream_stale", stream=stream, age_s=round(age_s, 3))
 
+    def silent_ns(self, now_ns: int) -> int:
+        """Return the time since the last message of the stream that is silent for longest; called by any thread."""
+        return now_ns - min((meter.active_ns for meter in tuple(self._meters.values())), default=self._meter.active_ns)
+
     def summary(self, state: schemas.SessionState, now_ns: int, *, degraded: bool) -> schemas.SessionSummary:
         """Return the line of the service's status; may be called by any thread."""
         stale, sensors = frozenset(self._stale), sorted(self._meters)

@@ -64,6 +64,7 @@ class Sweep:
         self._stale_s = settings.stale_s
         self._idle_ns = settings.idle_s * SECOND
         self._memory_mb = settings.memory_mb
+        self._has_log = bool(settings.cluster)
         self._actors = actors
         self._member = member
         self._untracked = untracked
@@ -89,6 +90,8 @@ class Sweep:
             if actor.fused and session is not None and session.awaits_caches and actor.mailbox.idle:
                 self._command(actor.stream, StreamActor.on_caches_answered, urgent=False)  # or a publisher may be gone
             actor.sensors.look_for_silent(now_ns, self._stale_s)
+            if self._has_log and actor.log_check.due(actor.sensors.silent_ns(now_ns), now_ns):
+                self._command(actor.stream, StreamActor.look_in_log, urgent=False)
             if now_ns - actor.meter.active_ns > self._idle_ns and actor.mailbox.idle:
                 self._command(actor.stream, self._close_idle, urgent=False)
         for stream, owners in rivals.contested(now_ns):

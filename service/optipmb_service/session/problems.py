@@ -55,6 +55,14 @@ CODES: Final = {
         "Two instances without the same `store` track the stream.",
         "Give them one `store` or `cluster`, or routers of their own.",
     ),
+    "duplicate_name": (
+        "Another process answers by the name of this instance. Both track, but orders and status reach either.",
+        "Give each its own `instance`, or none: the default is unique.",
+    ),
+    "numbers_back": (
+        "A publisher began again with the Zenoh id of its last run: Zenoh drops as many messages as that had sent.",
+        "Remove `id` from its Zenoh configuration, and start it again.",
+    ),
     "cut": (
         "In answers to `q/tracks`: there are more tracks than one answer takes.",
         "Ask again from `stamp_ns` on, as `optipmb_client.kept_tracks` does.",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import secrets
 import socket
 from pathlib import Path
 from typing import Final, Literal
@@ -30,10 +31,16 @@ PREFIX: Final = "OPTIPMB_"
 """Of environment variables."""
 
 
+RUN: Final = secrets.token_hex(3)
+"""Tells this process from one with its number in another container that has the host's name."""
+
+HOST_CHARACTERS: Final = 40
+
+
 def _default_instance() -> str:
-    """Return a name that two services on one host do not share."""
-    host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()) or "host"
-    return f"{host}-{os.getpid()}"
+    """Return a name that two services do not share."""
+    host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()[:HOST_CHARACTERS]) or "host"
+    return f"{host}-{os.getpid()}-{RUN}"
 
 
 def state_home() -> Path:
@@ -53,7 +60,7 @@ class Settings(BaseSettings):
     instance: str = Field(
         default_factory=_default_instance,
         pattern=r"^[A-Za-z0-9_.-]{1,64}$",
-        description="name of this instance; default: the host's name and the process number",
+        description="name of this instance; default: the host's name, the process number and six random digits",
     )
     prefix: Prefix = Field(default="optipmb/v1", description="first chunks of every key")
     router: bool | None = Field(
@@ -119,7 +126,11 @@ class Settings(BaseSettings):
         description="highest speed of a sensor, m/s; poses beyond it are refused; 0: no check",
     )
     queue_frames: int = Field(
-        default=256, ge=1, le=65536, description="frames waiting per stream; then the oldest is dropped"
+        default=1024,
+        ge=1,
+        le=65536,
+        description="frames waiting per stream, as many as a publisher's cache may send at once after an outage; then"
+        " the oldest is dropped",
     )
     queue_clouds: int = Field(
         default=16,

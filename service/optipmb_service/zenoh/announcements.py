@@ -34,10 +34,11 @@ class Announcements:
         session: to declare on.
         keys: of the network.
         instance: who announces.
+        run: tells this process from others of its name.
     """
 
-    def __init__(self, session: zenoh.Session, keys: schemas.Keys, instance: str) -> None:
-        self._session, self._keys, self._instance = session, keys, instance
+    def __init__(self, session: zenoh.Session, keys: schemas.Keys, instance: str, run: str) -> None:
+        self._session, self._keys, self._instance, self._run = session, keys, instance, run
         self._groups: dict[str, tuple[str, ...]] = {}
         """The group of each stream that is announced."""
         self._tokens: dict[tuple[str, ...], Undeclared] = {}
@@ -66,6 +67,6 @@ class Announcements:
 
     def _declared(self, group: tuple[str, ...]) -> Undeclared:
         try:
-            return self._session.liveliness().declare_token(self._keys.discovered(group, self._instance))
+            return self._session.liveliness().declare_token(self._keys.discovered(group, self._instance, self._run))
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error

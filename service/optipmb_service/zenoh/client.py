@@ -147,6 +147,11 @@ class Client:
         return self._router or bool(self._session.info.routers_zid())
 
     @property
+    def failure(self) -> str:
+        """Why nothing can be received or sent; empty while it can."""
+        return "" if self.linked() else "network: no router"
+
+    @property
     def key_numbers(self) -> KeyCount:
         """What is used of the numbers that the session has for keys."""
         return key_numbers.used(self._session)

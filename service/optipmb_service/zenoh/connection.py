@@ -139,6 +139,12 @@ def _configuration(settings: Settings) -> zenoh.Config:
     else:
         values["transport/link/tx/queue/congestion_control/block/wait_before_close"] = WAIT_BEFORE_CLOSE_US
     config = _base(settings.zenoh_config)
+    own = json.loads(config.get_json("id"))
+    if own is not None and not settings.is_router:
+        raise TransportError(
+            f'Zenoh configuration {settings.zenoh_config}: id: expected none, received "{own}": nobody would hear the'
+            " second run of a client with it; remove it"
+        )
     # One interest in the subscribers of all tracks, and one in those of heartbeats, in place of two for each stream:
     # a router compares every subscription with all interests.
     tracks = schemas.Keys(settings.prefix).all("tracks")

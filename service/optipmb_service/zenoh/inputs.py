@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 import zenoh
 import zenoh.ext
-from optipmb_schemas.late_join import CacheQueries, LateJoin
+from optipmb_schemas.late_join import ANSWER_S, CacheQueries, LateJoin
 
 from optipmb_service.runtime.intake import ALL
 from optipmb_service.runtime.ports import TransportError
@@ -41,6 +42,13 @@ NEWEST: Final = zenoh.ext.HistoryConfig(detect_late_publishers=False, max_sample
 Late publishers are not detected: after a link was lost, the newest message would come so before those that it follows,
 and Zenoh would take these for lost. Heartbeats tell of what was missed.
 """
+
+MOST_RETURNED: Final = 16_384
+"""Publishers that are to be asked at once."""
+
+FIRST_PAUSE_NS: Final = 500_000_000
+LAST_PAUSE_NS: Final = 16_000_000_000
+"""Pauses before a publisher that came back is asked, each twice as long as the last one until it has sent something."""
 
 MOST: Final = 256
 """Messages of a topic that may wait while another thread hands over those before them."""
@@ -119,6 +127,10 @@ class Topic:
             # After what has come, which would be known again.
             self._in_turn(self._late_join.keep, kept)
 
+    def due(self, zid: str, eid: int) -> int:
+        """Return the number after the highest that was handed over of a publisher; 0 of one that is not known."""
+        return self._late_join.due(zid, eid)
+
     def pass_through(self, then: Callable[[], object]) -> None:
         """Call `then`, on some thread, when all that has come until now is handed over."""
         self._in_turn(then)
@@ -169,3 +181,69 @@ class Topic:
             self._receive(sample)
         except Exception:
             log.exception("internal_error", topic=self._name)  # nor what waits for its turn in `LateJoin`
+
+
+class ReturnedPublishers:
+    """Publishers whose tokens came back, and who are asked for the newest number in their caches.
+
+    After a lost link the numbers go on. Those of a program that was started again with the Zenoh id of its last run
+    begin anew, and Zenoh drops its messages, up to the highest number before, without a word.
+
+    Args:
+        session: to ask on.
+        due: returns the number that is expected next of a publisher, by Zenoh id and number of the entity; 0: it is not
+            known.
+    """
+
+    def __init__(self, session: zenoh.Session, due: Callable[[str, int], int]) -> None:
+        self._session = session
+        self._due = due
+        self._waiting: dict[str, tuple[int, int]] = {}
+        """Tokens, each with the monotonic time of its next query and the pause after that."""
+
+    def came(self, token: str) -> None:
+        """Note that a token has come; called by any thread."""
+        if self._expected(token) and len(self._waiting) < MOST_RETURNED:
+            self._waiting[token] = time.monotonic_ns() + FIRST_PAUSE_NS, FIRST_PAUSE_NS
+
+    def look(self, report: Callable[[str, int, int], None]) -> None:
+        """Ask those that are due, without waiting for the answers.
+
+        Args:
+            report: called, on a thread of the network, with the token of a publisher whose numbers went back, the
+                number that was expected next, and its newest one.
+        """
+        now_ns = time.monotonic_ns()
+        for token, (at_ns, pause_ns) in tuple(self._waiting.items()):
+            if now_ns < at_ns:
+                continue
+            if pause_ns > LAST_PAUSE_NS:  # it has sent nothing
+                self._waiting.pop(token, None)
+            else:
+                self._waiting[token] = now_ns + 2 * pause_ns, 2 * pause_ns
+                self._ask(token, report)
+
+    def _ask(self, token: str, report: Callable[[str, int, int], None]) -> None:
+        due = self._expected(token)
+
+        def take(reply: zenoh.Reply) -> None:
+            if (sample := reply.ok) is None or (info := sample.source_info) is None:
+                return
+            newest = info.source_sn
+            if self._waiting.pop(token, None) is not None and newest + 1 < due:
+                report(token, due, newest)
+
+        with contextlib.suppress(zenoh.ZError):  # the session is closed
+            self._session.get(
+                f"{token.rpartition('/')[0]}/**?_max=1",
+                zenoh.handlers.Callback(take, indirect=False),
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=zenoh.CongestionControl.DROP,
+                timeout=ANSWER_S,
+            )
+
+    def _expected(self, token: str) -> int:
+        zid, _, rest = token.rpartition("/@adv/pub/")[2].partition("/")
+        eid = rest.partition("/")[0]
+        return self._due(zid, int(eid)) if eid.isdecimal() else 0

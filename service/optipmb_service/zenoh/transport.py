@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 import threading
 import time
 from functools import partial
@@ -26,7 +27,7 @@ from optipmb_service.zenoh.handles import (
     publish_problem,
     undeclare,
 )
-from optipmb_service.zenoh.inputs import Topic
+from optipmb_service.zenoh.inputs import ReturnedPublishers, Topic
 from optipmb_service.zenoh.queries import OpenQueries
 from optipmb_service.zenoh.subscription import ask_cache
 
@@ -44,8 +45,11 @@ CHANNEL: Final = 4096
 RECENT_S: Final = 2.0
 """How long other instances may take to answer what they have received of streams that have come here."""
 
-TRACKS_CACHE: Final = 50
-"""Tracks kept per stream for subscribers that lost some or come late: 5 s at 10 Hz. Most of what a stream holds."""
+TRACKS_CACHE: Final = 100
+"""Tracks kept per stream for subscribers that lost some or come late: 5 s at 20 Hz. Most of what a stream holds.
+
+It is longer than a dead link of the client library takes to be noticed and replaced, 4 s.
+"""
 
 CACHES_S: Final = 1.0
 """How long the caches may take to answer."""
@@ -72,7 +76,10 @@ class Transport:
         self._topics: dict[str, Topic] = {}
         self._discover: Callable[[zenoh.Sample], None] = lambda _: None
         self._all = False
-        self._announcements = Announcements(self._session, self._keys, self._instance)
+        self._run = secrets.token_hex(8)
+        """Tells this process from all others, also from those of its name."""
+        self._announcements = Announcements(self._session, self._keys, self._instance, self._run)
+        self._returned = ReturnedPublishers(self._session, lambda *_: 0)
         self._publishers: set[Publisher] = set()
         self._lock = threading.Lock()
         self._alive: Undeclared | None = None
@@ -116,6 +123,7 @@ class Transport:
             "detections": Topic("detections", self._session, detected, answered),
             "points": Topic("points", self._session, lambda one: self._receive(one, str(one.key_expr), on_cloud)),
         }
+        self._returned = ReturnedPublishers(self._session, self._topics["detections"].due)
 
     def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
         """Receive the detections or clouds of a stream, or of all of them where it is empty; `discovery` is of all.
@@ -155,15 +163,21 @@ class Transport:
         detections.pass_through(lambda: points.pass_through(then))
 
     def watch_streams(
-        self, published: Callable[[str, str, bool], None], discovered: Callable[[str, str, bool], None]
+        self, published: Callable[[str, str, bool], None], discovered: Callable[[str, bool], None]
     ) -> None:
-        """Tell of publishers of detections with a cache, by key and token, and of announcements, by token."""
-        self._watch("publishers", self._keys.all_publishers(), lambda key, present: published(key, key, present))
-        self._watch(
-            "discovered",
-            self._keys.all_discovered(),
-            lambda key, present: discovered(key, self._keys.instance_of(key), present),
-        )
+        """Tell of publishers of detections with a cache, by key and token, and of others' announcements, by token."""
+
+        def announced(key: str, present: bool) -> None:  # noqa: FBT001 - as a token is told
+            if not self._keys.discovered_by(key, self._run):
+                discovered(key, present)
+
+        def returned(key: str, present: bool) -> None:  # noqa: FBT001 - as a token is told
+            published(key, key, present)
+            if present:
+                self._returned.came(key)
+
+        self._watch("publishers", self._keys.all_publishers(), returned)
+        self._watch("discovered", self._keys.all_discovered(), announced)
 
     def discover(self, streams: set[str]) -> None:
         """Announce these streams, and no others."""
@@ -213,6 +227,32 @@ class Transport:
             ask_cache(self._session, f"{self._keys.detections(stream)}/@adv/pub/**", reply, partial(then, found))
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
+
+    def look_for_namesake(self, found: Callable[[], None]) -> None:
+        """Have `found` called, on a thread of the network, for each other process that answers by the same name."""
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                found()
+
+        with contextlib.suppress(zenoh.ZError):  # the session is closed
+            self._session.get(
+                self._keys.metrics(self._instance),
+                zenoh.handlers.Callback(take, indirect=False),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=zenoh.CongestionControl.DROP,
+                allowed_destination=zenoh.Locality.REMOTE,
+                priority=zenoh.Priority.BACKGROUND,
+                timeout=RECENT_S,
+            )
+
+    def look_for_returned(self, report: Callable[[str, int, int], None]) -> None:
+        """Call `report` for each publisher that came back with numbers below those that it has sent.
+
+        It is called on a thread of the network, with the key of its token, the number expected next and its newest one.
+        """
+        self._returned.look(report)
 
     def serve(self, about_streams: Callable[[Request], None], about_service: Callable[[Request], None]) -> None:
         """Hand over the queries about streams and those about this instance, each on a thread of its own."""

@@ -20,6 +20,10 @@ class Network:
     def __init__(self) -> None:
         self.asked, self.gate = threading.Event(), threading.Event()
 
+    def client(self) -> SimpleNamespace:
+        """Return what has a router."""
+        return SimpleNamespace(failure="")
+
     def ask(self, key: str, timeout: float, payload: bytes = b"", encoding: str = "") -> None:
         """Return no answer."""
         del timeout, payload, encoding

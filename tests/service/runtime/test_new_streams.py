@@ -48,7 +48,7 @@ class Network:
     def watch_streams(self, published: Callable[..., None], discovered: Callable[..., None]) -> None:
         """Tell of the streams that there are."""
         for stream in self._announced:
-            discovered(KEYS.discovered([stream], "other"), "other", True)
+            discovered(KEYS.discovered([stream], "other", "run"), True)
         for stream in self._published:
             published(f"{KEYS.detections(stream)}/@adv/pub/1/2/_", "token", True)
 
@@ -253,7 +253,7 @@ def test_subscriptions_are_those_of_who_begins_now(monkeypatch: pytest.MonkeyPat
             if chance.random() < 0.5:
                 intake._published(f"{KEYS.detections(stream)}/@adv/pub/1/2/_", "token", present)
             else:
-                intake._discovered(KEYS.discovered([stream], "other"), "other", present)
+                intake._discovered(KEYS.discovered([stream], "other", "run"), present)
         if chance.random() < 0.1:
             partition = chance.randrange(PARTITIONS)
             held ^= {partition}
@@ -352,7 +352,7 @@ class Kept:
             lambda _: self.holds, lambda: TakeoverBuffer(keep_ns, budget), registry._lose
         )
         registry._report = lambda code, *_: self.problems.append(code)
-        settings: Any = SimpleNamespace(idle_s=3600.0, stale_s=3600.0, memory_mb=1)
+        settings: Any = SimpleNamespace(idle_s=3600.0, stale_s=3600.0, memory_mb=1, cluster=())
         registry._sweep = Sweep(
             settings, registry._actors, registry._member, registry.untracked, registry.command, registry._report
         )

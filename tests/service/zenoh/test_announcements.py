@@ -60,7 +60,7 @@ def test_each_stream_is_in_one_token_and_all_tokens_but_one_are_full(monkeypatch
     chance = random.Random(1)
     tokens = Tokens()
     session: Any = tokens
-    announcements = Announcements(session, KEYS, "m0")
+    announcements = Announcements(session, KEYS, "m0", "run")
     streams: set[str] = set()
     away: list[str] = []
     most = 0

@@ -33,6 +33,7 @@ from optipmb_schemas import (
     encoding_of,
 )
 from optipmb_service.app.aggregate import QUERIES
+from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Tracked
 from optipmb_service.settings.loading import load
@@ -559,3 +560,36 @@ def test_what_a_client_sent_last_while_the_router_was_away_is_recovered(start: C
             state = KEYS.query(SENSOR.stream, "state")
             until(lambda: bool(node.query(state, timeout=5.0)), "the service is back")
             until(lambda: node.ask(state, SessionState).frames == 2, "the last frame is tracked")
+
+
+def test_a_publisher_whose_numbers_go_back_is_reported(start: Callable[..., Any]) -> None:
+    """One that starts again with the Zenoh id of its last run is not heard, which is said with its stream."""
+    service, endpoint = start()
+
+    def codes() -> set[str]:
+        service.housekeeping()
+        return {one.code for one in service.status().problems}
+
+    with Node(endpoint) as other:
+        for frames in (20, 3):
+            with Node(endpoint, zid="ab12") as node:
+                node.send(*(SENSOR.detections(seq) for seq in range(frames)))
+                if frames == 3:
+                    until(lambda: "numbers_back" in codes(), "it is reported")
+                else:
+                    other.tracks(SENSOR.stream, frames)
+                    assert "numbers_back" not in codes()
+        problem = other.problem(SENSOR.stream, "numbers_back")
+    assert (problem.expected, problem.received) == (
+        "messages numbered from 20 on by Zenoh",
+        "numbers that began again, now 2",
+    )
+
+
+def test_a_client_with_an_id_of_its_own_does_not_start(tmp_path: Path) -> None:
+    """A configuration file with an id is refused by a service that is a client; a router may have one."""
+    file = tmp_path / "zenoh.json5"
+    file.write_text('{id: "ab12"}')
+    settings = load(None, {"connect": [free_endpoint()], "zenoh_config": str(file), "instance": "test"}).settings
+    with pytest.raises(TransportError, match='id: expected none, received "ab12"'):
+        Transport(settings)
