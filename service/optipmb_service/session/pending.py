@@ -16,6 +16,7 @@ import optipmb_schemas as schemas
 from optipmb.records import record
 from optipmb_service.session.cloud_buffer import CloudBuffer
 from optipmb_service.session.fused_timeline import FusedTimeline
+from optipmb_service.session.stamp_check import StampCheck
 from optipmb_service.session.state import Entry, size_of
 from optipmb_service.session.timeline import hold_until
 
@@ -76,6 +77,7 @@ class PendingFrames:
         self._timeline = timeline
         self._behind = False
         self.clouds = CloudBuffer(policy.clouds, policy.cloud_bytes)
+        self.stamps = StampCheck()
         self.held: list[Held] = []
         """The frames held, in order."""
         self.held_bytes = 0

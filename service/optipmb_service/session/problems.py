@@ -39,6 +39,10 @@ CODES: Final = {
         "The stamp is far from those before it; frames are refused until several in a row agree.",
         "Check the sensor's clock.",
     ),
+    "clock": (
+        "The stamps of twenty frames do not advance, or not in nanoseconds; the frames are tracked nevertheless.",
+        "Send the time of the measurement, in nanoseconds, as `stamp_ns`.",
+    ),
     "restarted": (
         "The session restarted: its tracks ended, ids continue. `received` has the reason and the jump of stamps.",
         "After `jump` or `pose`: check clock and localisation. After `publisher` (a restart): nothing.",

@@ -37,6 +37,10 @@ class Refusals:
         """A frame that can no longer be put in its place."""
         return self._problem("late", frame_id, "stamp_ns", "a frame inside the window", f"{jump_ns / SECOND:+.3f} s")
 
+    def clock(self, frame_id: FrameId, found: str) -> schemas.Problem:
+        """Stamps that do not advance as time does."""
+        return self._problem("clock", frame_id, "stamp_ns", "stamps in nanoseconds that advance with time", found)
+
     def retired(self, frame_id: FrameId) -> schemas.Problem:
         """A publisher that was succeeded and still sends."""
         expected = "the newest publisher of the stream; an earlier one still sends"

@@ -121,6 +121,8 @@ class Session:
             return [*outputs, self._reporting.complain.invalid(frame_id, invalid)]
         pending.timeline = arrived
         since_ns = now_ns if arrived_ns is None else arrived_ns
+        if found := pending.stamps.add(frame_id.stamp_ns, since_ns):
+            outputs.append(self._reporting.complain.clock(frame_id, found))
         contents = Contents(message, frame, ignored)
         held = pending.arrived(contents, frame_id, since_ns, ticket, (judged_by, decision, arrived))
         return [*outputs, *self._steps.accept(held, pending, now_ns)]
