@@ -16,9 +16,10 @@ import optipmb_schemas as schemas
 from optipmb.records import record
 from optipmb_service.session.cloud_buffer import CloudBuffer
 from optipmb_service.session.fused_timeline import FusedTimeline
+from optipmb_service.session.seen_numbers import Checksums
 from optipmb_service.session.stamp_check import StampCheck
 from optipmb_service.session.state import Entry, size_of
-from optipmb_service.session.timeline import hold_until
+from optipmb_service.session.timeline import Verdict, hold_until
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Sequence
@@ -78,6 +79,7 @@ class PendingFrames:
         self._behind = False
         self.clouds = CloudBuffer(policy.clouds, policy.cloud_bytes)
         self.stamps = StampCheck()
+        self.checksums = Checksums()
         self.held: list[Held] = []
         """The frames held, in order."""
         self.held_bytes = 0
@@ -122,6 +124,15 @@ class PendingFrames:
         place, detections = judged[1].place, schemas.encoded(contents.message)
         entry = Entry(frame_id, detections, None, False, 0, [], place, size_of(detections))
         return Held(entry, contents, deadline_ns, ticket, judged)
+
+    def reuses_number(self, message: schemas.Detections, decision: Decision) -> bool:
+        """Whether a frame that is refused has the number of another frame."""
+        if decision.verdict is Verdict.DUPLICATE:
+            same = self.checksums.same(message.epoch, message.seq, schemas.encoded(message))
+            if same is not None:
+                return not same
+        # What was sent earlier has no stamp beyond the newest one.
+        return decision.verdict in {Verdict.DUPLICATE, Verdict.LATE} and decision.place.jump_ns > 0
 
     def passes(self, frame: Held) -> bool:
         """Whether a frame that arrived need not be held: nothing is, no frames are awaited, and no cloud ever came."""

@@ -22,6 +22,10 @@ CODES: Final = {
         "Publish in order, or raise `rewind_s`.",
     ),
     "duplicate_epoch": ("A publisher that was replaced by another one still sends.", "Stop one of the two publishers."),
+    "duplicate_seq": (
+        "A frame has the epoch and the number of another one, as of a publisher that began again; it is refused.",
+        "Give the publisher a new random epoch at every start, and number its frames upwards.",
+    ),
     "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or add processors."),
     "refused": (
         "No room for another session, or a change that needs a restart.",

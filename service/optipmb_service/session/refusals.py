@@ -41,6 +41,12 @@ class Refusals:
         """Stamps that do not advance as time does."""
         return self._problem("clock", frame_id, "stamp_ns", "stamps in nanoseconds that advance with time", found)
 
+    def reused(self, frame_id: FrameId, jump_ns: int) -> schemas.Problem:
+        """A frame with the number of another one."""
+        expected = "a number that no other frame of the epoch has, or a new epoch"
+        received = f"{frame_id.seq} again, in another frame, {jump_ns / SECOND:+.3f} s from the newest"
+        return self._problem("duplicate_seq", frame_id, "seq", expected, received)
+
     def retired(self, frame_id: FrameId) -> schemas.Problem:
         """A publisher that was succeeded and still sends."""
         expected = "the newest publisher of the stream; an earlier one still sends"

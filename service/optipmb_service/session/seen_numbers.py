@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
+from array import array
 from typing import TYPE_CHECKING, Final
 
 from optipmb.records import record
@@ -44,6 +46,25 @@ class SeenNumbers:
         # A sequence number may leap by 2^60: never shift further than the window is wide.
         shifted = self.mask << ahead if ahead < WINDOW else 0
         return SeenNumbers(self.epoch, seq, (shifted | 1) & ((1 << WINDOW) - 1))
+
+
+class Checksums:
+    """Checksums of the newest frames of a publisher, by which a repeated frame is told from another with its number."""
+
+    def __init__(self) -> None:
+        self._epoch = b""
+        self._values = array("I")
+
+    def add(self, epoch: bytes, seq: int, detections: bytes) -> None:
+        """Remember a frame that came, by the bytes of its detections."""
+        if epoch != self._epoch:
+            self._epoch, self._values = epoch, array("I", bytes(array("I").itemsize * WINDOW))
+        self._values[seq % WINDOW] = zlib.crc32(detections)
+
+    def same(self, epoch: bytes, seq: int, detections: bytes) -> bool | None:
+        """Return whether the frame that came with a number had these bytes; None: it is not known any more."""
+        known = self._values[seq % WINDOW] if epoch == self._epoch else 0
+        return known == zlib.crc32(detections) if known else None
 
 
 def number_of(epochs: Sequence[SeenNumbers], epoch: bytes | None) -> int:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
-from optipmb_schemas import Keys, Problem, SessionState, decode
-from router import DEADLINE_S, SECOND, Node, Sensor, plain
+from optipmb_schemas import Keys, Problem, ServiceStatus, SessionState, decode
+from router import DEADLINE_S, SECOND, Node, Sensor, until
+from routers import free_endpoint
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
+    from pathlib import Path
+
+    from optipmb_service.app.service import Service
 
 KEYS = Keys()
 SENSOR = Sensor()
@@ -62,3 +65,42 @@ def test_a_recording_at_any_speed_is_not_reported(node: Node, rate_hz: float) ->
     send(node, (round(SECOND * (1000 + seq / rate_hz)) for seq in range(60)))
     node.tracks(SENSOR.stream, 60)
     assert said(node, "clock") == []
+
+
+@pytest.mark.parametrize("frames", [30, 1100])
+def test_numbers_that_begin_again_in_one_epoch_are_reported(node: Node, frames: int) -> None:
+    """A publisher with a constant epoch that restarts at 0 is refused aloud, few frames or many after its start."""
+    for first in range(0, frames, 100):  # no more than a queue takes
+        send(node, map(SENSOR.stamp_ns, range(first, min(frames, first + 100))), first=first)
+        node.tracks(SENSOR.stream, min(frames, first + 100))
+    send(node, (SENSOR.stamp_ns(seq) for seq in range(frames, frames + 20)))
+    problem = node.problem(SENSOR.stream, "duplicate_seq")
+    assert problem.path == "seq"
+    assert "a new epoch" in problem.expected
+    until(lambda: state(node).refused == 20, "all are refused")
+    assert (state(node).duplicates, state(node).late) == (0, 0)
+
+
+def test_another_frame_with_the_number_of_one_that_came_is_reported(node: Node) -> None:
+    """The stamp may be the same: what the frame contains is compared. A frame that is repeated is no problem."""
+    node.send(*(SENSOR.detections(seq) for seq in range(20)), SENSOR.detections(3), SENSOR.detections(7, objects=2))
+    assert node.problem(SENSOR.stream, "duplicate_seq").seq == 7
+    assert [one.count for one in said(node, "duplicate_seq")] == [1]
+    status = node.ask(KEYS.status("test"), ServiceStatus).sessions[0]
+    assert (status.frames, status.duplicates, status.refused) == (20, 1, 1)
+
+
+def test_a_repetition_after_a_restart_is_no_other_frame(
+    start: Callable[..., tuple[Service, str]], tmp_path: Path
+) -> None:
+    """What a publisher's cache sends again to a service that was restarted is a duplicate, and no problem."""
+    endpoint = free_endpoint()
+    options: dict[str, Any] = {"store": str(tmp_path), "checkpoint_s": 0.1}
+    for end in (20, 40):
+        service, _ = start(listen=[endpoint], **options)
+        with Node(endpoint) as node:
+            node.send(*(SENSOR.detections(seq) for seq in range(end)))
+            until(lambda node=node, end=end: state(node).seq == end - 1, "all are tracked")
+            assert said(node, "duplicate_seq") == []
+        service.stop()
+    assert end == 40
