@@ -106,6 +106,8 @@ class _Stream:
     """Stamp of the newest detections."""
     ask_s: float = -math.inf
     """When predicted paths may be asked for again; clock of the bridge."""
+    session: str = ""
+    """Id of the session of these tracks."""
     shown_ns: int = -1
     """Stamp of the newest tracks that went to ROS."""
     counts: Counts = field(default_factory=Counts)
@@ -202,6 +204,8 @@ class Bridge:
     def take_tracks(self, message: schemas.Tracks) -> None:
         """Publish the tracks of a stream to ROS; those of frames before the newest one are left out."""
         stream = self._streams[message.stream]
+        if message.session != stream.session and not message.revision:
+            stream.session, stream.shown_ns = message.session, -1  # its clock may have stepped back
         if message.stamp_ns < stream.shown_ns or message.epoch != stream.epoch:
             return  # a repetition after a restart, or a late correction: ROS expects stamps that ascend
         stream.shown_ns = message.stamp_ns

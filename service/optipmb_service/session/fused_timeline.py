@@ -77,7 +77,12 @@ class FusedTimeline:
         if self.clock and abs(self._jump_ns(frame_id)) > self.gap_limit_ns:
             return self._other_clock(frame_id)
         refusal = self._no_place(frame_id, number if number >= 0 else len(epochs))
-        return self._admit(frame_id) if refusal is None else self._refuse(frame_id, refusal)
+        if refusal is None:
+            return self._admit(frame_id)
+        newest = number < 0 or (number == len(epochs) - 1 and frame_id.seq > epochs[number].highest)
+        if refusal is Verdict.LATE and newest and frame_id.stamp_ns < self.clock.get(frame_id.sensor, 0):
+            return self._other_clock(frame_id, refusal)  # the sensor's own clock has stepped back
+        return self._refuse(frame_id, refusal)
 
     def places(self) -> dict[FrameId, Placement]:
         """Return where each frame of the window belongs."""
@@ -175,7 +180,7 @@ class FusedTimeline:
         )
         return Decision(opens if last else Verdict.INSERTED, _placed(frame_id, self.generation), last), timeline
 
-    def _other_clock(self, frame_id: FrameId) -> tuple[Decision, FusedTimeline]:
+    def _other_clock(self, frame_id: FrameId, refusal: Verdict = Verdict.JUMPED) -> tuple[Decision, FusedTimeline]:
         """Refuse a frame whose stamp is far from the session's clock, or begin anew on its own."""
         sensor, stamp_ns = frame_id.sensor, frame_id.stamp_ns
         before = self.jumped.get(sensor)
@@ -186,7 +191,7 @@ class FusedTimeline:
         agreed = all(_agrees(jumped.get(name), stamp_ns, self.gap_limit_ns) for name in self.live() if name != sensor)
         alone = stamp_ns - one.since_ns > self.gap_limit_ns
         if one.count < JUMP_FRAMES or not (agreed or alone):
-            return self._refuse(frame_id, Verdict.JUMPED)[0], replace(self, jumped=jumped)
+            return self._refuse(frame_id, refusal)[0], replace(self, jumped=jumped)
         begun = replace(
             self,
             seen=self._remembering(frame_id),

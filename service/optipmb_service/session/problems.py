@@ -40,7 +40,7 @@ CODES: Final = {
         "Check the localisation; if it is right, raise `max_speed`.",
     ),
     "time_jump": (
-        "The stamp is far from those before it; frames are refused until several in a row agree.",
+        "The stamp is over `gap_limit_s` ahead or `rewind_s` behind; frames are refused until three in a row agree.",
         "Check the sensor's clock.",
     ),
     "clock": (
@@ -48,8 +48,8 @@ CODES: Final = {
         "Send the time of the measurement, in nanoseconds, as `stamp_ns`.",
     ),
     "restarted": (
-        "The session restarted: its tracks ended, ids continue. `received` has the reason and the jump of stamps.",
-        "After `jump` or `pose`: check clock and localisation. After `publisher` (a restart): nothing.",
+        "The session restarted: its tracks ended (`clock`: objects found again keep ids). `received` has the reason.",
+        "After `jump`, `clock` or `pose`: check clock and localisation. After `publisher` (a restart): nothing.",
     ),
     "overload": (
         "The frame, or the stream, exceeds its limit of computing time; the frame is refused.",

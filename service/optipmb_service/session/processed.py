@@ -42,8 +42,8 @@ class ProcessedFrames:
     def __init__(self, transition: Transition, policy: Policy, life: Lineage, *, fused: bool) -> None:
         self.transition = transition
         self._policy = policy
-        gap_limit_ns = policy.gap_limit_ns
-        self.timeline: Timeline | FusedTimeline = FusedTimeline(gap_limit_ns) if fused else Timeline(gap_limit_ns)
+        self.timeline: Timeline | FusedTimeline
+        self.timeline = FusedTimeline(policy.gap_limit_ns) if fused else Timeline(policy.jump_limits)
         self._history = ReorderWindow(empty(transition, None, life.next_id, life.starts), transition.step)
 
     @property
@@ -126,5 +126,5 @@ class ProcessedFrames:
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Take up what was written down."""
-        self.timeline, entries = window_of(checkpoint, self._policy.gap_limit_ns)
+        self.timeline, entries = window_of(checkpoint, self._policy.jump_limits)
         self._history = ReorderWindow(checkpoint.base, self.transition.step, entries, checkpoint.head)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import optipmb_schemas as schemas
 
 from optipmb.records import record
+from optipmb_service.session.timeline import JumpLimits
 
 if TYPE_CHECKING:
     import optipmb
@@ -88,6 +89,11 @@ class Policy:
     astray_frames: int = 5
     at_once: int = 2**62
 
+    @property
+    def jump_limits(self) -> JumpLimits:
+        """The steps of a publisher's stamps beyond which they jumped."""
+        return JumpLimits(min(self.rewind_ns, self.gap_limit_ns), self.gap_limit_ns)
+
 
 @dataclass(frozen=True, slots=True)
 class Lineage:
@@ -132,7 +138,8 @@ class Begun:
 
     Attributes:
         session: its id.
-        reason: "first", "jump", "publisher", "pose", "effort", "reset", "parameters" or "quarantine".
+        reason: "first", "jump", "clock" (a step back, after which the objects are kept), "publisher", "pose", "effort",
+            "reset", "parameters" or "quarantine".
         jump_ns: how far the stamps jumped.
     """
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
-from optipmb_schemas import Keys, Problem, ServiceStatus, SessionState, decode
+from optipmb_schemas import Keys, Pose, Problem, ServiceStatus, SessionState, Tracks, decode
 from router import DEADLINE_S, SECOND, Node, Sensor, until
 from routers import free_endpoint
 
@@ -104,3 +106,55 @@ def test_a_repetition_after_a_restart_is_no_other_frame(
             assert said(node, "duplicate_seq") == []
         service.stop()
     assert end == 40
+
+
+@pytest.mark.parametrize("back_s", [1.2, 3.0, 4.9])
+def test_a_clock_that_steps_back_ends_no_track(node: Node, back_s: float) -> None:
+    """Of sixty frames two are refused, the restart is reported once, and every object keeps its id."""
+    stamps = [SENSOR.stamp_ns(seq) - round(back_s * SECOND) * (seq >= 30) for seq in range(60)]
+    send(node, stamps)
+    received = node.tracks(SENSOR.stream, 58)
+    assert [one.seq for one in received] == [*range(30), *range(32, 60)]
+    assert {tuple(sorted(one.id.tolist())) for one in received[5:]} == {(1, 2, 3)}
+    assert len({one.session for one in received}) == 2
+    assert [(one.received.partition(",")[0], one.count) for one in said(node, "restarted")] == [("clock", 1)]
+    assert (state(node).frames, state(node).refused, state(node).late) == (58, 2, 0)
+
+
+def test_a_recording_of_four_seconds_in_a_loop_is_tracked(node: Node) -> None:
+    """Of two hundred frames two are refused at each of the four beginnings, though the sensor is elsewhere then."""
+    for seq in range(200):
+        pose = Pose(translation=np.array([3.0 * (seq % 40), 0, 0]), quaternion=np.array([1.0, 0, 0, 0]))
+        node.send(SENSOR.detections(seq % 40, pose=pose, frame="sensor").model_copy(update={"seq": seq}))
+    received = node.tracks(SENSOR.stream, 192)
+    assert [one.seq % 40 for one in received[-38:]] == list(range(2, 40))
+    ids = [set(one.id.tolist()) for one in received]
+    assert not ids[39] & ids[-1]
+
+
+def test_stamps_far_behind_that_are_few_change_nothing(node: Node) -> None:
+    """Two frames in a row with stamps of two seconds ago are refused; the tracks go on in their session."""
+    stamps = [SENSOR.stamp_ns(seq) - 2 * SECOND * (seq in {10, 11, 20}) for seq in range(30)]
+    send(node, stamps)
+    received = node.tracks(SENSOR.stream, 27)
+    assert len({one.session for one in received}) == 1
+    assert said(node, "restarted") == []
+
+
+def test_sensors_of_one_session_step_back_together(start: Callable[..., tuple[Service, str]]) -> None:
+    """A recording of two sensors in a loop is tracked again as soon as both are on the clock that stepped back."""
+    _, endpoint = start(fuse=["site/*/lidar*"])
+    sensors = [replace(SENSOR, stream=f"site/node/lidar-{one}", epoch=bytes([one]) * 16) for one in (1, 2)]
+    with Node(endpoint) as node:
+        for first in (0, 40, 80):
+            for seq in range(first, first + 40):
+                for shift_ns, sensor in enumerate(sensors):
+                    node.send(sensor.detections(seq, stamp_ns=SENSOR.stamp_ns(seq - first) + shift_ns))
+            expected = {(sensor.stream, seq) for sensor in sensors for seq in range(first + 20, first + 40)}
+
+            def came(expected: set[tuple[str, int]] = expected) -> bool:
+                items = node.tracks_seen.items
+                tracks = [decode(one, Tracks) for at, one, _ in items if at == KEYS.tracks("site/node/fused")]
+                return expected <= {(one.sensor or "", one.seq) for one in tracks}
+
+            until(came, "the second half of the recording is tracked")
