@@ -17,7 +17,14 @@ from bisect import bisect
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from optipmb_service.session.seen_numbers import WINDOW, SeenNumbers, complete_until, number_of, remembered
+from optipmb_service.session.seen_numbers import (
+    WINDOW,
+    SeenNumbers,
+    complete_until,
+    number_of,
+    reinstated,
+    remembered,
+)
 from optipmb_service.session.timeline import JUMP_FRAMES, Cursor, Decision, FrameId, Placement, Verdict, without
 from optipmb_service.session.values import MAX_SENSORS
 
@@ -119,6 +126,11 @@ class FusedTimeline:
     def settle(self, base: FilterState, gone: Sequence[FrameId]) -> FusedTimeline:
         """Return it with a later beginning of the window: `gone` are the frames that fell out of it."""
         return replace(self, base=base.cursors, floor=base.last, frame_ids=without(self.frame_ids, gone))
+
+    def reinstated(self, frame_id: FrameId) -> FusedTimeline:
+        """Return it with the publisher of a frame in force again."""
+        epochs = reinstated(self.seen[frame_id.sensor], frame_id.epoch)
+        return replace(self, seen={**self.seen, frame_id.sensor: epochs})
 
     def complete_until(self, frame_id: FrameId, processed: tuple[bytes, int] | None) -> bool:
         """Whether no frame of its sensor is missing between the last one processed of its epoch and this one."""

@@ -21,7 +21,10 @@ CODES: Final = {
         "The frame came later than the window in which tracks are corrected.",
         "Publish in order, or raise `rewind_s`.",
     ),
-    "duplicate_epoch": ("A publisher that was replaced by another one still sends.", "Stop one of the two publishers."),
+    "duplicate_epoch": (
+        "A publisher that was replaced by another one still sends; it is tracked again when the other one is silent.",
+        "Stop one of the two publishers: those with the `epoch` of the problem, and with that of the tracks.",
+    ),
     "duplicate_seq": (
         "A frame has the epoch and the number of another one, as of a publisher that began again; it is refused.",
         "Give the publisher a new random epoch at every start, and number its frames upwards.",

@@ -96,6 +96,12 @@ class ProcessedFrames:
         """Remember that a frame came which is not to be processed."""
         self.timeline = self.timeline.note(frame_id)
 
+    def reinstate(self, frame_id: FrameId) -> None:
+        """Go on with the publisher of a frame, which others have succeeded."""
+        if isinstance(self.timeline, Timeline):
+            self.begin(self.head)  # in the window the order of publishers is that of their first frames
+        self.timeline = self.timeline.reinstated(frame_id)
+
     def begin(self, state: FilterState, transition: Transition | None = None) -> None:
         """Go on from a moment without a way back behind it; with another transition when the profile changes."""
         self.transition = transition or self.transition

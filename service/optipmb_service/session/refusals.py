@@ -47,9 +47,10 @@ class Refusals:
         received = f"{frame_id.seq} again, in another frame, {jump_ns / SECOND:+.3f} s from the newest"
         return self._problem("duplicate_seq", frame_id, "seq", expected, received)
 
-    def retired(self, frame_id: FrameId) -> schemas.Problem:
+    def retired(self, frame_id: FrameId, gap_limit_ns: int) -> schemas.Problem:
         """A publisher that was succeeded and still sends."""
-        expected = "the newest publisher of the stream; an earlier one still sends"
+        silent = f"when the other has been silent for {gap_limit_ns / SECOND:g} s"
+        expected = f"the publisher that began last; stop one of the two, this one is tracked again {silent}"
         return self._problem("duplicate_epoch", frame_id, "epoch", expected, frame_id.epoch.hex())
 
     def astray(self, entry: Entry, policy: Policy) -> schemas.Problem:

@@ -108,6 +108,12 @@ class Session:
             self._recovery.begin(frame_id, now_ns if arrived_ns is None else arrived_ns, now_ns)
         judged_by = pending.timeline
         decision, arrived = judged_by.judge(frame_id)
+        if pending.is_alive(frame_id, decision):
+            outputs += self.flush()
+            self._processed.reinstate(frame_id)
+            self._sensors.begin_anew()
+            judged_by = pending.timeline
+            decision, arrived = judged_by.judge(frame_id)
         if not decision.verdict.admitted:
             self._sensors.remember(pending, judged_by, arrived)
             if pending.reuses_number(message, decision):

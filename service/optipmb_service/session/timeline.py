@@ -23,7 +23,14 @@ from enum import StrEnum, unique
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from optipmb.records import record
-from optipmb_service.session.seen_numbers import WINDOW, SeenNumbers, complete_until, number_of, remembered
+from optipmb_service.session.seen_numbers import (
+    WINDOW,
+    SeenNumbers,
+    complete_until,
+    number_of,
+    reinstated,
+    remembered,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -270,6 +277,10 @@ class Timeline:
         left = without(self.frame_ids, gone)
         return Timeline(self.limits, self.epochs, base.sensor("").cursor, base.last, left, self.tip)
 
+    def reinstated(self, frame_id: FrameId) -> Timeline:
+        """Return it with the publisher of a frame in force again; nothing is in the window."""
+        return replace(self, epochs=reinstated(self.epochs, frame_id.epoch))
+
     def complete_until(self, frame_id: FrameId, processed: tuple[bytes, int] | None) -> bool:
         """Whether no frame is missing between the last one processed of its epoch and this one."""
         return complete_until(self.epochs, frame_id, processed)
@@ -302,7 +313,7 @@ class Timeline:
         if frame_id.epoch == self.base.epoch and frame_id.seq < self.base.seq and place.opens is not Verdict.NEXT:
             # What was sent before the window cannot be what opens an era behind it: it merely took long.
             return self._refuse(frame_id, refusal)
-        if succeeded and not self._before_successor(at, places):
+        if succeeded and (place.opens is Verdict.UNCONFIRMED or not self._before_successor(at, places)):
             return self._refuse(frame_id, refusal)
         order = place.order(frame_id)
         behind = any(other.order(one) > order for one, other in zip(frame_ids, places, strict=True))

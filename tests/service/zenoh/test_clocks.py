@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from optipmb_schemas import Keys, Pose, Problem, ServiceStatus, SessionState, Tracks, decode
+from optipmb_schemas import Detections, Keys, Pose, Problem, ServiceStatus, SessionState, Tracks, decode
 from router import DEADLINE_S, SECOND, Node, Sensor, until
 from routers import free_endpoint
 
@@ -158,3 +158,68 @@ def test_sensors_of_one_session_step_back_together(start: Callable[..., tuple[Se
                 return expected <= {(one.sensor or "", one.seq) for one in tracks}
 
             until(came, "the second half of the recording is tracked")
+
+
+def stray(back_s: float = 0.0) -> Detections:
+    """One frame of another publisher of the sensor's stream, sent between its frames 19 and 20."""
+    at_ns = SENSOR.stamp_ns(19) + SECOND // 20 - round(back_s * SECOND)
+    return replace(SENSOR, epoch=b"s" * 16).detections(0, stamp_ns=at_ns)
+
+
+@pytest.mark.parametrize("back_s", [0.0, 0.5, -3600.0, 3600.0])
+def test_one_stray_frame_locks_nobody_out(node: Node, back_s: float) -> None:
+    """After a frame with another epoch, whatever its stamp, who is alive is tracked again in a second."""
+    node.send(*map(SENSOR.detections, range(20)))
+    node.tracks(SENSOR.stream, 20)
+    node.send_plain(stray(back_s))
+    node.tracks(SENSOR.stream, 21)
+    node.send(*map(SENSOR.detections, range(20, 60)))
+    received = node.tracks(SENSOR.stream, 21 + 30)[21:]
+    assert [one.seq for one in received] == list(range(30, 60))
+    problem = said(node, "duplicate_epoch")[0]
+    assert "stop one of the two" in problem.message
+    assert "silent for 5 s" in problem.message
+    assert problem.received == SENSOR.epoch.hex()
+    if not back_s:
+        assert set(received[-1].id.tolist()) == {1, 2, 3}
+
+
+def test_a_stray_frame_locks_no_sensor_of_several_out(start: Callable[..., tuple[Service, str]]) -> None:
+    """In a session of several sensors, too, the publisher that is alive is tracked again."""
+    _, endpoint = start(fuse=["site/*/lidar*"], recovery_wait_s=0)
+    with Node(endpoint) as node:
+        node.send(*map(SENSOR.detections, range(20)))
+        node.tracks("site/node/fused", 20)
+        node.send_plain(stray())
+        node.tracks("site/node/fused", 21)
+        node.send(*map(SENSOR.detections, range(20, 60)))
+        received = node.tracks("site/node/fused", 21 + 30)[21:]
+    assert [one.seq for one in received] == list(range(30, 60))
+    assert set(received[-1].id.tolist()) == {1, 2, 3}
+
+
+def test_the_publisher_that_is_alive_is_tracked(node: Node) -> None:
+    """A later publisher that ends gives the stream back to the earlier one, after `gap_limit_s` without a frame."""
+    other = replace(SENSOR, epoch=b"o" * 16)
+    node.send(*map(SENSOR.detections, range(10)))
+    node.tracks(SENSOR.stream, 10)
+    for seq in range(10, 20):
+        node.send_plain(other.detections(seq - 10, stamp_ns=SENSOR.stamp_ns(seq)))
+    node.tracks(SENSOR.stream, 20)
+    node.send(*map(SENSOR.detections, range(20, 90)))
+    received = node.tracks(SENSOR.stream, 20 + 20)
+    assert [one.seq for one in received if one.epoch == other.epoch] == list(range(10))
+    assert [one.seq for one in received[20:]] == list(range(70, 90))
+
+
+def test_two_publishers_do_not_take_turns(node: Node) -> None:
+    """While both send, the later one is tracked and the earlier one refused, whichever is faster."""
+    other = replace(SENSOR, epoch=b"o" * 16)
+    node.send(*map(SENSOR.detections, range(10)))
+    for seq in range(10, 100):
+        node.send_plain(SENSOR.detections(seq))
+        if seq % 4 == 0:
+            node.send_plain(other.detections(seq // 4, stamp_ns=SENSOR.stamp_ns(seq) + 1))
+    until(lambda: state(node).received == 10 + 90 + 22, "all have come")
+    assert state(node).new_epochs == 1
+    assert len({one.session for one in node.tracks(SENSOR.stream, 10 + 2 + 22)}) == 1
