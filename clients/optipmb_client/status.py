@@ -11,7 +11,7 @@ from rich.text import Text
 __all__ = ["duration", "members_of", "render"]
 
 COLUMNS = ("stream", "profile", "state", "frames/s", "p50 ms", "p99 ms", "frames", "tracks", "queue")
-COUNTED = ("refused", "shed", "gaps", "last frame")
+COUNTED = ("refused", "shed", "late", "gaps", "duplicates", "last frame")
 TEXTS = 3
 """Columns of texts; the others are of numbers."""
 
@@ -79,7 +79,9 @@ def _streams(sessions: Sequence[SessionSummary]) -> Table:
             str(session.queue),
             str(session.refused),
             str(session.shed),
+            str(session.late),
             str(session.gaps),
+            str(session.duplicates),
             "never" if session.age_s is None else f"{duration(session.age_s)} ago",
         )
         for sensor in session.sensors:

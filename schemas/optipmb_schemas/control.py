@@ -179,6 +179,8 @@ class SessionSummary(Message):
         default=(), max_length=256, description="Streams that share the session; none: it is that of one stream."
     )
     silent: tuple[Stream, ...] = Field(default=(), max_length=256, description="Those of them without a frame lately.")
+    late: Count = Field(default=0, description="Frames that came too late.")
+    duplicates: Count = Field(default=0, description="Frames that had been tracked before.")
 
 
 class MemberSummary(Message):

@@ -182,7 +182,9 @@ class Tracks(Header):
         default=None,
         description="Stream of the detections, and of `epoch` and `seq`. Absent: it is `stream`.",
     )
-    session: SessionId = Field(description="32 hexadecimal digits. When it changes, earlier tracks have ended.")
+    session: SessionId = Field(
+        description="32 hexadecimal digits. When it changes, earlier tracks have ended, except those whose ids return."
+    )
     revision: Count = Field(
         default=0,
         description="Higher than 0: corrects, after a late frame, what was published for the same `session`, `epoch` "

@@ -284,6 +284,28 @@ def test_a_clock_that_is_set_back_starts_anew(robot: Robot, scene: DataSequence,
         assert "the clock went back by 100." in told(client, "clock went back")
 
 
+def test_a_root_that_comes_late_starts_anew(robot: Robot, scene: DataSequence, tmp_path: Path) -> None:
+    """Detections that came before the root of tf was there are tracked in another frame, those after it in the root."""
+    frames = [[one for one in frame if one.topic != "/points"] for frame in frames_of(scene)]
+    for index, frame in enumerate(frames):
+        transforms = next(one.message["transforms"] for one in frame if one.topic == "/tf")
+        root = json.loads(json.dumps(transforms[0])) | {"child_frame_id": "base"}
+        turned = bags.pose((5, 0, 0), bags.turned(0))
+        root["transform"] = {"translation": turned["position"], "rotation": turned["orientation"]}
+        transforms[0]["header"]["frame_id"] = "base"
+        if index >= 4:
+            transforms.append(root)
+    with bridge(robot, tmp_path), ready_client(robot) as client:
+        play(client, frames)
+        tracked = client.received[TRACKS]
+        assert "the root of tf is now 'map'" in told(client, "it was 'base'")
+    assert [one.header.frame_id for one in tracked] == ["base"] * 4 + ["map"] * (len(frames) - 4)
+    before, after = ({id_ for one in part for id_ in ids(one)} for part in (tracked[:4], tracked[4:]))
+    assert before
+    assert after
+    assert not before & after
+
+
 def _shift(message: Any, seconds: int) -> None:
     """Move every stamp in a message."""
     if isinstance(message, dict):

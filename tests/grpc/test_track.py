@@ -206,3 +206,13 @@ def test_acknowledgements_are_few(stub: Any, stream: str) -> None:
     assert len(numbers) <= 4 + time.monotonic() - began
     requests.put(None)
     assert {one.acknowledgement.detections for one in call} <= {39}
+
+
+def test_a_clock_that_stands_still_is_told_to_the_caller(stub: Any, stream: str) -> None:
+    """Frames with one stamp are tracked, and the call that sent them gets the problem `clock`."""
+    sent = [frame(seq, stream).model_copy(update={"stamp_ns": 10**18}) for seq in range(25)]
+    responses = list(stub.Track(detections(one) for one in sent))
+    problems = [one.problem for one in responses if one.WhichOneof("response") == "problem"]
+    assert [one.code for one in problems] == ["clock"]
+    assert problems[0].received == f"20 frames with the stamp {10**18}: the clock does not advance"
+    assert sum(one.WhichOneof("response") == "tracks" for one in responses) == 25

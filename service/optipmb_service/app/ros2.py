@@ -167,24 +167,26 @@ class _Work:
         """Whether ROS has a subscription to a topic."""
         return self._node.listened(topic)
 
-    def ask(self, stream: str, parameters: schemas.SessionParameters) -> None:
-        """Set parameters of a stream's session, on a thread of its own; one request of a stream at a time."""
-        if stream not in self._asked:
+    def ask(self, stream: str, parameters: schemas.SessionParameters, then: Callable[[], None] | None = None) -> None:
+        """Set parameters of a stream's session, on a thread of its own; without `then` one request at a time."""
+        if then is not None or stream not in self._asked:
             self._asked.add(stream)
-            self._asking.submit(self._ask, stream, parameters)
+            self._asking.submit(self._ask, stream, parameters, then)
 
-    def _ask(self, stream: str, parameters: schemas.SessionParameters) -> None:
+    def _ask(self, stream: str, parameters: schemas.SessionParameters, then: Callable[[], None] | None) -> None:
         client = self._node.client
         key, encoding = client.keys.query(stream, "parameters"), schemas.encoding_of(parameters)
         try:
             answers = client.ask(key, schemas.encode(parameters), encoding, timeout=QUERY_S)
             if not any(answer.good for answer in answers):
                 said = schemas.decode(answers[0].payload, schemas.Problem).message if answers else "nobody answered"
-                log.warning("problem", stream=stream, message=f"predicted paths: {said}")
+                log.warning("problem", stream=stream, message=f"parameters of its session: {said}")
         except (TransportError, schemas.MessageError) as error:
-            log.warning("problem", stream=stream, message=f"predicted paths: {error}")
+            log.warning("problem", stream=stream, message=f"parameters of its session: {error}")
         finally:
             self._asked.discard(stream)
+            if then is not None:
+                self._put(then)
 
     # What comes in
 

@@ -79,6 +79,8 @@ class StreamMeter:
             refused=state.refused,
             shed=state.shed,
             gaps=state.gaps,
+            late=state.late,
+            duplicates=state.duplicates,
             tracks=state.tracks,
             queue=state.queue,
             age_s=self.age_s(now_ns),

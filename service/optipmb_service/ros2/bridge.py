@@ -36,6 +36,8 @@ KEPT: Final = 4096
 FRAMES: Final = 2000
 ASK_S: Final = 5.0
 """Time between two requests for the predicted paths of a stream."""
+RESTART_S: Final = 5.0
+"""Longest wait for a session that is to restart."""
 CLOUDS_S: Final = 2.0
 """Without a cloud for so long none is waited for."""
 CLOCK_BACK_NS: Final = 5 * 10**9
@@ -57,8 +59,8 @@ class Sink(Protocol):
     def listened(self, topic: str) -> bool:
         """Whether ROS has a subscription to a topic."""
 
-    def ask(self, stream: str, parameters: schemas.SessionParameters) -> None:
-        """Set parameters of a stream's session."""
+    def ask(self, stream: str, parameters: schemas.SessionParameters, then: Callable[[], None] | None = None) -> None:
+        """Set parameters of a stream's session; `then` is called when that is done, or has failed."""
 
 
 @dataclass
@@ -95,6 +97,11 @@ class _Stream:
     topics: Ros2Stream
     epoch: bytes = field(default_factory=lambda: secrets.token_bytes(16))
     world: str = ""
+    """Frame of the tracks; empty before the first pose."""
+    restart_s: float = -math.inf
+    """Until when messages wait for the session to restart in another world; clock of the bridge."""
+    ended: str = ""
+    """Id of the session in the world before, whose tracks may still come."""
     seq: dict[Kind, int] = field(default_factory=lambda: {"detections": 0, "points": 0})
     waiting: dict[Kind, collections.deque[_Waiting]] = field(
         default_factory=lambda: {"detections": collections.deque(), "points": collections.deque()}
@@ -106,6 +113,8 @@ class _Stream:
     """Stamp of the newest detections."""
     ask_s: float = -math.inf
     """When predicted paths may be asked for again; clock of the bridge."""
+    session: str = ""
+    """Id of the session of these tracks."""
     shown_ns: int = -1
     """Stamp of the newest tracks that went to ROS."""
     counts: Counts = field(default_factory=Counts)
@@ -196,12 +205,16 @@ class Bridge:
         now = self._clock()
         for stream in self._streams.values():
             for queue in stream.waiting.values():
-                while queue and self._sent(stream, queue[0], now):
+                while queue and now >= stream.restart_s and self._sent(stream, queue[0], now):
                     queue.popleft()
 
     def take_tracks(self, message: schemas.Tracks) -> None:
         """Publish the tracks of a stream to ROS; those of frames before the newest one are left out."""
         stream = self._streams[message.stream]
+        if self._clock() < stream.restart_s or message.session == stream.ended:
+            return
+        if message.session != stream.session and not message.revision:
+            stream.session, stream.shown_ns = message.session, -1  # its clock may have stepped back
         if message.stamp_ns < stream.shown_ns or message.epoch != stream.epoch:
             return  # a repetition after a restart, or a late correction: ROS expects stamps that ascend
         stream.shown_ns = message.stamp_ns
@@ -295,18 +308,33 @@ class Bridge:
         return True if expected else None
 
     def _pose(self, stream: _Stream, frame: str, stamp_ns: int) -> schemas.Pose:
-        """Return world from frame; the world is chosen at the first frame, and stays."""
-        world = stream.world or self._settings.fixed_frame
+        """Return world from frame; the world is the root of tf at the first frame, until that gets a parent."""
+        world = self._settings.fixed_frame
         if not world:
-            if self._transforms.has_parent(frame):
-                world = self._transforms.root(frame)
+            if stream.world or self._transforms.has_parent(frame):
+                world = self._transforms.root(stream.world or frame)
             elif stream.topics.fixed:
                 world = frame
             else:
                 raise TransformError(f"frame {frame!r}: expected a transform to it in tf", later=True)
         translation, quaternion = self._transforms.lookup(world, frame, stamp_ns)
-        stream.world = world
+        before, stream.world = stream.world, world
+        if before not in {"", world}:
+            self._restart(stream, before, stamp_ns)
+            raise TransformError(f"frame {frame!r}: expected a session in {world!r}", later=True)
         return schemas.Pose(translation=translation, quaternion=quaternion)
+
+    def _restart(self, stream: _Stream, before: str, stamp_ns: int) -> None:
+        """Have the session begin anew in another world than before, while messages wait."""
+        text = f"the root of tf is now {stream.world!r}, where tracks begin anew; it was {before!r}"
+        self._tell(stream, "world_changed", f"{text}. Set `fixed_frame` to wait for a frame", stamp_ns, refused=0)
+        stream.restart_s, stream.ended = self._clock() + RESTART_S, stream.session
+
+        def restarted() -> None:
+            stream.restart_s = -math.inf
+            self.go_on()
+
+        self._sink.ask(stream.name, schemas.SessionParameters(restart=True), restarted)
 
     def _add(self, path: str, header: Any, child: Any, place: Any, turn: Any, *, static: bool) -> None:
         try:
@@ -328,8 +356,8 @@ class Bridge:
         stream.counts.problem = problem.message
         self._sink.tell(problem.model_copy(update={"stamp_ns": stamp_ns}))
 
-    def _tell(self, stream: _Stream, code: str, text: str, stamp_ns: int) -> None:
-        stream.counts.refused += 1
+    def _tell(self, stream: _Stream, code: str, text: str, stamp_ns: int, *, refused: int = 1) -> None:
+        stream.counts.refused += refused
         text = text[:500]
         stream.counts.problems += 1
         stream.counts.problem = text

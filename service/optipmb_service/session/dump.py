@@ -34,13 +34,15 @@ def dump_of(transition: Transition, base: FilterState, placed: Sequence[Entry], 
     state = base
     for entry in placed:
         anew = begins_with(state, entry)
+        if (moved := transition.on_new_clock(state, entry)) is not None:
+            base, state, anew, frames = moved, moved, False, []  # a dump has one clock
         try:
             state, outcome = transition.step(state, entry)
         except Exception:  # noqa: BLE001 - the very one
             frames.append(schemas.DumpedFrame(entry.message, entry.points, anew))
             break
         if outcome.tracks is not None:
-            begun = outcome.begins is not None and outcome.begins.reason != "first"
+            begun = outcome.begins is not None and outcome.begins.reason not in {"first", "clock"}
             frames.append(schemas.DumpedFrame(entry.message, entry.points, begun))
     return schemas.encode_dump(
         schemas.Dump(

@@ -17,7 +17,14 @@ from bisect import bisect
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from optipmb_service.session.seen_numbers import WINDOW, SeenNumbers, complete_until, number_of, remembered
+from optipmb_service.session.seen_numbers import (
+    WINDOW,
+    SeenNumbers,
+    complete_until,
+    number_of,
+    reinstated,
+    remembered,
+)
 from optipmb_service.session.timeline import JUMP_FRAMES, Cursor, Decision, FrameId, Placement, Verdict, without
 from optipmb_service.session.values import MAX_SENSORS
 
@@ -77,7 +84,12 @@ class FusedTimeline:
         if self.clock and abs(self._jump_ns(frame_id)) > self.gap_limit_ns:
             return self._other_clock(frame_id)
         refusal = self._no_place(frame_id, number if number >= 0 else len(epochs))
-        return self._admit(frame_id) if refusal is None else self._refuse(frame_id, refusal)
+        if refusal is None:
+            return self._admit(frame_id)
+        newest = number < 0 or (number == len(epochs) - 1 and frame_id.seq > epochs[number].highest)
+        if refusal is Verdict.LATE and newest and frame_id.stamp_ns < self.clock.get(frame_id.sensor, 0):
+            return self._other_clock(frame_id, refusal)  # the sensor's own clock has stepped back
+        return self._refuse(frame_id, refusal)
 
     def places(self) -> dict[FrameId, Placement]:
         """Return where each frame of the window belongs."""
@@ -114,6 +126,11 @@ class FusedTimeline:
     def settle(self, base: FilterState, gone: Sequence[FrameId]) -> FusedTimeline:
         """Return it with a later beginning of the window: `gone` are the frames that fell out of it."""
         return replace(self, base=base.cursors, floor=base.last, frame_ids=without(self.frame_ids, gone))
+
+    def reinstated(self, frame_id: FrameId) -> FusedTimeline:
+        """Return it with the publisher of a frame in force again."""
+        epochs = reinstated(self.seen[frame_id.sensor], frame_id.epoch)
+        return replace(self, seen={**self.seen, frame_id.sensor: epochs})
 
     def complete_until(self, frame_id: FrameId, processed: tuple[bytes, int] | None) -> bool:
         """Whether no frame of its sensor is missing between the last one processed of its epoch and this one."""
@@ -175,7 +192,7 @@ class FusedTimeline:
         )
         return Decision(opens if last else Verdict.INSERTED, _placed(frame_id, self.generation), last), timeline
 
-    def _other_clock(self, frame_id: FrameId) -> tuple[Decision, FusedTimeline]:
+    def _other_clock(self, frame_id: FrameId, refusal: Verdict = Verdict.JUMPED) -> tuple[Decision, FusedTimeline]:
         """Refuse a frame whose stamp is far from the session's clock, or begin anew on its own."""
         sensor, stamp_ns = frame_id.sensor, frame_id.stamp_ns
         before = self.jumped.get(sensor)
@@ -186,7 +203,7 @@ class FusedTimeline:
         agreed = all(_agrees(jumped.get(name), stamp_ns, self.gap_limit_ns) for name in self.live() if name != sensor)
         alone = stamp_ns - one.since_ns > self.gap_limit_ns
         if one.count < JUMP_FRAMES or not (agreed or alone):
-            return self._refuse(frame_id, Verdict.JUMPED)[0], replace(self, jumped=jumped)
+            return self._refuse(frame_id, refusal)[0], replace(self, jumped=jumped)
         begun = replace(
             self,
             seen=self._remembering(frame_id),

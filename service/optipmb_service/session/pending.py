@@ -16,8 +16,10 @@ import optipmb_schemas as schemas
 from optipmb.records import record
 from optipmb_service.session.cloud_buffer import CloudBuffer
 from optipmb_service.session.fused_timeline import FusedTimeline
+from optipmb_service.session.seen_numbers import Checksums, Claim
+from optipmb_service.session.stamp_check import StampCheck
 from optipmb_service.session.state import Entry, size_of
-from optipmb_service.session.timeline import hold_until
+from optipmb_service.session.timeline import JUMP_FRAMES, Verdict, hold_until
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Sequence
@@ -76,6 +78,9 @@ class PendingFrames:
         self._timeline = timeline
         self._behind = False
         self.clouds = CloudBuffer(policy.clouds, policy.cloud_bytes)
+        self.stamps = StampCheck()
+        self.checksums = Checksums()
+        self._claim = Claim()
         self.held: list[Held] = []
         """The frames held, in order."""
         self.held_bytes = 0
@@ -120,6 +125,29 @@ class PendingFrames:
         place, detections = judged[1].place, schemas.encoded(contents.message)
         entry = Entry(frame_id, detections, None, False, 0, [], place, size_of(detections))
         return Held(entry, contents, deadline_ns, ticket, judged)
+
+    def is_alive(self, frame_id: FrameId, decision: Decision) -> bool:
+        """Whether a frame shows that a publisher is the one to track, though another one has succeeded it.
+
+        It has sent several frames in a row since the other one's last: for as long as a late frame may take, where the
+        other one has sent fewer; else for as long as stamps may be apart.
+        """
+        if decision.verdict is not Verdict.RETIRED:
+            if decision.verdict.admitted:
+                self._claim.clear()
+            return False
+        strayed = self.timeline.seen[frame_id.sensor][-1].mask.bit_count() < JUMP_FRAMES
+        span_ns = self.policy.rewind_ns if strayed else self.policy.gap_limit_ns
+        return self._claim.add(frame_id, frames=JUMP_FRAMES, span_ns=span_ns)
+
+    def reuses_number(self, message: schemas.Detections, decision: Decision) -> bool:
+        """Whether a frame that is refused has the number of another frame."""
+        if decision.verdict is Verdict.DUPLICATE:
+            same = self.checksums.same(message.epoch, message.seq, schemas.encoded(message))
+            if same is not None:
+                return not same
+        # What was sent earlier has no stamp beyond the newest one.
+        return decision.verdict in {Verdict.DUPLICATE, Verdict.LATE} and decision.place.jump_ns > 0
 
     def passes(self, frame: Held) -> bool:
         """Whether a frame that arrived need not be held: nothing is, no frames are awaited, and no cloud ever came."""

@@ -21,7 +21,14 @@ CODES: Final = {
         "The frame came later than the window in which tracks are corrected.",
         "Publish in order, or raise `rewind_s`.",
     ),
-    "duplicate_epoch": ("A publisher that was replaced by another one still sends.", "Stop one of the two publishers."),
+    "duplicate_epoch": (
+        "A publisher that was replaced by another one still sends; it is tracked again when the other one is silent.",
+        "Stop one of the two publishers: those with the `epoch` of the problem, and with that of the tracks.",
+    ),
+    "duplicate_seq": (
+        "A frame has the epoch and the number of another one, as of a publisher that began again; it is refused.",
+        "Give the publisher a new random epoch at every start, and number its frames upwards.",
+    ),
     "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or add processors."),
     "refused": (
         "No room for another session, or a change that needs a restart.",
@@ -36,12 +43,16 @@ CODES: Final = {
         "Check the localisation; if it is right, raise `max_speed`.",
     ),
     "time_jump": (
-        "The stamp is far from those before it; frames are refused until several in a row agree.",
+        "The stamp is over `gap_limit_s` ahead or `rewind_s` behind; frames are refused until three in a row agree.",
         "Check the sensor's clock.",
     ),
+    "clock": (
+        "The stamps of twenty frames do not advance, or not in nanoseconds; the frames are tracked nevertheless.",
+        "Send the time of the measurement, in nanoseconds, as `stamp_ns`.",
+    ),
     "restarted": (
-        "The session restarted: its tracks ended, ids continue. `received` has the reason and the jump of stamps.",
-        "After `jump` or `pose`: check clock and localisation. After `publisher` (a restart): nothing.",
+        "The session restarted: its tracks ended (`clock`: objects found again keep ids). `received` has the reason.",
+        "After `jump`, `clock` or `pose`: check clock and localisation. After `publisher` (a restart): nothing.",
     ),
     "overload": (
         "The frame, or the stream, exceeds its limit of computing time; the frame is refused.",

@@ -42,8 +42,8 @@ class ProcessedFrames:
     def __init__(self, transition: Transition, policy: Policy, life: Lineage, *, fused: bool) -> None:
         self.transition = transition
         self._policy = policy
-        gap_limit_ns = policy.gap_limit_ns
-        self.timeline: Timeline | FusedTimeline = FusedTimeline(gap_limit_ns) if fused else Timeline(gap_limit_ns)
+        self.timeline: Timeline | FusedTimeline
+        self.timeline = FusedTimeline(policy.gap_limit_ns) if fused else Timeline(policy.jump_limits)
         self._history = ReorderWindow(empty(transition, None, life.next_id, life.starts), transition.step)
 
     @property
@@ -96,6 +96,12 @@ class ProcessedFrames:
         """Remember that a frame came which is not to be processed."""
         self.timeline = self.timeline.note(frame_id)
 
+    def reinstate(self, frame_id: FrameId) -> None:
+        """Go on with the publisher of a frame, which others have succeeded."""
+        if isinstance(self.timeline, Timeline):
+            self.begin(self.head)  # in the window the order of publishers is that of their first frames
+        self.timeline = self.timeline.reinstated(frame_id)
+
     def begin(self, state: FilterState, transition: Transition | None = None) -> None:
         """Go on from a moment without a way back behind it; with another transition when the profile changes."""
         self.transition = transition or self.transition
@@ -126,5 +132,5 @@ class ProcessedFrames:
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Take up what was written down."""
-        self.timeline, entries = window_of(checkpoint, self._policy.gap_limit_ns)
+        self.timeline, entries = window_of(checkpoint, self._policy.jump_limits)
         self._history = ReorderWindow(checkpoint.base, self.transition.step, entries, checkpoint.head)

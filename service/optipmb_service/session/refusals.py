@@ -37,9 +37,20 @@ class Refusals:
         """A frame that can no longer be put in its place."""
         return self._problem("late", frame_id, "stamp_ns", "a frame inside the window", f"{jump_ns / SECOND:+.3f} s")
 
-    def retired(self, frame_id: FrameId) -> schemas.Problem:
+    def clock(self, frame_id: FrameId, found: str) -> schemas.Problem:
+        """Stamps that do not advance as time does."""
+        return self._problem("clock", frame_id, "stamp_ns", "stamps in nanoseconds that advance with time", found)
+
+    def reused(self, frame_id: FrameId, jump_ns: int) -> schemas.Problem:
+        """A frame with the number of another one."""
+        expected = "a number that no other frame of the epoch has, or a new epoch"
+        received = f"{frame_id.seq} again, in another frame, {jump_ns / SECOND:+.3f} s from the newest"
+        return self._problem("duplicate_seq", frame_id, "seq", expected, received)
+
+    def retired(self, frame_id: FrameId, gap_limit_ns: int) -> schemas.Problem:
         """A publisher that was succeeded and still sends."""
-        expected = "the newest publisher of the stream; an earlier one still sends"
+        silent = f"when the other has been silent for {gap_limit_ns / SECOND:g} s"
+        expected = f"the publisher that began last; stop one of the two, this one is tracked again {silent}"
         return self._problem("duplicate_epoch", frame_id, "epoch", expected, frame_id.epoch.hex())
 
     def astray(self, entry: Entry, policy: Policy) -> schemas.Problem:

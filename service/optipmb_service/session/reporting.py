@@ -45,7 +45,7 @@ class SessionReporting:
             return []
         if decision.verdict is Verdict.RETIRED:
             self.deliveries.refused += 1
-            return [self.complain.retired(frame_id)]
+            return [self.complain.retired(frame_id, self._policy.gap_limit_ns)]
         if decision.verdict is Verdict.JUMPED:
             self.deliveries.refused += 1
             return [self.complain.other_clock(frame_id, decision.place.jump_ns)]

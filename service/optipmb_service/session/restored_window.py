@@ -10,14 +10,15 @@ from optipmb_service.session.timeline import Timeline
 
 if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
+    from optipmb_service.session.timeline import JumpLimits
 
 
-def window_of(checkpoint: Checkpoint, gap_limit_ns: int) -> tuple[Timeline | FusedTimeline, list[Entry]]:
+def window_of(checkpoint: Checkpoint, limits: JumpLimits) -> tuple[Timeline | FusedTimeline, list[Entry]]:
     """Return the timeline and the frames of the window in the order of processing.
 
     Args:
         checkpoint: what was written down.
-        gap_limit_ns: see `Timeline`.
+        limits: see `Timeline`.
     """
     base = checkpoint.base
     frame_ids = tuple(one.frame_id for one in checkpoint.window)
@@ -26,10 +27,12 @@ def window_of(checkpoint: Checkpoint, gap_limit_ns: int) -> tuple[Timeline | Fus
         # A frame that was refused for its effort may have begun a generation that no frame was tracked in yet.
         head = checkpoint.head
         generation = max([head.generation, *(one.generation for one in head.cursors.values())])
-        timeline = FusedTimeline.resume(gap_limit_ns, checkpoint.seen, base.cursors, base.last, frame_ids, generation)
+        timeline = FusedTimeline.resume(
+            limits.ahead_ns, checkpoint.seen, base.cursors, base.last, frame_ids, generation
+        )
     else:
         epochs, cursor = checkpoint.seen.get("", ()), base.sensor("").cursor
-        timeline = Timeline.resume(gap_limit_ns, epochs, cursor, base.last, frozenset(frame_ids))
+        timeline = Timeline.resume(limits, epochs, cursor, base.last, frozenset(frame_ids))
     places = timeline.places()
     entries = [
         Entry(

@@ -132,6 +132,9 @@ class SensorQueues:
         for name in checkpoint.head.sensors if checkpoint.fused else ("",):
             if (pending := self.of(name)) is not None:
                 pending.clouds.newest_ns = checkpoint.newest_cloud_ns.get(name)
+        for one in checkpoint.window:
+            if (pending := self.pending.get(one.frame_id.sensor)) is not None:
+                pending.checksums.add(one.frame_id.epoch, one.frame_id.seq, one.detections)
 
     def unprocessed(self) -> list[tuple[schemas.Detections | schemas.Points, Any]]:
         """Return clouds without their frame, and frames held, each with its ticket."""

@@ -17,6 +17,8 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
+import optipmb_schemas as schemas
+
 import optipmb
 from optipmb_service.session import convert
 from optipmb_service.session.checkpoint import Checkpoint
@@ -32,8 +34,6 @@ from optipmb_service.session.values import SECOND, Begun, Counters, Lineage, Out
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-
-    import optipmb_schemas as schemas
 
     from optipmb_service.session.reporting import Condition
     from optipmb_service.session.values import Steps
@@ -108,9 +108,19 @@ class Session:
             self._recovery.begin(frame_id, now_ns if arrived_ns is None else arrived_ns, now_ns)
         judged_by = pending.timeline
         decision, arrived = judged_by.judge(frame_id)
+        if pending.is_alive(frame_id, decision):
+            outputs += self.flush()
+            self._processed.reinstate(frame_id)
+            self._sensors.begin_anew()
+            judged_by = pending.timeline
+            decision, arrived = judged_by.judge(frame_id)
         if not decision.verdict.admitted:
             self._sensors.remember(pending, judged_by, arrived)
+            if pending.reuses_number(message, decision):
+                self._reporting.deliveries.refused += 1
+                return [*outputs, self._reporting.complain.reused(frame_id, decision.place.jump_ns)]
             return [*outputs, *self._reporting.refused(frame_id, decision)]
+        pending.checksums.add(frame_id.epoch, frame_id.seq, schemas.encoded(message))
         try:
             frame, ignored = convert.frame_of(self.parameters, message)
         except optipmb.FrameError as invalid:
@@ -121,6 +131,8 @@ class Session:
             return [*outputs, self._reporting.complain.invalid(frame_id, invalid)]
         pending.timeline = arrived
         since_ns = now_ns if arrived_ns is None else arrived_ns
+        if found := pending.stamps.add(frame_id.stamp_ns, since_ns):
+            outputs.append(self._reporting.complain.clock(frame_id, found))
         contents = Contents(message, frame, ignored)
         held = pending.arrived(contents, frame_id, since_ns, ticket, (judged_by, decision, arrived))
         return [*outputs, *self._steps.accept(held, pending, now_ns)]

@@ -23,7 +23,14 @@ from enum import StrEnum, unique
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from optipmb.records import record
-from optipmb_service.session.seen_numbers import WINDOW, SeenNumbers, complete_until, number_of, remembered
+from optipmb_service.session.seen_numbers import (
+    WINDOW,
+    SeenNumbers,
+    complete_until,
+    number_of,
+    reinstated,
+    remembered,
+)
 from optipmb_service.session.values import Count, Epoch, SensorName, Whole  # noqa: TC001 - pydantic reads them
 
 if TYPE_CHECKING:
@@ -85,6 +92,18 @@ class FrameId(NamedTuple):
     sensor: SensorName = ""
 
 
+class JumpLimits(NamedTuple):
+    """Steps of the stamps, in the order of a publisher, beyond which they jumped.
+
+    Attributes:
+        back_ns: largest step back: what a late frame is put in its place for.
+        ahead_ns: largest step ahead.
+    """
+
+    back_ns: int
+    ahead_ns: int
+
+
 Order = tuple[int, int, str, int, int]
 """The key by which frames are processed: generation, stamp, sensor, era, sequence number."""
 
@@ -139,18 +158,19 @@ class Cursor:
     jumped: Count = 0
     jumped_ns: Whole = 0
 
-    def follow(self, frame_id: FrameId, gap_limit_ns: int) -> Placement:
+    def follow(self, frame_id: FrameId, limits: JumpLimits) -> Placement:
         """Return the place of the frame that comes next in its publisher's order."""
         stamp_ns = frame_id.stamp_ns
         if self.epoch is None:
             return Placement(self.era + 1, self.generation, None, Verdict.FIRST, 0, stamp_ns)
         jump_ns = stamp_ns - self.newest_ns
         if frame_id.epoch == self.epoch:
-            if -gap_limit_ns <= jump_ns <= gap_limit_ns:
+            goes_on = -limits.back_ns <= jump_ns <= limits.ahead_ns
+            if goes_on and not (jump_ns < 0 and self.jumped_ns < self.newest_ns and self._agreeing(frame_id) > 1):
                 return Placement(self.era, self.generation, self.floor_ns, Verdict.NEXT, jump_ns, stamp_ns)
             if self._agreeing(frame_id) < JUMP_FRAMES:
                 return Placement(self.era, self.generation, self.floor_ns, Verdict.UNCONFIRMED, jump_ns, self.newest_ns)
-        elif 0 < jump_ns <= gap_limit_ns:
+        elif 0 < jump_ns <= limits.ahead_ns:
             return Placement(self.era + 1, self.generation, self.newest_ns, Verdict.NEW_EPOCH, jump_ns, stamp_ns)
         return Placement(self.era + 1, self.generation + 1, None, Verdict.RESTART, jump_ns, stamp_ns)
 
@@ -193,7 +213,7 @@ class Timeline:
     """What is remembered of the frames of a stream.
 
     Attributes:
-        gap_limit_ns: a step of the stamps beyond this, ahead or back, is a jump.
+        limits: a step of the stamps beyond these is a jump.
         epochs: what came of each epoch, in the order of their appearance; the last one is in force.
         base: the course up to the window.
         floor: the last frame before the window in the order of processing; nothing goes before it.
@@ -201,7 +221,7 @@ class Timeline:
         tip: the course after all of them.
     """
 
-    gap_limit_ns: int
+    limits: JumpLimits
     epochs: tuple[SeenNumbers, ...] = ()
     base: Cursor = field(default_factory=Cursor)
     floor: FrameId | None = None
@@ -229,14 +249,14 @@ class Timeline:
     @classmethod
     def resume(
         cls,
-        gap_limit_ns: int,
+        limits: JumpLimits,
         epochs: tuple[SeenNumbers, ...],
         base: Cursor,
         floor: FrameId | None,
         frame_ids: frozenset[FrameId],
     ) -> Timeline:
         """Return the timeline that had these parts."""
-        timeline = cls(gap_limit_ns, epochs, base, floor)
+        timeline = cls(limits, epochs, base, floor)
         ordered = tuple(sorted(frame_ids, key=lambda one: (timeline._number(one.epoch), one.seq)))
         return replace(timeline, frame_ids=ordered, tip=timeline._arrange(ordered)[1])
 
@@ -256,7 +276,11 @@ class Timeline:
     def settle(self, base: FilterState, gone: Sequence[FrameId]) -> Timeline:
         """Return it with a later beginning of the window: `gone` are the frames that fell out of it."""
         left = without(self.frame_ids, gone)
-        return Timeline(self.gap_limit_ns, self.epochs, base.sensor("").cursor, base.last, left, self.tip)
+        return Timeline(self.limits, self.epochs, base.sensor("").cursor, base.last, left, self.tip)
+
+    def reinstated(self, frame_id: FrameId) -> Timeline:
+        """Return it with the publisher of a frame in force again; nothing is in the window."""
+        return replace(self, epochs=reinstated(self.epochs, frame_id.epoch))
 
     def complete_until(self, frame_id: FrameId, processed: tuple[bytes, int] | None) -> bool:
         """Whether no frame is missing between the last one processed of its epoch and this one."""
@@ -266,12 +290,12 @@ class Timeline:
 
     def _append(self, frame_id: FrameId) -> tuple[Decision, Timeline]:
         """Take a frame that is the last one in its publisher's order."""
-        place = self.tip.follow(frame_id, self.gap_limit_ns)
+        place = self.tip.follow(frame_id, self.limits)
         if not self._free(frame_id, place):
             return self._refuse(frame_id, Verdict.LATE)
         behind = place.jump_ns < 0 and place.opens is Verdict.NEXT
         epochs, tip = remembered(self.epochs, frame_id), self.tip.after(frame_id, place)
-        timeline = Timeline(self.gap_limit_ns, epochs, self.base, self.floor, (*self.frame_ids, frame_id), tip)
+        timeline = Timeline(self.limits, epochs, self.base, self.floor, (*self.frame_ids, frame_id), tip)
         return Decision(Verdict.INSERTED if behind else place.opens, place, not behind), timeline
 
     def _insert(self, frame_id: FrameId, number: int) -> tuple[Decision, Timeline]:
@@ -290,7 +314,7 @@ class Timeline:
         if frame_id.epoch == self.base.epoch and frame_id.seq < self.base.seq and place.opens is not Verdict.NEXT:
             # What was sent before the window cannot be what opens an era behind it: it merely took long.
             return self._refuse(frame_id, refusal)
-        if succeeded and not self._before_successor(at, places):
+        if succeeded and (place.opens is Verdict.UNCONFIRMED or not self._before_successor(at, places)):
             return self._refuse(frame_id, refusal)
         order = place.order(frame_id)
         behind = any(other.order(one) > order for one, other in zip(frame_ids, places, strict=True))
@@ -308,7 +332,7 @@ class Timeline:
     def _arrange(self, frame_ids: tuple[FrameId, ...]) -> tuple[tuple[Placement, ...], Cursor]:
         cursor, places = self.base, []
         for frame_id in frame_ids:
-            place = cursor.follow(frame_id, self.gap_limit_ns)
+            place = cursor.follow(frame_id, self.limits)
             cursor = cursor.after(frame_id, place)
             places.append(place)
         return tuple(places), cursor

@@ -15,7 +15,9 @@ import hashlib
 import json
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
 
 import optipmb
 from optipmb.records import record
@@ -23,7 +25,7 @@ from optipmb_service.session import convert
 from optipmb_service.session.frame_tracks import FrameTracks, tracks_of
 from optipmb_service.session.pose_check import judge
 from optipmb_service.session.state import Contents, Entry, FilterState, FrameCounts, PoseHistory, SensorState
-from optipmb_service.session.timeline import FrameId, Verdict
+from optipmb_service.session.timeline import JUMP_FRAMES, FrameId, Verdict
 from optipmb_service.session.values import MAX_LABELS, MAX_SENSORS, SECOND, total
 
 if TYPE_CHECKING:
@@ -46,7 +48,7 @@ class SessionStart:
         jump_ns: how far the stamps jumped.
     """
 
-    reason: Literal["first", "jump", "publisher", "pose", "effort"]
+    reason: Literal["first", "jump", "clock", "publisher", "pose", "effort"]
     jump_ns: int
 
 
@@ -115,8 +117,11 @@ class Transition:
         if contents is None:
             message = entry.message
             contents = Contents(message, *convert.frame_of(self.parameters, message))
-        sensor = before.sensor(frame_id.sensor)
         begins = _begins(before, entry)
+        moved = self.on_new_clock(before, entry, contents.message)
+        if moved is not None:
+            before, begins = moved, SessionStart("clock", place.jump_ns)
+        sensor = before.sensor(frame_id.sensor)
         known = PoseHistory() if begins else sensor.pose_history
         pose_history, where = judge(known, contents.message, self._policy)
         if where == "moved" and self._others_stayed(before, frame_id):
@@ -143,6 +148,28 @@ class Transition:
                     return self._track(before, entry, contents, begins, pose_history)
             return _passed(before, entry, sensor.pose_history, effort=1), Outcome(entry, None, None, {}, error)
 
+    def on_new_clock(
+        self, before: FilterState, entry: Entry, message: schemas.Detections | None = None
+    ) -> FilterState | None:
+        """Return the state with its stamps set back, where a frame begins a life because the clock stepped back.
+
+        The objects are where they were: for as long as the frames that agreed on the step took, they go on. None where
+        the frame begins no life, or its stamps or its sensor are too far from those before to say so.
+        """
+        sensor = before.sensor(entry.frame_id.sensor)
+        cursor, last, history = sensor.cursor, before.last, sensor.pose_history
+        same = last is not None and cursor.epoch == entry.frame_id.epoch and cursor.jumped > 0
+        if not same or not begins_with(before, entry) or not -self._policy.gap_limit_ns <= entry.place.jump_ns < 0:
+            return None
+        stamp_ns = entry.frame_id.stamp_ns
+        density = set_clock(before.density, max(0, stamp_ns - JUMP_FRAMES * (stamp_ns - cursor.jumped_ns)))
+        if history.stamp_ns is not None:
+            history = replace(history, stamp_ns=density.stamp_ns)
+        if judge(history, message or entry.message, self._policy)[1] != "near":
+            return None
+        known = replace(sensor, pose_history=history)
+        return replace(before, density=density, sensors=_sensors(before, entry.frame_id.sensor, known))
+
     def _others_stayed(self, before: FilterState, frame_id: FrameId) -> bool:
         """Whether another sensor of the session is where it was, as far as was heard lately."""
         return any(
@@ -164,7 +191,7 @@ class Transition:
         frame_id = entry.frame_id
         if begins:
             starts, density = before.starts + 1, before.density
-            if begins.reason != "first":
+            if begins.reason not in {"first", "clock"}:
                 density = optipmb.Density.empty(self.parameters.labels, density.next_id)
             before = before.begun_anew(density, self.name(frame_id, starts), starts)
         sensor = before.sensor(frame_id.sensor)
@@ -266,6 +293,24 @@ def _counted(  # noqa: PLR0913 - all keywords, each a count
         effort=before.effort + effort,
         unconfirmed=before.unconfirmed + unconfirmed,
         repaired=before.repaired + repaired,
+    )
+
+
+def set_clock(density: optipmb.Density, stamp_ns: int) -> optipmb.Density:
+    """Return a density whose last frame has another stamp; its other stamps are as long ago, but not before 0."""
+    if density.stamp_ns < 0:
+        return density
+    shift_ns = stamp_ns - density.stamp_ns
+
+    def moved(rows: Any, *names: str) -> Any:
+        return rows.replaced(**{name: np.maximum(getattr(rows, name) + shift_ns, 0) for name in names})
+
+    return replace(
+        density,
+        stamp_ns=stamp_ns,
+        bernoulli=moved(density.bernoulli, "born_ns", "seen_ns"),
+        poisson=moved(density.poisson, "born_ns"),
+        misses=None if density.misses is None else moved(density.misses, "missed_from_ns", "looked_ns"),
     )
 
 

@@ -9,6 +9,7 @@ import optipmb_schemas as schemas
 from pydantic import AfterValidator, Field
 
 from optipmb.records import record
+from optipmb_service.session.timeline import JumpLimits
 
 if TYPE_CHECKING:
     import optipmb
@@ -105,6 +106,11 @@ class Policy:
     astray_frames: int = 5
     at_once: int = 2**62
 
+    @property
+    def jump_limits(self) -> JumpLimits:
+        """The steps of a publisher's stamps beyond which they jumped."""
+        return JumpLimits(min(self.rewind_ns, self.gap_limit_ns), self.gap_limit_ns)
+
 
 @dataclass(frozen=True, slots=True)
 class Lineage:
@@ -149,7 +155,8 @@ class Begun:
 
     Attributes:
         session: its id.
-        reason: "first", "jump", "publisher", "pose", "effort", "reset", "parameters" or "quarantine".
+        reason: "first", "jump", "clock" (a step back, after which the objects are kept), "publisher", "pose", "effort",
+            "reset", "parameters" or "quarantine".
         jump_ns: how far the stamps jumped.
     """
 

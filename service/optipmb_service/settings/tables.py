@@ -70,9 +70,7 @@ class Ros2Settings(BaseModel):
 
     domain: int = Field(default=0, ge=0, le=232, description="`ROS_DOMAIN_ID` of the system")
     node: str = Field(default="optipmb", pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="name of the ROS 2 node")
-    fixed_frame: str = Field(
-        default="", description="frame of the tracks; default: the root of the first detections' tf tree"
-    )
+    fixed_frame: str = Field(default="", description="frame of the tracks; default: the root of tf")
     odometry: Topic = Field(default="", description="topic of `nav_msgs/Odometry`, for poses that tf has not")
     tf_wait_s: float = Field(default=0.5, ge=0, le=60, description="longest wait of a message for its transform")
     diagnostics: Topic = Field(default="/diagnostics", description="topic of `diagnostic_msgs/DiagnosticArray`")

@@ -162,6 +162,15 @@ def test_a_dump_leads_to_the_same_density() -> None:
     seen.clear()
     client.replay(schemas.decode_dump(saved.dump), Noting)
     assert seen == live
+    seen.clear()
+    one = Session(SENSOR.stream, NUSCENES, tracker=Noting)
+    feed(one, range(5), SENSOR)
+    back = replace(SENSOR, start_s=SENSOR.start_s - 3)
+    (saved,) = dumps([*feed(one, range(5, 9), back), *feed(one, [9], back, objects=7)])
+    live = seen[5:8]  # a dump begins on the newest clock
+    seen.clear()
+    client.replay(schemas.decode_dump(saved.dump), Noting)
+    assert seen == live
 
 
 @given(st.binary(max_size=300))

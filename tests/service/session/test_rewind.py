@@ -108,7 +108,7 @@ def test_the_first_frame_may_come_late() -> None:
     assert {message.session for message in tracks(outputs)} == {expected.session}
 
 
-@pytest.mark.parametrize("shift_s", [3600.0, -3600.0])
+@pytest.mark.parametrize("shift_s", [3600.0, -3600.0, -3.0, -1.7])
 def test_disorder_across_a_jump_of_the_clock(shift_s: float) -> None:
     """Frames from both sides of a jump go to the lives that they belong to."""
     after = replace(SENSOR, start_s=SENSOR.start_s + shift_s)

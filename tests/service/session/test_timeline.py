@@ -8,12 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.session.seen_numbers import WINDOW
 from optipmb_service.session.state import FilterState, SensorState
-from optipmb_service.session.timeline import Cursor, Decision, FrameId, Timeline, Verdict, hold_until
+from optipmb_service.session.timeline import Cursor, Decision, FrameId, JumpLimits, Timeline, Verdict, hold_until
 
 import optipmb
 
 SECOND = 1_000_000_000
 LIMIT = 5 * SECOND
+LIMITS = JumpLimits(SECOND, LIMIT)
 JUMPS = [0] * 4 + [3600] * 3 + [3607] * 5
 A, B, C = (bytes([letter]) * 16 for letter in b"abc")
 
@@ -30,7 +31,7 @@ def state_after(cursor: Cursor, last: FrameId | None) -> FilterState:
 
 def judge_all(marks: list[FrameId], *, window: bool = False) -> tuple[list[Decision], Timeline]:
     """Judge frames; without a window none can be gone behind."""
-    timeline, decisions, cursor, floor = Timeline(LIMIT), [], Cursor(), None
+    timeline, decisions, cursor, floor = Timeline(LIMITS), [], Cursor(), None
     for one in marks:
         decision, timeline = timeline.judge(one)
         decisions.append(decision)
@@ -153,7 +154,7 @@ def test_a_frame_behind_a_processed_one_is_late() -> None:
 
 
 def test_a_jump_restarts_the_session() -> None:
-    """A clock set by an hour, ahead or back, begins a new generation once three frames agree; small steps are late."""
+    """A clock set by an hour, ahead or back, begins a new generation once three frames agree; one behind is late."""
     for to in (3600, -3600):
         jumped = [mark(seq, 7200 + seq / 10 + to) for seq in range(2, 6)]
         decisions, _ = judge_all([mark(0, 7200), mark(1, 7200.1), *jumped])
@@ -166,7 +167,17 @@ def test_a_jump_restarts_the_session() -> None:
             Verdict.NEXT,
         ]
         assert [d.place.generation for d in decisions] == [0, 0, 0, 0, 1, 1]
-    assert verdicts([mark(0, 10), mark(1, 10.1), mark(2, 9), mark(3, 10.2)])[2:] == [Verdict.LATE, Verdict.NEXT]
+    assert verdicts([mark(0, 10), mark(1, 10.1), mark(2, 9.5), mark(3, 10.2)])[2:] == [Verdict.LATE, Verdict.NEXT]
+
+
+def test_a_step_back_beyond_the_window_is_a_jump() -> None:
+    """Three frames that go on from behind the window begin a new generation, also where they come back into it."""
+    jumped = Verdict.UNCONFIRMED
+    for back in (1.2, 2, 5):
+        stepped = [mark(seq, 10 + seq / 10 - back) for seq in range(2, 6)]
+        assert verdicts([mark(0, 10), mark(1, 10.1), *stepped])[2:] == [jumped, jumped, Verdict.RESTART, Verdict.NEXT]
+    twice = [mark(0, 10), mark(1, 10.1), mark(2, 8), mark(3, 8.1), mark(4, 10.2)]
+    assert verdicts(twice)[2:] == [jumped, jumped, Verdict.NEXT]
 
 
 def test_the_gap_limit_itself_is_no_jump() -> None:
