@@ -248,7 +248,8 @@ class Settings(BaseSettings):
     )
     http_hosts: Names = Field(
         default=(),
-        description="host names with a dot that HTTP requests may use, besides addresses and names without; `*`: any",
+        description="host names with a dot by which the page may be asked for, besides addresses and names without;"
+        " `*`: any",
     )
     http_streams: int = Field(
         default=100, ge=0, le=10_000, description="streams with series of their own in the metrics, by name"
