@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import sys
 from typing import TYPE_CHECKING, Any
 
 import structlog
@@ -13,6 +12,7 @@ from optipmb_service.app.edges import monitoring
 from optipmb_service.app.ending import END_HUNG, RESTART, EndBound, longest_end_s
 from optipmb_service.app.loops import StopRequest, beat, unless, watch_keys
 from optipmb_service.cluster.store import StoreError
+from optipmb_service.observability import logs
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh.client import Client
@@ -47,7 +47,7 @@ async def run(
         with monitoring(settings, health):
             ended = await serve(asked, health)
     except (TransportError, EdgeError, StoreError) as error:
-        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+        logs.say(f"optipmb-service: {error}")
         return 1
     finally:
         asked.bound.begin()  # also where nobody asked

@@ -14,7 +14,6 @@ import asyncio
 import contextlib
 import math
 import signal
-import sys
 import time
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -27,6 +26,7 @@ from optipmb_service.app.ending import END_HUNG, LATE_S, RESTART, SLICE_S, EndBo
 from optipmb_service.app.loops import StopRequest, beat, say_ready, unless, watch_keys
 from optipmb_service.app.private_folder import private_folder
 from optipmb_service.app.worker_process import WorkerProcess
+from optipmb_service.observability import logs
 from optipmb_service.observability.health import BEAT_S
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh import Transport
@@ -216,7 +216,7 @@ async def supervise(settings: Settings) -> int:
                 return 0
             return await _supervised(settings, workers, transport, asked, folder)
         except (TransportError, EdgeError) as error:
-            print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+            logs.say(f"optipmb-service: {error}")
             return 1
 
 

@@ -20,6 +20,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.metrics_core import Metric
 from prometheus_client.samples import Sample
 
+from optipmb_service.observability.logs import lines_dropped
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
@@ -94,6 +96,7 @@ SERVICE_METRICS: Final = {
     "stream_latency_seconds": MetricFamily(
         "gauge", ("stream", "quantile"), "Median and 99th percentile of the last 512 latencies."
     ),
+    "log_lines_dropped_total": MetricFamily("counter", (), "Log lines not written: nobody read stderr in time."),
     "streams_unlisted": MetricFamily("gauge", (), "Streams beyond `http_streams`, without series of their own."),
 }
 """Those of a process that tracks, by their names without the prefix `optipmb_`."""
@@ -224,6 +227,7 @@ class Metrics:
         yield "tracks_started_total", (), self._started
         yield "tracks_ended_total", (), self._ended
         yield "sessions_restored_total", (), self._restored
+        yield "log_lines_dropped_total", (), lines_dropped()
 
 
 def families(data: bytes) -> list[Metric]:
