@@ -34,6 +34,8 @@ EVENTS: Final = {
     "grpc_connections": "The limit of open files allows fewer connections than the setting.",
     "grpc_invalid": "An invalid message from the network was not forwarded to callers.",
     "grpc_certificates": "Renewed certificates cannot be read; the previous ones stay in use.",
+    "unprotected": "Everybody who reaches these `addresses` may publish, read and command: there is neither TLS nor"
+    " access control. See `security.md`.",
     "unknown_environment": "Variables `OPTIPMB_…` that are not settings, usually misspelt.",
     "peer_connected": "A node, router or service has connected.",
     "tracker_message": "A `text` of the tracker: it compiles, for up to a minute.",
@@ -156,7 +158,7 @@ class LineWriter:
     """
 
     def __init__(self, file: TextIO) -> None:
-        self._file = file
+        self.file = file
         self._changed = threading.Condition()
         self._lines: deque[bytes] = deque()
         self._bytes = 0
@@ -204,9 +206,9 @@ class LineWriter:
 
     def _write(self, line: bytes) -> None:
         try:
-            descriptor = self._file.fileno()
+            descriptor = self.file.fileno()
         except OSError:  # of a test, which has put another object in its place
-            self._file.write(line.decode())
+            self.file.write(line.decode())
             return
         while line:
             try:
@@ -220,7 +222,7 @@ _writer: LineWriter | None = None
 
 def say(line: str) -> None:
     """Write a line to stderr as it is, after those of the log."""
-    if _writer is None:
+    if _writer is None or _writer.file is not sys.stderr:
         print(line, file=sys.stderr)  # noqa: T201 - the one line of a failed start
     else:
         _writer.write(f"{line}\n")
@@ -287,3 +289,8 @@ def unknown_environment(names: tuple[str, ...]) -> None:
     """Log environment variables that look like settings and are none: usually a typing error."""
     if names:
         structlog.get_logger("optipmb_service").warning("unknown_environment", names=names)
+
+
+def unprotected(addresses: tuple[str, ...]) -> None:
+    """Log addresses beyond this machine without TLS and access control."""
+    structlog.get_logger("optipmb_service").warning("unprotected", addresses=addresses)
