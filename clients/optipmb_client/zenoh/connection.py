@@ -12,6 +12,7 @@ from typing import Protocol, Self, TypeVar
 
 import zenoh
 from optipmb_schemas import Detections, Keys, Points, Topic, encoding_of
+from optipmb_schemas.certificates import end_of, ended
 
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Answer, Inbox
@@ -74,13 +75,13 @@ class Connection:
         try:
             self._session = zenoh.open(settings)
         except zenoh.ZError as error:
-            raise self._unanswered(endpoints, timeout) from error
+            raise self._unanswered(endpoints, timeout, settings) from error
         # A router that starts at this moment may be known and not linked yet: what is sent then is lost.
         ends = time.monotonic() + timeout
         while json.loads(settings.get_json("mode")) == "client" and not self._session.info.routers_zid():
             if time.monotonic() > ends:
                 self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
-                raise self._unanswered(endpoints, timeout)
+                raise self._unanswered(endpoints, timeout, settings)
             time.sleep(POLL_S)
         self._opened: weakref.WeakSet[Sender | Subscription] = weakref.WeakSet()
         self._lock = threading.Lock()
@@ -106,9 +107,15 @@ class Connection:
         """Whether `close` has been called."""
         return self._session.is_closed()
 
-    def _unanswered(self, endpoints: tuple[str, ...], timeout: float) -> ConnectionFailed:
+    def _unanswered(self, endpoints: tuple[str, ...], timeout: float, settings: zenoh.Config) -> ConnectionFailed:
+        names = ("connect_certificate", "root_ca_certificate")
+        found = [json.loads(settings.get_json(f"transport/link/tls/{name}")) for name in names]
+        ends = [ended(Path(file), end_of(Path(file))) for file in found if file]
+        advice = "; ".join(filter(None, ends)) or "is optipmb-service running there?"
+        if any(found) and not any(ends):
+            advice = "is optipmb-service running there, and does its TLS certificate hold?"
         return ConnectionFailed(
-            f"nothing answers at {self.where} (waited {timeout:g} s); is optipmb-service running there?",
+            f"nothing answers at {self.where} (waited {timeout:g} s); {advice}",
             endpoints=endpoints,
             timeout=timeout,
         )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import structlog
 
 from optipmb_service import __version__
+from optipmb_service.app.certificates import Certificates
 from optipmb_service.app.edges import monitoring
 from optipmb_service.app.ending import END_HUNG, RESTART, EndBound, longest_end_s
 from optipmb_service.app.loops import StopRequest, beat, unless, watch_keys
@@ -43,7 +44,11 @@ async def run(
     log.info("starting", instance=settings.instance, version=__version__, **about)
     health = ProcessHealth(settings.instance)
     beating = asyncio.create_task(beat(health))
+    watching: asyncio.Task[None] | None = None
     try:
+        health.tls = certificates = Certificates(settings)
+        health.metrics.add(certificates.figures)
+        watching = asyncio.create_task(certificates.watch())
         with monitoring(settings, health):
             ended = await serve(asked, health)
     except (TransportError, EdgeError, StoreError) as error:
@@ -52,6 +57,8 @@ async def run(
     finally:
         asked.bound.begin()  # also where nobody asked
         beating.cancel()
+        if watching is not None:
+            watching.cancel()
     if ended is not None:
         log.info("stopped", drained=ended)
     if asked.restarts:

@@ -21,6 +21,7 @@ import structlog
 
 from optipmb_service import __version__
 from optipmb_service.app.aggregate import QUERIES, AggregateView
+from optipmb_service.app.certificates import Certificates
 from optipmb_service.app.edges import grpc_edge, monitoring
 from optipmb_service.app.ending import END_HUNG, LATE_S, RESTART, SLICE_S, EndBound, longest_end_s
 from optipmb_service.app.loops import StopRequest, beat, say_ready, unless, watch_keys
@@ -230,6 +231,9 @@ async def _supervised(
     """
     supervisor = Supervisor(workers, asked, private)
     view = AggregateView(settings, supervisor, transport)
+    view.tls = certificates = Certificates(settings)
+    view.add(certificates.figures)
+    looking = asyncio.create_task(certificates.watch())
     beating = asyncio.create_task(beat(view))
     client = transport.client()
     watching = asyncio.create_task(watch_keys(asked, lambda: client.key_numbers, settings.restart_keys))
@@ -249,8 +253,8 @@ async def _supervised(
             ended = await supervisor.stop()
     finally:
         asked.bound.begin()  # also where nobody asked
-        beating.cancel()
-        watching.cancel()
+        for task in (beating, watching, looking):
+            task.cancel()
         with contextlib.suppress(Exception):
             await asyncio.to_thread(transport.close)
     log.info("stopped", drained=ended)

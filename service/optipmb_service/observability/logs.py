@@ -34,6 +34,9 @@ EVENTS: Final = {
     "grpc_connections": "The limit of open files allows fewer connections than the setting.",
     "grpc_invalid": "An invalid message from the network was not forwarded to callers.",
     "grpc_certificates": "Renewed certificates cannot be read; the previous ones stay in use.",
+    "certificate_ends": "Certificates that end within a week, and the `days` that they hold: renew them.",
+    "certificate_ended": "A certificate has ended: no link with it can be opened. Renew it, and restart what listens"
+    " with it.",
     "unprotected": "Everybody who reaches these `addresses` may publish, read and command: there is neither TLS nor"
     " access control. See `security.md`.",
     "unknown_environment": "Variables `OPTIPMB_…` that are not settings, usually misspelt.",

@@ -123,7 +123,12 @@ LOG_METRICS: Final = {
 }
 """Those of a bridge into the log."""
 
-METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS | LOG_METRICS
+TLS_METRICS: Final = {
+    "certificate_days": MetricFamily("gauge", ("use",), "Days until a certificate ends; below 0: it has ended."),
+}
+"""Those of a process with certificates."""
+
+METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS | LOG_METRICS | TLS_METRICS
 """Every metric. The figures of the process itself start with `process_`."""
 
 Value = tuple[str, tuple[str, ...], float]
