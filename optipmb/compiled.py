@@ -9,11 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
+import tempfile
+from functools import cache, partial
 from pathlib import Path
+from stat import S_ISDIR, S_IWGRP, S_IWOTH
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numba
-from numba.core import event
+from numba.core import config, event
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,6 +25,9 @@ if TYPE_CHECKING:
     F = TypeVar("F", bound=Callable[..., object])
 else:
     F = TypeVar("F")
+
+
+_log: Final = logging.getLogger(__package__)
 
 
 def _digest() -> str:
@@ -46,9 +53,7 @@ class _FirstCompilation(event.Listener):
         """Numba begins to compile a function that is not in its cache."""
         if not self.said and event.data["dispatcher"].py_func.__module__.startswith(f"{__package__}."):
             self.said = True
-            logging.getLogger(__package__).warning(
-                "optipmb: compiling the tracker, once after an installation; it takes up to a minute"
-            )
+            _log.warning("optipmb: compiling the tracker, once after an installation; it takes up to a minute")
 
     def on_end(self, event: Any) -> None:
         """It has compiled the function."""
@@ -75,6 +80,36 @@ def long_kernel(function: F) -> F:
 
 
 def _compiled(function: F, *, nogil: bool) -> F:
-    compiled: Any = numba.njit(cache=True, nogil=nogil, error_model="numpy")(function)
+    jit = partial(numba.njit, nogil=nogil, error_model="numpy")
+    try:
+        compiled: Any = jit(cache=True)(function)
+    except RuntimeError:  # numba finds no folder that this user may write to
+        folder = _private_folder()
+        if folder is None:
+            return cast("F", jit()(function))
+        usual, config.CACHE_DIR = config.CACHE_DIR, folder
+        try:
+            compiled = jit(cache=True)(function)
+        finally:
+            config.CACHE_DIR = usual
     compiled._cache._cache_file._source_stamp = _SOURCES  # noqa: SLF001 - numba has no public name for it
     return cast("F", compiled)
+
+
+@cache
+def _private_folder() -> str | None:
+    """Return the folder for compiled kernels of a user who may write nowhere else, None where there can be none.
+
+    Machine code is loaded from it: a folder that somebody else owns or may write to is not used.
+    """
+    folder = Path(tempfile.gettempdir()) / f"optipmb-kernels-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError:
+        found = None
+    if found and S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & (S_IWGRP | S_IWOTH):
+        _log.warning("optipmb: no cache can be written: kernels are kept in %s; set NUMBA_CACHE_DIR", folder)
+        return str(folder)
+    _log.warning("optipmb: no cache can be written: every process compiles its kernels; set NUMBA_CACHE_DIR")
+    return None

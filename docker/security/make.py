@@ -128,7 +128,13 @@ def gateway(prefix: str, name: str) -> Role:
     return Role(
         f"gateway/{name}",
         f"gateway/{name}",
-        sends=((WRITE + TOKEN + ANSWER, inputs), (READ + ASK, outputs), (ASK, questions), (READ, presence)),
+        sends=(
+            (WRITE + TOKEN + ANSWER, inputs),
+            (WRITE, (f"{prefix}/*/*/*/problems",)),
+            (READ + ASK, outputs),
+            (ASK, questions),
+            (READ, presence),
+        ),
         receives=(
             (READ + ASK + ANSWER, recoverable(f"{prefix}/**")),
             (WRITE + TOKEN, outputs),

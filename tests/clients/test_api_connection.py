@@ -1,5 +1,6 @@
 """Connections and what is opened on them, against a real router in the same process."""
 
+import math
 import re
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 import zenoh
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Arrival, Inbox
+from optipmb_client.links import linked
 from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection, configuration
 from optipmb_client.zenoh.subscription import Subscription
 from routers import free_endpoint, open_client, open_router
@@ -47,6 +49,20 @@ def test_a_configuration_with_an_id_is_refused(tmp_path: Path) -> None:
         Connection(free_endpoint(), config=file)
 
 
+@pytest.mark.parametrize("timeout", [math.nan, -1.0])
+@pytest.mark.parametrize("scheme", ["tcp/", "grpc://"])
+def test_a_timeout_that_is_none_is_one_error(timeout: float, scheme: str) -> None:
+    """What is no time gives ConnectionFailed with what was expected, over Zenoh and over gRPC."""
+    with pytest.raises(ConnectionFailed, match=f"timeout: expected seconds, 0 or more, received {timeout}"):
+        linked(f"{scheme}127.0.0.1:1", timeout=timeout)
+
+
+def test_a_connection_may_wait_for_ever(endpoint: str) -> None:
+    """With an infinite timeout a connection opens; it has a router when it is open."""
+    with Connection(endpoint, timeout=math.inf) as connection:
+        assert list(connection._session.info.routers_zid())
+
+
 def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:
     """Opening a connection before its router is no error when the router comes in time."""
     address = free_endpoint()
@@ -56,6 +72,7 @@ def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:
     try:
         with Connection(address, timeout=60.0) as connection:
             assert not connection.closed
+            assert list(connection._session.info.routers_zid())
     finally:
         timer.join()
         opened[0].close()

@@ -3,6 +3,10 @@
 import concurrent.futures
 import importlib
 import json
+import os
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +24,7 @@ from optipmb_client.foxglove_server import FoxgloveServer
 from optipmb_client.mcap_files.plan import plan, renamed, steps
 from optipmb_client.mcap_files.reading import Recorded, RecordingFile
 from optipmb_client.mcap_files.writing import RecordingWriter
+from optipmb_client.zenoh import Connection
 from optipmb_schemas import (
     Detections,
     Keys,
@@ -103,6 +108,33 @@ def put(writer: RecordingWriter, message: Message, received_ns: int, *, json: bo
     key = f"optipmb/v1/{STREAM}/{topic}"
     writer.add(key, payload, encoding_of(message, form="json" if json else "msgpack"), received_ns)
     return payload
+
+
+LIMITED = """
+import resource, sys
+from optipmb_client.cli import run
+
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+sys.exit(run(sys.argv[1:]))
+"""
+
+
+def test_a_disk_that_is_full_is_one_line_with_the_file(endpoint: str, tmp_path: Path) -> None:
+    """A recording that cannot be written ends by itself, with one line that names the file."""
+    file = tmp_path / "full.mcap"
+    command = [sys.executable, "-c", LIMITED, "record", "--out", str(file), "--connect", endpoint]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
+        Connection(endpoint) as connection,
+    ):
+        sender = connection.cached_sender("optipmb/v1/a/b/c/detections", "application/octet-stream", cache=10)
+        while process.poll() is None:
+            sender.put(os.urandom(50_000))
+            time.sleep(0.05)
+        assert process.stderr is not None
+        errors = process.stderr.read()
+        assert process.returncode != 0
+    assert errors == f"optipmb: {file}: File too large\n"
 
 
 def test_messages_come_back_byte_for_byte(tmp_path: Path) -> None:

@@ -111,6 +111,16 @@ def test_the_image_is_safe_to_run() -> None:
         assert "--require-hashes" in line or "--no-index" in line, line
 
 
+def test_the_image_runs_under_any_user_id() -> None:
+    """No manifest of the image fixes the user id, and the volume can be written by the group that any id comes with."""
+    manifests = [file.read_text() for file in (DOCKER / "kubernetes").glob("*.yaml")]
+    ours = [text for text in manifests if re.search(r"^\s+image: optipmb$", text, re.MULTILINE)]
+    assert ours
+    assert not [text for text in ours if "runAsUser" in text or "runAsGroup" in text]
+    (made,) = [one.value for one in STAGES[-1].instructions if "install -d" in one.value]
+    assert "-g root -m 0770 /var/lib/optipmb" in made
+
+
 def test_what_is_copied_is_let_through() -> None:
     """`.dockerignore` keeps everything out but what the Dockerfile copies."""
     copied = {word for one in STAGES[0].instructions if one.name == "COPY" for word in one.words[:-1]}

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import grpc
+import numpy as np
 import pytest
-from gateway import GatewayProcess, connected, detections, frame, resident
+from gateway import EPOCH, GatewayProcess, connected, detections, frame, points, resident
+from optipmb_schemas import Points
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
+from optipmb_service.grpc.outbox import varint
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -73,6 +78,84 @@ def test_many_small_lists_take_little_memory(gateway: GatewayProcess, stream: st
         problems = list(stub.Track(iter([request])))
         assert [one.WhichOneof("response") for one in problems] == ["problem"]
     assert resident(gateway.process.pid) - before < 300 * 2**20
+
+
+def test_fields_that_nobody_knows_leave_no_memory_behind(gateway: GatewayProcess, stream: str) -> None:
+    """Forty calls at once with 30 MB of unknown fields are refused, and their memory is given back."""
+    size = 30 * 2**20
+    payload = b"\xa2\x06" + varint(size) + bytes(size)
+    channel = grpc.insecure_channel(gateway.address, options=[("grpc.max_send_message_length", -1)])
+    track = channel.stream_stream(f"/{pb.DESCRIPTOR.services_by_name['TrackingService'].full_name}/Track")
+    served(gateway, stream)
+    before = resident(gateway.process.pid)
+
+    def refusal(_number: int) -> grpc.StatusCode:
+        with pytest.raises(grpc.RpcError) as raised:
+            list(track(iter([payload])))
+        code: grpc.StatusCode = raised.value.code()
+        return code
+
+    with ThreadPoolExecutor(40) as pool:
+        assert set(pool.map(refusal, range(40))) == {grpc.StatusCode.INVALID_ARGUMENT}
+    ends = time.monotonic() + 60
+    while resident(gateway.process.pid) - before > 250 * 2**20:
+        assert time.monotonic() < ends, f"{(resident(gateway.process.pid) - before) >> 20} MB are left"
+        time.sleep(0.1)
+    channel.close()
+    served(gateway, stream)
+
+
+def test_a_call_that_ends_badly_after_a_problem_ends(gateway: GatewayProcess, stream: str) -> None:
+    """A valid frame, an invalid one and one of another stream, sent at once: the problem comes, then the status."""
+    invalid = detections(frame(1, stream))
+    invalid.detections.yaw.data = np.full(2, np.nan).tobytes()
+    requests = [detections(frame(0, stream)), invalid, detections(frame(2, f"{stream}-2"))]
+    call = gateway.stub().Track(iter(requests), timeout=30)
+    with pytest.raises(grpc.RpcError) as raised:
+        list(call)
+    assert raised.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+
+
+def test_deadlines_are_no_faults_of_the_gateway(gateway: GatewayProcess, stream: str) -> None:
+    """Calls that pass their deadline at any moment leave no line about an internal error."""
+    stub = gateway.stub()
+    served(gateway, stream)
+    for number in range(60):
+        with contextlib.suppress(grpc.RpcError):
+            stub.GetState(pb.GetStateRequest(stream=stream), timeout=0.001 * number)
+        with contextlib.suppress(grpc.RpcError):
+            list(
+                stub.Track((detections(frame(seq, f"{stream}-{number}")) for seq in range(20)), timeout=0.002 * number)
+            )
+        with contextlib.suppress(grpc.RpcError):
+            list(stub.Subscribe(pb.SubscribeRequest(pattern=stream), timeout=0.002 * number))
+    served(gateway, f"{stream}-last")
+    assert "internal_error" not in gateway.errors
+    assert "Traceback" not in gateway.errors
+
+
+def test_a_refused_cloud_is_told_to_all(gateway: GatewayProcess, stream: str) -> None:
+    """A cloud that the gateway refuses is a problem for the caller, once, and for everybody who looks at the stream."""
+    stub = gateway.stub()
+    watching = stub.Subscribe(pb.SubscribeRequest(pattern=stream, problems=True), timeout=60)
+    watching.initial_metadata()
+    cloud = points(
+        Points(stream=stream, epoch=EPOCH, seq=0, stamp_ns=0, frame="world", xyz=np.zeros((5, 3), np.float32)),
+        pb.PublishRequest,
+    )
+    cloud.points.xyz.data = b"123"
+    seen = threading.Event()
+
+    def requests() -> Iterator[pb.PublishRequest]:
+        yield cloud
+        seen.wait(60)
+
+    call = stub.Publish(requests())
+    problem = next(watching).problem
+    assert (problem.code, problem.path) == ("invalid_value", "xyz.data")
+    seen.set()
+    assert [one.problem.path for one in call if one.HasField("problem")] == ["xyz.data"]
+    watching.cancel()
 
 
 def test_idle_connections(gateway: GatewayProcess, stream: str) -> None:

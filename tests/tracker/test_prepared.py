@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import tempfile
 from typing import TYPE_CHECKING, Any, NoReturn
 
+import pytest
 from numba.core.caching import InTreeCacheLocator
 
 from optipmb import motion
@@ -12,7 +16,14 @@ from optipmb.prepared import PreparedCacheLocator
 from optipmb.warm import kernels
 
 if TYPE_CHECKING:
-    import pytest
+    from pathlib import Path
+
+PROGRAM = """
+import numpy as np
+import optipmb
+
+print(len(optipmb.bev_iou(np.zeros((1, 5)), np.zeros((2, 5)))[0]))  # a kernel
+"""
 
 
 def test_a_cache_that_cannot_be_written_is_still_read(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,3 +39,20 @@ def test_a_cache_that_cannot_be_written_is_still_read(monkeypatch: pytest.Monkey
     ours = PreparedCacheLocator.from_function(function, motion.__file__)
     assert ours.get_cache_path() == usual.get_cache_path()
     assert ours.get_source_stamp() == usual.get_source_stamp()
+
+
+@pytest.mark.parametrize("mode", [0o700, 0o777])
+def test_a_user_without_a_writable_cache_can_import(mode: int, tmp_path: Path) -> None:
+    """Where numba finds no folder, kernels go to a private one, unless others may write there; and it is said."""
+    kept = tmp_path / f"optipmb-kernels-{os.getuid()}"
+    kept.mkdir()
+    kept.chmod(mode)
+    nowhere = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator", "TMPDIR": str(tmp_path)}
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"} | nowhere
+    command = [sys.executable, "-c", PROGRAM]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False, env=environment)
+    assert (done.returncode, done.stdout) == (0, "2\n"), done.stderr
+    assert done.stderr.count("set NUMBA_CACHE_DIR") == 1
+    is_private = mode == 0o700
+    assert (f"kernels are kept in {kept}" in done.stderr) is is_private
+    assert any(kept.rglob("*.nbi")) is is_private

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import grpc
+from optipmb_schemas.certificates import end_of, ended
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused
@@ -69,8 +70,10 @@ class Channels:
         while not self._ready(timeout / len(self.addresses)):
             if time.monotonic() >= ends:
                 self.close()
+                files = [] if config is None else [Path(config) / name for name in ("cert.pem", "ca.pem")]
+                why = "".join(f"; {said}" for file in files if (said := ended(file, end_of(file))))
                 raise ConnectionFailed(
-                    f"no gRPC gateway answers at {', '.join(self.addresses)} (waited {timeout:g} s)",
+                    f"no gRPC gateway answers at {', '.join(self.addresses)} (waited {timeout:g} s){why}",
                     endpoints=self.addresses,
                     timeout=timeout,
                 )

@@ -1,5 +1,6 @@
 """A connection to gateways, with what publishers, subscribers and replays use of a Zenoh connection."""
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -20,7 +21,7 @@ from optipmb_schemas import (
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
-from optipmb_client.errors import ClientError
+from optipmb_client.errors import ClientError, ConnectionFailed
 from optipmb_client.grpc.channels import Channels, from_gateway, lasting
 from optipmb_client.grpc.publishing import GrpcSender, Publishing
 from optipmb_client.grpc.subscribing import GrpcSubscription
@@ -51,8 +52,10 @@ class GrpcConnection:
         timeout: float = 5.0,
     ) -> None:
         self.where = ", ".join(addresses)
-        self._timeout = timeout
-        self._channels = Channels(addresses, config, metadata, timeout)
+        if not timeout >= 0:  # NaN is not
+            raise ConnectionFailed(f"timeout: expected seconds, 0 or more, received {timeout!r}", endpoints=addresses)
+        self._timeout = min(timeout, threading.TIMEOUT_MAX)
+        self._channels = Channels(addresses, config, metadata, self._timeout)
 
     def __enter__(self) -> Self:
         return self

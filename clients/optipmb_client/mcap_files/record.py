@@ -79,6 +79,7 @@ def record(  # noqa: PLR0913  one argument per decision of the caller
 
     Raises:
         FileExistsError: There is such a file.
+        OSError: It cannot be written, as on a full disk.
         MessageError: A pattern is none.
     """
     keys = Keys(prefix)
@@ -89,7 +90,7 @@ def record(  # noqa: PLR0913  one argument per decision of the caller
         task = _Task(connection, keys, writer)
         inboxes = {topic: Inbox(CLOUD_QUEUE if topic == "points" else SMALL_QUEUE) for topic in topics}
         subscriptions = [connection.subscribe(key, inboxes[topic]) for topic in topics for key in wanted[topic]]
-        threads = [threading.Thread(target=task.drain, args=(inbox,), daemon=True) for inbox in inboxes.values()]
+        threads = [threading.Thread(target=task.drain, args=(inbox, stop), daemon=True) for inbox in inboxes.values()]
         for thread in threads:
             thread.start()
         result = Recording(path)
@@ -112,6 +113,8 @@ def record(  # noqa: PLR0913  one argument per decision of the caller
             for thread in threads:
                 thread.join()
             task.finish()
+        if task.failure is not None:
+            raise task.failure
         count()
     result.size = path.stat().st_size
     result.streams = task.streams
@@ -130,9 +133,17 @@ class _Task:
         self._questions = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="parameters")
         self._lock = threading.Lock()
         self.streams: dict[str, dict[str, int]] = {}
+        self.failure: OSError | None = None
 
-    def drain(self, inbox: Inbox) -> None:
-        """Move messages into the file until the inbox is closed and empty."""
+    def drain(self, inbox: Inbox, stop: threading.Event) -> None:
+        """Move messages into the file until the inbox is closed and empty, or the file cannot be written."""
+        try:
+            self._drain(inbox)
+        except OSError as error:
+            self.failure = error
+            stop.set()
+
+    def _drain(self, inbox: Inbox) -> None:
         while (arrival := inbox.get()) is not None:
             try:
                 self._keys.stream_of(arrival.key)

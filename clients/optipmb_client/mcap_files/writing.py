@@ -4,8 +4,10 @@ Messages gather in a chunk that is compressed and written when it is full or at 
 kill; the index at the end of the file comes with `close`.
 """
 
+import contextlib
 import json
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
@@ -48,6 +50,7 @@ class RecordingWriter:
 
     def __init__(self, path: Path, about: dict[str, str] | None = None) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
+        self._path = path
         self._file = path.open("xb")
         self._writer = Writer(self._file, chunk_size=CHUNK, compression=CompressionType.ZSTD)
         self._lock = threading.Lock()
@@ -87,7 +90,7 @@ class RecordingWriter:
         sequence = (getattr(message, "seq", None) or 0) % SEQUENCES
         # Clouds would double the size of the file: they are shown live alone.
         shown = [] if message is None or isinstance(message, Points) else list(self._foxglove.of(message))
-        with self._lock:
+        with self._lock, self._naming_file():
             if self._closed:
                 return None
             channel = self._channel(key, kind, payload, encoding)
@@ -99,7 +102,7 @@ class RecordingWriter:
 
     def flush(self) -> int:
         """Write what was added so far, so that a kill cannot take it; return the size of the file in bytes."""
-        with self._lock:
+        with self._lock, self._naming_file():
             if not self._closed:
                 self._writer.flush()
                 self._size = self._file.tell()
@@ -107,12 +110,19 @@ class RecordingWriter:
 
     def close(self) -> None:
         """Write the index and close the file. May be called twice."""
-        with self._lock:
+        with self._lock, self._naming_file():
             if not self._closed:
                 self._closed = True
-                self._writer.finish()
-                self._size = self._file.tell()
-                self._file.close()
+                with self._file:
+                    self._writer.finish()
+                    self._size = self._file.tell()
+
+    @contextlib.contextmanager
+    def _naming_file(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self._path)) from error
 
     def _channel(self, key: str, kind: type[Message], payload: bytes, encoding: str) -> int:
         """Return the channel of a key and encoding: a publisher may change from msgpack to JSON."""

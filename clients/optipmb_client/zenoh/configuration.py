@@ -1,6 +1,7 @@
 """The configuration of a Zenoh session: endpoints, a file, and values that suit large messages on busy machines."""
 
 import json
+import math
 from pathlib import Path
 
 import zenoh
@@ -20,8 +21,10 @@ def configuration(endpoints: tuple[str, ...], config: str | Path | None, timeout
     """Return what opens a session; arguments as for `Connection`.
 
     Raises:
-        ConnectionFailed: An endpoint or the file is unusable.
+        ConnectionFailed: An endpoint, the file or the timeout is unusable.
     """
+    if not timeout >= 0:  # NaN is not
+        raise ConnectionFailed(f"timeout: expected seconds, 0 or more, received {timeout!r}", endpoints=endpoints)
     try:
         settings = zenoh.Config() if config is None else zenoh.Config.from_file(config)
         own = json.loads(settings.get_json("id"))
@@ -41,7 +44,7 @@ def configuration(endpoints: tuple[str, ...], config: str | Path | None, timeout
                 settings.insert_json5(key, json.dumps(value))
         if endpoints:
             settings.insert_json5("connect/endpoints", json.dumps(endpoints))
-        settings.insert_json5("connect/timeout_ms", json.dumps(int(timeout * 1e3)))
+        settings.insert_json5("connect/timeout_ms", json.dumps(-1 if timeout == math.inf else int(timeout * 1e3)))
         retry = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
         settings.insert_json5("connect/retry", json.dumps(retry))
     except (zenoh.ZError, OSError) as error:

@@ -1,7 +1,9 @@
 """A Zenoh session: what is opened on it, what is asked over it, and how all of it is closed."""
 
 import contextlib
+import json
 import threading
+import time
 import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any, Self, TypeVar
 
 import zenoh
 from optipmb_schemas import Detections, Keys, Points, Topic, encoding_of
+from optipmb_schemas.certificates import end_of, ended
 
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Answer, Inbox
@@ -24,6 +27,8 @@ NO_BOUND = 2**31 - 1  # of the replies to a query, in effect: they are all kept 
 MOST_KEYS = 0xFFFF
 """Keys that a Zenoh session can declare in its life: it numbers them by 16 bits and gives no number back. Beyond, it
 would use numbers again that are in use, and what is sent with these would be lost without an error."""
+
+POLL_S = 0.02
 
 PLAIN = 1
 """Keys that a publisher declares."""
@@ -45,7 +50,7 @@ class Connection:
             the session is then a client of them. Default: ``tcp/127.0.0.1:7447``, unless `config` is given.
         config: A Zenoh configuration file (JSON5), for TLS, user names and everything else; its endpoints hold unless
             `connect` is given too.
-        timeout: Seconds to wait for a router.
+        timeout: Seconds to wait for a router; `math.inf`: for ever.
 
     Raises:
         ConnectionFailed: Within `timeout`, when no router is reachable or an endpoint or the file is unusable.
@@ -66,11 +71,14 @@ class Connection:
         try:
             self._session = zenoh.open(settings)
         except zenoh.ZError as error:
-            raise ConnectionFailed(
-                f"nothing answers at {self.where} (waited {timeout:g} s); is optipmb-service running there?",
-                endpoints=endpoints,
-                timeout=timeout,
-            ) from error
+            raise self._unanswered(endpoints, timeout, settings) from error
+        # A router that starts at this moment may be known and not linked yet: what is sent then is lost.
+        ends = time.monotonic() + timeout
+        while json.loads(settings.get_json("mode")) == "client" and not self._session.info.routers_zid():
+            if time.monotonic() > ends:
+                self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
+                raise self._unanswered(endpoints, timeout, settings)
+            time.sleep(POLL_S)
         self._opened: weakref.WeakSet[Sender | Subscription] = weakref.WeakSet()
         self._lock = threading.Lock()
         self._keys = 0
@@ -94,6 +102,19 @@ class Connection:
     def closed(self) -> bool:
         """Whether `close` has been called."""
         return self._session.is_closed()
+
+    def _unanswered(self, endpoints: tuple[str, ...], timeout: float, settings: zenoh.Config) -> ConnectionFailed:
+        names = ("connect_certificate", "root_ca_certificate")
+        found = [json.loads(settings.get_json(f"transport/link/tls/{name}")) for name in names]
+        ends = [ended(Path(file), end_of(Path(file))) for file in found if file]
+        advice = "; ".join(filter(None, ends)) or "is optipmb-service running there?"
+        if any(found) and not any(ends):
+            advice = "is optipmb-service running there, and does its TLS certificate hold?"
+        return ConnectionFailed(
+            f"nothing answers at {self.where} (waited {timeout:g} s); {advice}",
+            endpoints=endpoints,
+            timeout=timeout,
+        )
 
     def cached_sender(self, key: str, encoding: str, *, cache: int) -> Sender:
         """Open a publisher for small messages that must not get lost: it keeps the newest `cache` for recovery."""

@@ -27,6 +27,7 @@ from optipmb_service.runtime.service_queries import UNDRAINED, drain_asked, move
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
+    from optipmb_service.observability.health import TlsSource
     from optipmb_service.observability.metrics import Value
     from optipmb_service.runtime.ports import Request
     from optipmb_service.settings.model import Settings
@@ -96,6 +97,8 @@ class AggregateView:
         self._started_ns = time.time_ns()
         self._began_ns = self._beat_ns = time.monotonic_ns()
         self._ending = False
+        self.tls: TlsSource | None = None
+        """The certificates of the parent."""
         self._asking = ThreadPoolExecutor(workers.count, "asking")
         self._draining = ThreadPoolExecutor(workers.count, "draining")  # takes long, and keeps no status waiting
         self._registry = CollectorRegistry()
@@ -127,10 +130,13 @@ class AggregateView:
 
     def ready(self) -> bool:
         """Tell whether streams are tracked, be it not all of them."""
-        return self.state() in {"ready", "degraded"} and "ready" in self._workers.states
+        cut_off = self.tls is not None and self.tls.cut_off
+        return self.state() in {"ready", "degraded"} and "ready" in self._workers.states and not cut_off
 
     def failure(self) -> str:
         """Return why there is no network, or which workers are not ready; empty while all is well."""
+        if self.tls is not None and self.tls.failure:
+            return self.tls.failure
         if why := self._network.client().failure:
             return why
         states = enumerate(self._workers.states)

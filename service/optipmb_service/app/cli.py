@@ -23,7 +23,7 @@ from optipmb_service.app import health_command, nats, router
 from optipmb_service.app.ending import leave_or_restart
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import logs
-from optipmb_service.settings.forms import DEFAULT_GRPC, DEFAULT_LISTEN, DEFAULT_NATS, address
+from optipmb_service.settings.forms import DEFAULT_GRPC, DEFAULT_LISTEN, DEFAULT_NATS, address, without_password
 from optipmb_service.settings.loading import Loaded, SettingsInvalidError, load
 from optipmb_service.settings.model import Settings, state_home
 
@@ -168,6 +168,7 @@ def config_command(
     loaded = _load(given)
     values = loaded.settings.model_dump(mode="json")
     values |= {"router": loaded.settings.is_router, "listen": list(loaded.settings.endpoints)}
+    values["cluster"] = [without_password(server) for server in loaded.settings.cluster]
     if as_json:
         typer.echo(json.dumps({"settings": values, "sources": loaded.sources}, indent=2))
         return
@@ -306,6 +307,8 @@ def _begin(loaded: Loaded) -> Settings:
     """Let logs go where the settings want them."""
     logs.configure(loaded.settings.log_format, loaded.settings.log_level)
     logs.unknown_environment(loaded.unknown)
+    if loaded.settings.unprotected:
+        logs.unprotected(loaded.settings.unprotected)
     return loaded.settings
 
 

@@ -139,6 +139,8 @@ async def _serve(
         while not asked.is_set():
             await asked.wait(HOUSEKEEPING_S)
             service.housekeeping()
+            if health.tls is not None and (why := health.tls.failure):
+                service.report_certificate(why)
             parent.beat()
         health.ends()
     watching.cancel()

@@ -27,6 +27,8 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from optipmb_service.observability import logs
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from types import FrameType
@@ -183,7 +185,7 @@ def leave_or_restart(status: int) -> None:
     """End the process, or begin it again in its place, with its id and what it was started with."""
     if status == RESTART:
         sys.stdout.flush()
-        sys.stderr.flush()
+        logs.finish()
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - the command line of this process itself
     leave(status)
 
@@ -195,7 +197,7 @@ def leave(status: int) -> None:
     been in order there is nothing left to wait for.
     """
     sys.stdout.flush()
-    sys.stderr.flush()
+    logs.finish()
     if any(thread.daemon and thread.is_alive() for thread in threading.enumerate()):
         os._exit(status)
     sys.exit(status)
@@ -206,6 +208,7 @@ def _log_threads(seconds: float) -> None:
     frames = sys._current_frames()  # noqa: SLF001 - the documented way to see what threads do
     threads = {names[ident]: calls for ident, frame in frames.items() if ident in names and (calls := _calls(frame))}
     log.error("end_hangs", bound_s=seconds, threads=threads)
+    logs.finish()
 
 
 def _calls(frame: FrameType) -> str:

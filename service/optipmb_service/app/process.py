@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import sys
 from typing import TYPE_CHECKING, Any
 
 import structlog
 
 from optipmb_service import __version__
+from optipmb_service.app.certificates import Certificates
 from optipmb_service.app.edges import monitoring
 from optipmb_service.app.ending import END_HUNG, RESTART, EndBound, longest_end_s
 from optipmb_service.app.loops import StopRequest, beat, unless, watch_keys
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.observability import collectors
+from optipmb_service.observability import collectors, logs
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh.client import Client
@@ -44,15 +44,21 @@ async def run(
     log.info("starting", instance=settings.instance, version=__version__, **about)
     health = ProcessHealth(settings.instance)
     beating = asyncio.create_task(beat(health))
+    watching: asyncio.Task[None] | None = None
     try:
+        health.tls = certificates = Certificates(settings)
+        health.metrics.add(certificates.figures)
+        watching = asyncio.create_task(certificates.watch())
         with monitoring(settings, health):
             ended = await serve(asked, health)
     except (TransportError, EdgeError, StoreError) as error:
-        print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+        logs.say(f"optipmb-service: {error}")
         return 1
     finally:
         asked.bound.begin()  # also where nobody asked
         beating.cancel()
+        if watching is not None:
+            watching.cancel()
     if ended is not None:
         log.info("stopped", drained=ended)
     if asked.restarts:

@@ -304,6 +304,18 @@ class Service:
         )
         self._reporter.report(problem, time.monotonic_ns())
 
+    def report_certificate(self, why: str) -> None:
+        """Report that a certificate has ended."""
+        problem = problem_of(
+            "certificate",
+            stream="",
+            instance=self._settings.instance,
+            expected="certificates that hold",
+            received=why,
+            message=why,
+        )
+        self._reporter.report(problem, time.monotonic_ns())
+
     def _unkept(self, stream: str, why: str) -> None:
         """Report that the state of a stream cannot be kept."""
         self._report(stream, "a state that can be written down", why)

@@ -14,7 +14,6 @@ import asyncio
 import contextlib
 import math
 import signal
-import sys
 import time
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -22,11 +21,13 @@ import structlog
 
 from optipmb_service import __version__
 from optipmb_service.app.aggregate import QUERIES, AggregateView
+from optipmb_service.app.certificates import Certificates
 from optipmb_service.app.edges import grpc_edge, monitoring
 from optipmb_service.app.ending import END_HUNG, LATE_S, RESTART, SLICE_S, EndBound, longest_end_s
 from optipmb_service.app.loops import StopRequest, beat, say_ready, unless, watch_keys
 from optipmb_service.app.private_folder import private_folder
 from optipmb_service.app.worker_process import WorkerProcess
+from optipmb_service.observability import logs
 from optipmb_service.observability.health import BEAT_S
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh import Transport
@@ -216,7 +217,7 @@ async def supervise(settings: Settings) -> int:
                 return 0
             return await _supervised(settings, workers, transport, asked, folder)
         except (TransportError, EdgeError) as error:
-            print(f"optipmb-service: {error}", file=sys.stderr)  # noqa: T201 - the one line of a failed start
+            logs.say(f"optipmb-service: {error}")
             return 1
 
 
@@ -230,6 +231,9 @@ async def _supervised(
     """
     supervisor = Supervisor(workers, asked, private)
     view = AggregateView(settings, supervisor, transport)
+    view.tls = certificates = Certificates(settings)
+    view.add(certificates.figures)
+    looking = asyncio.create_task(certificates.watch())
     beating = asyncio.create_task(beat(view))
     client = transport.client()
     watching = asyncio.create_task(watch_keys(asked, lambda: client.key_numbers, settings.restart_keys))
@@ -249,8 +253,8 @@ async def _supervised(
             ended = await supervisor.stop()
     finally:
         asked.bound.begin()  # also where nobody asked
-        beating.cancel()
-        watching.cancel()
+        for task in (beating, watching, looking):
+            task.cancel()
         with contextlib.suppress(Exception):
             await asyncio.to_thread(transport.close)
     log.info("stopped", drained=ended)

@@ -108,7 +108,7 @@ def _run(settings: Settings, parent: SupervisingParent | None) -> int:
         profiles = Profiles.read(settings.profile, settings.profiles)
     except optipmb.ParameterError as error:
         if parent is None or parent.index == 0:  # of all workers one says it
-            print(f"optipmb-service: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201 - the one line
+            logs.say(f"optipmb-service: {' '.join(str(error).split())}")
         return WRONG_USE
     return asyncio.run(run(settings, profiles, parent))
 

@@ -12,7 +12,7 @@ import grpc
 from optipmb_service.grpc.status import EndCall
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Iterator
 
     import optipmb_schemas as schemas
 
@@ -47,9 +47,6 @@ class Context(Protocol):
     def peer(self) -> str:
         """Return the address of the caller."""
 
-    def done(self) -> bool:
-        """Tell whether the caller has gone."""
-
 
 FIRST_S: Final = 30.0
 """How long a call may be open before its first message."""
@@ -63,9 +60,28 @@ class Gateway:
     feeds: Feeds
     instance: str
     limits: schemas.Limits
-    refused: Callable[[str, schemas.MessageError], None]
-    """Called for a message that is not valid."""
+    refused: Callable[[schemas.Problem], None]
+    """Called with the problem of a message that is not valid."""
     calls: set[Call] = field(default_factory=set)
+
+
+class CallerGoneError(Exception):
+    """The caller has cancelled the call, its deadline has passed, or its connection is lost."""
+
+
+@contextlib.contextmanager
+def ending_with_caller() -> Iterator[None]:
+    """Take any error of gRPC for the end of the caller: bytes of a call that is open can be written.
+
+    Raises:
+        CallerGoneError: there is an error.
+    """
+    try:
+        yield
+    except (asyncio.CancelledError, grpc.aio.AbortError):
+        raise
+    except Exception as error:
+        raise CallerGoneError from error
 
 
 class Call:
@@ -129,15 +145,26 @@ class Call:
         if request is grpc.aio.EOF:
             return None
         self._metrics.requests[self._name] += 1
+        self._metrics.request_bytes += len(request)
         return bytes(request)
 
     async def begin(self) -> None:
-        """Tell the caller that the call is in force, before the first response."""
-        await self._context.send_initial_metadata(())
+        """Tell the caller that the call is in force, before the first response.
+
+        Raises:
+            CallerGoneError: there is nobody to tell.
+        """
+        with ending_with_caller():
+            await self._context.send_initial_metadata(())
 
     async def write(self, response: bytes) -> None:
-        """Write a response; waits while the caller reads too slowly."""
-        await self._context.write(response)
+        """Write a response; waits while the caller reads too slowly.
+
+        Raises:
+            CallerGoneError: nobody reads it.
+        """
+        with ending_with_caller():
+            await self._context.write(response)
         self._metrics.responses[self._name] += 1
 
     async def drain(self, outbox: Outbox) -> None:
@@ -151,7 +178,13 @@ class Call:
         """Write what comes into an outbox meanwhile, and at the end what is left in it."""
         task = asyncio.create_task(self.drain(outbox))
         try:
-            yield
+            try:
+                yield
+            except Exception:
+                # A write that is cancelled would keep the status from being sent: what is left is written before it.
+                outbox.close()
+                await asyncio.wait((task,))
+                raise
             outbox.close()
             await task
         finally:

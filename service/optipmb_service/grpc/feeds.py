@@ -36,11 +36,17 @@ log = structlog.get_logger("optipmb_service")
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Something that came, as a response of any streaming method, and the tracks that it is of, if it is of any."""
+    """Something that came, as a response of any streaming method.
+
+    Attributes:
+        tracks: of which it is, if it is of any.
+        problem: its code and path, if it is one.
+    """
 
     stream: str
     response: bytes
     tracks: EncodedTracks | None = None
+    problem: tuple[str, str] | None = None
 
 
 class Listener(Protocol):
@@ -165,4 +171,4 @@ def tracks_item(tracks: EncodedTracks, selection: Selection = EVERYTHING) -> Ite
 def problem_item(problem: schemas.Problem) -> Item:
     """Return a problem as a response."""
     response = pb.SubscribeResponse(problem=convert.to_proto(problem))
-    return Item(problem.stream, response.SerializeToString())
+    return Item(problem.stream, response.SerializeToString(), problem=(problem.code, problem.path))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import collections
 import contextlib
 from typing import TYPE_CHECKING, Any, Final
 
@@ -168,10 +169,11 @@ class Incoming:
 
     def _problem(self, message: Any, error: schemas.MessageError) -> schemas.Problem:
         gateway = self._call.gateway
-        gateway.refused(self.stream, error)
         problem = schemas.Problem.of(error, stream=self.stream, instance=gateway.instance)
         known = {name: getattr(message, name) for name in ("seq", "stamp_ns") if message.HasField(name)}
-        return problem.model_copy(update={name: value for name, value in known.items() if value >= 0})
+        problem = problem.model_copy(update={name: value for name, value in known.items() if value >= 0})
+        gateway.refused(problem)
+        return problem
 
 
 class _Answers:
@@ -181,14 +183,21 @@ class _Answers:
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
+        self._told: collections.deque[tuple[str, str]] = collections.deque(maxlen=RESPONSES)
+
+    def tell(self, problem: schemas.Problem) -> None:
+        """Tell the caller of a message that was refused here; the problem also comes back from the network."""
+        self._told.append((problem.code, problem.path))
+        self._outbox.put(problem.stream, problem_item(problem).response)
 
     def passes(self, _tracks: EncodedTracks) -> bool:
         """Tell whether they are wanted: all are."""
         return True
 
     def take(self, item: Item) -> None:
-        """Take tracks or a problem."""
-        self._outbox.put(item.stream, item.response)
+        """Take tracks, or a problem that the caller does not know."""
+        if item.problem not in self._told:
+            self._outbox.put(item.stream, item.response)
 
 
 class _TracksAnswers(_Answers):
@@ -234,7 +243,7 @@ async def track(call: Call) -> None:
         answers.begin(held)
         while message is not None:
             if isinstance(message, schemas.Problem):
-                outbox.put(incoming.stream, problem_item(message).response)
+                answers.tell(message)
             elif isinstance(message, schemas.Detections | schemas.Points):
                 if isinstance(message, schemas.Detections) and (message.epoch, message.seq) not in known:
                     flight.sent(message.epoch, message.seq)
@@ -263,9 +272,9 @@ async def publish(call: Call) -> None:
     message = await incoming.first()
     if message is None:
         return
-    progress = _Progress(outbox)
+    progress, answers = _Progress(outbox), _Answers(outbox)
     async with (
-        call.gateway.feeds.joined(call.gateway.client.keys.problems(incoming.stream), _Answers(outbox)),
+        call.gateway.feeds.joined(call.gateway.client.keys.problems(incoming.stream), answers),
         incoming.opened(progress.acknowledge) as outgoing,
         call.writing(outbox),
     ):
@@ -273,7 +282,7 @@ async def publish(call: Call) -> None:
         try:
             while message is not None:
                 if isinstance(message, schemas.Problem):
-                    outbox.put(incoming.stream, problem_item(message).response)
+                    answers.tell(message)
                 elif isinstance(message, schemas.Detections | schemas.Points):
                     await incoming.send(message)
                     progress.sent(message)

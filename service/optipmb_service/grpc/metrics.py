@@ -22,6 +22,7 @@ class CallMetrics:
         self.responses: collections.Counter[str] = collections.Counter()
         self.skipped: collections.Counter[str] = collections.Counter()
         self.refused: collections.Counter[str] = collections.Counter()
+        self.request_bytes = 0
         self.invalid = 0
 
     def figures(self) -> Iterator[Value]:

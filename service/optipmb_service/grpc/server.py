@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import resource
 import time
 from typing import TYPE_CHECKING, Any, Final
@@ -16,11 +17,12 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.grpc import inputs, outputs, questions
 from optipmb_service.grpc.access import Access
-from optipmb_service.grpc.calls import Call, Gateway
+from optipmb_service.grpc.calls import Call, CallerGoneError, Gateway, ending_with_caller
 from optipmb_service.grpc.feeds import Feeds
 from optipmb_service.grpc.metrics import CallMetrics
 from optipmb_service.grpc.status import EndCall, refused
 from optipmb_service.grpc.tls import credentials
+from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.ports import EdgeError, TransportError
 
 if TYPE_CHECKING:
@@ -52,8 +54,14 @@ GRACE_S: Final = 1.0
 LINK_S: Final = 0.5
 """How often the gateway looks whether it has a router."""
 
+TRIM_BYTES: Final = 64 * 2**20
+"""Bytes of requests after which the memory that they took is given back."""
+
 OTHER_FILES: Final = 256
-"""Files of a process beside the connections of gRPC: its own, and a service's with its links and its store."""
+"""Files of a process beside the connections of gRPC: its own, and a service's with its links and its store.
+
+Where the limit of open files is low, half of it.
+"""
 
 HEADROOM: Final = 64 * 2**10
 """Bytes of a request beyond its payload."""
@@ -86,6 +94,7 @@ class Server:
     def __init__(self, settings: Settings, client: Client) -> None:
         self.metrics = CallMetrics()
         self._client = client
+        self._reporter = ProblemReporter(client.publish_problem, log_problem)
         self._most = settings.grpc_calls
         self._access = Access(
             certificates=settings.grpc_tls is not None, names=settings.grpc_names, tokens=settings.grpc_tokens
@@ -146,9 +155,14 @@ class Server:
         return f"{settings.grpc.rpartition(':')[0]}:{port}"
 
     async def _watch(self) -> None:
-        """Tell the health service whether the network can be used, for ever."""
+        """Tell the health service whether the network can be used, and report problems that are due, for ever."""
         known: bool | None = None
+        trimmed = 0
         while True:
+            self._reporter.flush(time.monotonic_ns())
+            if self.metrics.request_bytes - trimmed > TRIM_BYTES:
+                trimmed = self.metrics.request_bytes
+                await asyncio.to_thread(_trim)
             linked = self._client.linked()
             if linked != known:
                 known = linked
@@ -161,13 +175,23 @@ class Server:
         async def handle(_requests: Any, context: Context) -> None:
             began, code = time.monotonic(), "OK"
             self.metrics.open[name] += 1
+            end: EndCall | None = None
             try:
-                await self._serve(name, context)
-            except EndCall as end:
-                code = end.code.name
-                status = end.status()
-                signed = (*(status.trailing_metadata or ()), (SAID_BY, self._gateway.instance))
-                await context.abort(status.code, status.details, signed)
+                try:
+                    await self._serve(name, context)
+                except EndCall as raised:
+                    end = raised
+                if end is not None:
+                    # A request may be 32 MB, and the frames of what it has raised hold it until the next collection.
+                    end.__traceback__ = end.__context__ = end.__cause__ = None
+                    code = end.code.name
+                    status = end.status()
+                    signed = (*(status.trailing_metadata or ()), (SAID_BY, self._gateway.instance))
+                    with ending_with_caller():
+                        await context.abort(status.code, status.details, signed)
+            except CallerGoneError:
+                code = "CANCELLED"
+                raise asyncio.CancelledError from None
             except asyncio.CancelledError:
                 code = "CANCELLED"
                 raise
@@ -198,32 +222,28 @@ class Server:
             raise refused(error) from None
         except TransportError as error:
             raise EndCall(grpc.StatusCode.UNAVAILABLE, f"the network cannot be used: {error}") from error
-        except (EndCall, asyncio.CancelledError):
+        except (EndCall, CallerGoneError, asyncio.CancelledError):
             raise
         except Exception as error:
-            if context.done():
-                raise asyncio.CancelledError from error  # the caller has gone while it was written to
             log.exception("internal_error", method=name)
             raise EndCall(grpc.StatusCode.INTERNAL, "a fault of the gateway; its log has it") from error
         finally:
             gateway.calls.discard(call)
             self.metrics.skipped[name] += call.left_out
 
-    def _refused(self, stream: str, error: schemas.MessageError) -> None:
-        self.metrics.refused[error.code] += 1
-        log.warning(
-            "problem",
-            stream=stream,
-            code=error.code,
-            path=error.path,
-            expected=error.expected,
-            received=error.received,
-            count=1,
-        )
+    def _refused(self, problem: schemas.Problem) -> None:
+        self.metrics.refused[problem.code] += 1
+        self._reporter.report(problem, time.monotonic_ns())
 
     def _invalid(self, reason: str) -> None:
         self.metrics.invalid += 1
         log.warning("grpc_invalid", reason=reason)
+
+
+def _trim() -> None:
+    """Give back the memory of requests that are done with: the allocator of the C library keeps gigabytes."""
+    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+        trim(0)
 
 
 def _connections(wanted: int) -> int:
@@ -234,6 +254,7 @@ def _connections(wanted: int) -> int:
         return wanted
     files = needed if most == resource.RLIM_INFINITY else min(needed, most)
     resource.setrlimit(resource.RLIMIT_NOFILE, (files, most))
-    if files < needed:
-        log.warning("grpc_connections", allowed=files - OTHER_FILES, wanted=wanted, files=files)
-    return max(1, files - OTHER_FILES)
+    allowed = min(wanted, max(1, files - min(OTHER_FILES, files // 2)))
+    if allowed < wanted:
+        log.warning("grpc_connections", allowed=allowed, wanted=wanted, files=files)
+    return allowed

@@ -48,4 +48,5 @@ class EndCall(Exception):  # noqa: N818 - it ends a call, and need not be an err
 
 def refused(error: schemas.MessageError) -> EndCall:
     """Return the end of a call whose request is not valid."""
-    return EndCall(CODES.get(error.code, grpc.StatusCode.INVALID_ARGUMENT), str(error), error)
+    code = CODES.get(error.code, grpc.StatusCode.INVALID_ARGUMENT)
+    return EndCall(code, str(error), error.with_traceback(None))  # its frames hold the request

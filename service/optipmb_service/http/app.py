@@ -5,7 +5,7 @@ It knows nothing of the service but what `Source` says, so a test runs it with a
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from starlette.applications import Starlette
 from starlette.responses import JSONResponse, Response
@@ -14,13 +14,19 @@ from starlette.routing import Route
 from optipmb_service.observability.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Awaitable, Callable, Sequence
 
     import optipmb_schemas as schemas
     from starlette.requests import Request
     from starlette.routing import BaseRoute
 
-UNAVAILABLE = 503
+UNAVAILABLE: Final = 503
+
+PROBES: Final = frozenset({"/healthz", "/readyz"})
+"""Paths that are answered however many other requests are."""
+
+MONITORING: Final = PROBES | {"/metrics"}
+"""Paths that programs ask for, by whatever name the service has for them."""
 
 
 class Source(Protocol):
@@ -56,8 +62,8 @@ def application(source: Source, routes: Sequence[BaseRoute] = ()) -> Starlette:
         routes: served besides its own; its own come first.
     """
     own = [
-        Route("/healthz", _answer(lambda: _health(source))),
-        Route("/readyz", _answer(lambda: _readiness(source))),
+        Route("/healthz", _answer_at_once(lambda: _health(source))),
+        Route("/readyz", _answer_at_once(lambda: _readiness(source))),
         Route("/metrics", _answer(lambda: Response(source.text(), media_type=CONTENT_TYPE))),
     ]
     return Starlette(routes=[*own, *routes])
@@ -75,6 +81,16 @@ def _readiness(source: Source) -> Response:
     if failure := source.failure():
         body["failure"] = failure
     return JSONResponse(body, status_code=200 if ready else UNAVAILABLE)
+
+
+def _answer_at_once(make: Callable[[], Response]) -> Callable[[Request], Awaitable[Response]]:
+    answer = _answer(make)
+
+    # A coroutine: probes wait for no thread.
+    async def endpoint(request: Request) -> Response:
+        return answer(request)
+
+    return endpoint
 
 
 def _answer(make: Callable[[], Response]) -> Callable[[Request], Response]:

@@ -3,6 +3,8 @@
 A browser that was led to a page of a stranger can be made to ask a service of its own network: the stranger lets his
 name point to its address (DNS rebinding). Such a request carries the stranger's name. Addresses, names without a dot
 (`localhost`, a container, a host of the same network) and the names of the settings are answered, others are not.
+Probes and Prometheus ask by names with a domain (`tracker.site.svc.cluster.local`): their paths, which show no tracks,
+are answered under any name.
 """
 
 from __future__ import annotations
@@ -12,6 +14,8 @@ from typing import TYPE_CHECKING
 
 from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
+
+from optipmb_service.http.app import MONITORING
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -36,7 +40,8 @@ class KnownHosts:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer, or refuse."""
-        if scope["type"] == "http" and not self._knows(Headers(scope=scope).get("host", "")):
+        named = scope["type"] == "http" and scope["path"] not in MONITORING
+        if named and not self._knows(Headers(scope=scope).get("host", "")):
             refusal = PlainTextResponse("unknown host; see the setting http_hosts", status_code=MISDIRECTED)
             await refusal(scope, receive, send)
             return

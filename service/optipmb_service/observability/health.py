@@ -46,6 +46,18 @@ class StatusSource(Protocol):
         """Return its report; None when it makes none."""
 
 
+class TlsSource(Protocol):
+    """What knows the certificates."""
+
+    @property
+    def failure(self) -> str:
+        """Which certificates have ended; empty while all hold."""
+
+    @property
+    def cut_off(self) -> bool:
+        """Whether there is no link to the network for it."""
+
+
 @runtime_checkable
 class LiveSource(Protocol):
     """What has streams that can be looked at."""
@@ -63,6 +75,8 @@ class ProcessHealth:
 
     def __init__(self, instance: str) -> None:
         self.metrics = Metrics()
+        self.tls: TlsSource | None = None
+        """The certificates of the process; None while they are not read."""
         self._service: StatusSource | None = None
         self._state = "starting"
         self._lock = threading.Lock()
@@ -93,17 +107,20 @@ class ProcessHealth:
 
     def failure(self) -> str:
         """Return why the service cannot be used, or works with a part missing; empty while it works."""
-        service = self._service
-        return "" if service is None else service.failure
+        return "; ".join(
+            source.failure for source in (self.tls, self._service) if source is not None and source.failure
+        )
 
     def state(self) -> str:
         """Return the state of the process."""
         service = self._service
-        return self._state if service is None or self._state == "stopping" else service.state
+        if service is None or self._state == "stopping":
+            return self._state
+        return "degraded" if service.state == "ready" and self.tls is not None and self.tls.failure else service.state
 
     def ready(self) -> bool:
         """Tell whether the service can be used."""
-        return self.state() in USABLE and self.alive()
+        return self.state() in USABLE and self.alive() and not (self.tls is not None and self.tls.cut_off)
 
     def status(self) -> schemas.ServiceStatus | None:
         """Return the service's own report; None while it starts."""

@@ -1,13 +1,19 @@
-"""Logs: one line per event that an operator can act on, on stderr; stdout holds nothing but the ready line."""
+"""Logs: one line per event that an operator can act on, on stderr; stdout holds nothing but the ready line.
+
+A thread of its own writes the lines: whoever logs does not wait for the reader of stderr, which may have stopped
+reading. Lines beyond the bound of the queue are dropped and counted.
+"""
 
 from __future__ import annotations
 
+import atexit
 import logging
+import os
 import sys
 import threading
 import time
-from collections import Counter
-from typing import TYPE_CHECKING, Final, Literal
+from collections import Counter, deque
+from typing import TYPE_CHECKING, Final, Literal, TextIO, cast
 
 import structlog
 
@@ -17,6 +23,7 @@ if TYPE_CHECKING:
     from structlog.typing import EventDict, Processor, WrappedLogger
 
 EVENTS: Final = {
+    "log_lines_dropped": "Whoever reads stderr reads too slowly, or not at all: `count` lines were not written.",
     "starting": "The service compiles or loads its kernels.",
     "connecting": "Waits for a router. If this lasts, check `connect`.",
     "http": "Health, metrics and the live page are served at `address`.",
@@ -27,6 +34,11 @@ EVENTS: Final = {
     "grpc_connections": "The limit of open files allows fewer connections than the setting.",
     "grpc_invalid": "An invalid message from the network was not forwarded to callers.",
     "grpc_certificates": "Renewed certificates cannot be read; the previous ones stay in use.",
+    "certificate_ends": "Certificates that end within a week, and the `days` that they hold: renew them.",
+    "certificate_ended": "A certificate has ended: no link with it can be opened. Renew it, and restart what listens"
+    " with it.",
+    "unprotected": "Everybody who reaches these `addresses` may publish, read and command: there is neither TLS nor"
+    " access control. See `security.md`.",
     "unknown_environment": "Variables `OPTIPMB_…` that are not settings, usually misspelt.",
     "peer_connected": "A node, router or service has connected.",
     "tracker_message": "A `text` of the tracker: it compiles, for up to a minute.",
@@ -135,6 +147,102 @@ class Limiter:
         return event
 
 
+QUEUE_BYTES: Final = 4 * 2**20
+"""Lines that wait for the reader of stderr."""
+
+CLOSE_S: Final = 0.5
+"""How long the end of a process waits for the last lines to be written."""
+
+
+class LineWriter:
+    """Bounded queue of lines that a thread writes to a file; implements what structlog uses of a file.
+
+    Args:
+        file: where the lines go. Its descriptor is written to directly: a write that blocks holds no lock of the file.
+    """
+
+    def __init__(self, file: TextIO) -> None:
+        self.file = file
+        self._changed = threading.Condition()
+        self._lines: deque[bytes] = deque()
+        self._bytes = 0
+        self._unreported = 0
+        self.dropped = 0
+        """Lines that were not written."""
+        threading.Thread(target=self._run, name="log", daemon=True).start()
+
+    def write(self, text: str) -> None:
+        """Queue a line, or drop it; never waits."""
+        line = text.encode(errors="backslashreplace")
+        with self._changed:
+            if self._bytes + len(line) > QUEUE_BYTES:
+                self.dropped += 1
+                self._unreported += 1
+                return
+            self._lines.append(line)
+            self._bytes += len(line)
+            self._changed.notify_all()
+
+    def flush(self) -> None:
+        """Have no effect: the thread writes each line as soon as it can."""
+
+    def finish(self, seconds: float = CLOSE_S) -> None:
+        """Wait until all lines are written, at most so long."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._bytes, seconds)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._lines)
+                line = self._lines.popleft()
+            try:
+                self._write(line)
+            except OSError:  # nobody reads any more
+                with self._changed:
+                    self.dropped += 1
+            with self._changed:
+                self._bytes -= len(line)
+                self._changed.notify_all()
+                dropped, self._unreported = (0, self._unreported) if self._lines else (self._unreported, 0)
+            if dropped:
+                structlog.get_logger("optipmb_service").warning("log_lines_dropped", count=dropped)
+
+    def _write(self, line: bytes) -> None:
+        try:
+            descriptor = self.file.fileno()
+        except OSError:  # of a test, which has put another object in its place
+            self.file.write(line.decode())
+            return
+        while line:
+            try:
+                line = line[os.write(descriptor, line) :]
+            except BlockingIOError:  # somebody has made the pipe non-blocking
+                time.sleep(0.01)
+
+
+_writer: LineWriter | None = None
+
+
+def say(line: str) -> None:
+    """Write a line to stderr as it is, after those of the log."""
+    if _writer is None or _writer.file is not sys.stderr:
+        print(line, file=sys.stderr)  # noqa: T201 - the one line of a failed start
+    else:
+        _writer.write(f"{line}\n")
+
+
+def finish() -> None:
+    """Wait, for a moment at most, until all lines are written; to be called before the process ends."""
+    if _writer is not None:
+        _writer.finish()
+
+
+def lines_dropped() -> int:
+    """Return how many lines this process could not write."""
+    return 0 if _writer is None else _writer.dropped
+
+
 def configure(form: Literal["console", "json"], level: str, worker: int | None = None) -> None:
     """Send the log lines to stderr, as coloured text on a terminal, plain text elsewhere, or JSON.
 
@@ -159,9 +267,18 @@ def configure(form: Literal["console", "json"], level: str, worker: int | None =
     structlog.configure(
         processors=processors,
         wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
-        logger_factory=structlog.WriteLoggerFactory(file=sys.stderr),
+        logger_factory=structlog.WriteLoggerFactory(file=_written()),
     )
     logging.getLogger("optipmb").handlers = [_Library()]
+
+
+def _written() -> TextIO:
+    """Return what takes the lines of this process."""
+    global _writer  # noqa: PLW0603 - a process has one stderr
+    if _writer is None:
+        atexit.register(finish)
+    _writer = LineWriter(sys.stderr)
+    return cast("TextIO", _writer)
 
 
 class _Library(logging.Handler):
@@ -176,3 +293,8 @@ def unknown_environment(names: tuple[str, ...]) -> None:
     """Log environment variables that look like settings and are none: usually a typing error."""
     if names:
         structlog.get_logger("optipmb_service").warning("unknown_environment", names=names)
+
+
+def unprotected(addresses: tuple[str, ...]) -> None:
+    """Log addresses beyond this machine without TLS and access control."""
+    structlog.get_logger("optipmb_service").warning("unprotected", addresses=addresses)

@@ -20,6 +20,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.metrics_core import Metric
 from prometheus_client.samples import Sample
 
+from optipmb_service.observability.logs import lines_dropped
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
@@ -95,6 +97,7 @@ SERVICE_METRICS: Final = {
     "stream_latency_seconds": MetricFamily(
         "gauge", ("stream", "quantile"), "Median and 99th percentile of the last 512 latencies."
     ),
+    "log_lines_dropped_total": MetricFamily("counter", (), "Log lines not written: nobody read stderr in time."),
     "streams_unlisted": MetricFamily("gauge", (), "Streams beyond `http_streams`, without series of their own."),
 }
 """Those of a process that tracks, by their names without the prefix `optipmb_`."""
@@ -121,7 +124,12 @@ LOG_METRICS: Final = {
 }
 """Those of a bridge into the log."""
 
-METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS | LOG_METRICS
+TLS_METRICS: Final = {
+    "certificate_days": MetricFamily("gauge", ("use",), "Days until a certificate ends; below 0: it has ended."),
+}
+"""Those of a process with certificates."""
+
+METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS | LOG_METRICS | TLS_METRICS
 """Every metric. The figures of the process itself start with `process_`."""
 
 Value = tuple[str, tuple[str, ...], float]
@@ -225,6 +233,7 @@ class Metrics:
         yield "tracks_started_total", (), self._started
         yield "tracks_ended_total", (), self._ended
         yield "sessions_restored_total", (), self._restored
+        yield "log_lines_dropped_total", (), lines_dropped()
 
 
 def families(data: bytes) -> list[Metric]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
+from itertools import pairwise
 from typing import Final
 
 import optipmb_schemas as schemas
@@ -13,7 +14,9 @@ ARRIVALS: Final = 1024
 RATE_NS: Final = 5_000_000_000
 """The rate is that of the frames of this time; of a slower stream that of its last two frames."""
 SILENT_PERIODS: Final = 3
-"""After so many periods without a frame the rate falls."""
+"""After so many periods without a frame the rate falls, and the stream is silent."""
+LAST: Final = 5
+"""Frames whose largest distance is the period by which silence is judged."""
 
 
 class StreamMeter:
@@ -37,6 +40,12 @@ class StreamMeter:
     def published(self, latency_ns: int) -> None:
         """Note the time from the arrival of a frame to the publication of its tracks."""
         self._latencies.append(latency_ns)
+
+    def is_silent(self, now_ns: int) -> bool:
+        """Tell whether no frame came for several of the stream's own periods; a stream of one frame has none."""
+        last = list(self._arrivals)[-LAST:]
+        period_ns = max((after - before for before, after in pairwise(last)), default=0)
+        return not last or now_ns - last[-1] > SILENT_PERIODS * period_ns
 
     def rate_hz(self, now_ns: int) -> float:
         """Return frames per second over the last `RATE_NS`, falling while none comes; 0 with fewer than two."""

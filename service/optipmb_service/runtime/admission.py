@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 MAX_LIVES: Final = 65_536
 """Streams without a session whose past is remembered."""
 
-EVICT_IDLE_S: Final = 30.0
-"""Silence after which a session is closed for a stream that has none, when there is no more room."""
-
 EVICT_EVERY_NS: Final = SECOND
 """A session is asked to close no more often than this."""
 
@@ -40,12 +37,12 @@ class Admission:
 
     Args:
         settings: the limits.
-        tracked: returns the streams with a session, and when each was last used (monotonic ns).
+        tracked: returns the streams with a session, when each was last used, and whether it is silent.
         evict: closes the session of a stream for that of another.
     """
 
     def __init__(
-        self, settings: Settings, tracked: Callable[[], Sequence[tuple[str, int]]], evict: Callable[[str], None]
+        self, settings: Settings, tracked: Callable[[], Sequence[tuple[str, int, bool]]], evict: Callable[[str], None]
     ) -> None:
         self._most = settings.max_sessions
         self._tracked = tracked
@@ -98,7 +95,7 @@ class Admission:
             return full
         if self._sessions < self._most:
             return ""
-        victim = victim_of(stream, self._tracked(), now_ns, round(EVICT_IDLE_S * SECOND))
+        victim = victim_of(stream, self._tracked())
         if victim is None:
             return f"at most {self._most} streams at once"
         evicted, until_ns = self._evicted

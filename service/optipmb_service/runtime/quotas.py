@@ -103,28 +103,28 @@ class Quotas:
         return bucket
 
 
-def victim_of(stream: str, tracked: Iterable[tuple[str, int]], now_ns: int, idle_ns: int) -> str | None:
+def victim_of(stream: str, tracked: Iterable[tuple[str, int, bool]]) -> str | None:
     """Return the stream whose session makes room for another one; None when nobody has to.
 
-    The least recently used that has been silent for a while; else, of the site that has the most, its least recently
-    used, if that site has at least two more than the one that asks. So no site keeps the others out.
+    The least recently used of those that are silent: they go on from the store. Else, of the site that has the most,
+    its least recently used, if that site has at least two more than the one that asks. So no site keeps the others
+    out, and streams of one frame keep out nobody.
 
     Args:
         stream: the one that asks.
-        tracked: streams with a session, and when each was last used.
-        now_ns: the present.
-        idle_ns: silence after which a session is nobody's loss: its state is in the store.
+        tracked: streams with a session, when each was last used, and whether it is silent.
     """
     used = sorted(tracked, key=lambda one: one[1])
-    if used and now_ns - used[0][1] > idle_ns:
-        return used[0][0]
-    sites = Counter(other.partition("/")[0] for other, _ in used)
+    for other, _, silent in used:
+        if silent:
+            return other
+    sites = Counter(other.partition("/")[0] for other, _, _ in used)
     if not sites:
         return None
     largest, most = max(sites.items(), key=lambda one: (one[1], one[0]))
     if most < sites[stream.partition("/")[0]] + 2:
         return None
-    return next(other for other, _ in used if other.partition("/")[0] == largest)
+    return next(other for other, _, _ in used if other.partition("/")[0] == largest)
 
 
 @lru_cache(MAX_OWNERS)  # asked about with each message

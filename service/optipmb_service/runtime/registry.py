@@ -309,9 +309,10 @@ class Registry:
 
     # Room
 
-    def _used(self) -> list[tuple[str, int]]:
-        """Return the streams with a session, and when each was last used."""
-        return [(actor.stream, actor.meter.active_ns) for actor in self.actors()]
+    def _used(self) -> list[tuple[str, int, bool]]:
+        """Return the streams with a session, when each was last used, and whether it is silent."""
+        now_ns = time.monotonic_ns()
+        return [(actor.stream, actor.meter.active_ns, actor.meter.is_silent(now_ns)) for actor in self.actors()]
 
     def _evict_for_another(self, stream: str) -> None:
         self._report("refused", stream, f"at most {self._settings.max_sessions} streams at once", "another site's")

@@ -62,6 +62,10 @@ CODES: Final = {
         "The instance was frozen or cut off for longer than its lease; another one tracks the stream now.",
         "Nothing. If it happens often, raise `lease_s`, or look for what stops the process.",
     ),
+    "certificate": (
+        "A certificate of the service has ended; `received` names it.",
+        "Renew it; see `security.md`. A process that listens with it needs a restart.",
+    ),
     "contested": (
         "Two instances without the same `store` track the stream.",
         "Give them one `store` or `cluster`, or routers of their own.",

@@ -36,6 +36,11 @@ def address(value: str) -> str:
     return value
 
 
+def without_password(server: str) -> str:
+    """Return the address of a server as it may be shown."""
+    return re.sub(r"(?<=//)[^/@]*@", "***@", server)
+
+
 def _listed(value: Any) -> Any:
     """Take a text for a list: JSON, or names separated by commas."""
     if not isinstance(value, str):

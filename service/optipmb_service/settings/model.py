@@ -6,6 +6,7 @@ Times are in seconds. Every setting is described where it stands; `docs/operatio
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import re
 import secrets
@@ -41,6 +42,13 @@ def _default_instance() -> str:
     """Return a name that two services do not share."""
     host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()[:HOST_CHARACTERS]) or "host"
     return f"{host}-{os.getpid()}-{RUN}"
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def state_home() -> Path:
@@ -259,7 +267,8 @@ class Settings(BaseSettings):
     )
     http_hosts: Names = Field(
         default=(),
-        description="host names with a dot that HTTP requests may use, besides addresses and names without; `*`: any",
+        description="host names with a dot by which the page may be asked for, besides addresses and names without;"
+        " `*`: any",
     )
     http_streams: int = Field(
         default=100, ge=0, le=10_000, description="streams with series of their own in the metrics, by name"
@@ -305,6 +314,16 @@ class Settings(BaseSettings):
         if self.listen is not None:
             return self.listen
         return (DEFAULT_LISTEN,) if self.is_router else ()
+
+    @property
+    def unprotected(self) -> tuple[str, ...]:
+        """Addresses beyond this machine where everybody who reaches them may publish and command."""
+        endpoints = () if self.zenoh_config else self.endpoints
+        addresses = [(one, one.partition("/")[2].partition("?")[0].partition("#")[0]) for one in endpoints]
+        if self.grpc_tls is None and not self.grpc_tokens and self.grpc:
+            addresses.append((f"grpc {self.grpc}", self.grpc))
+        hosts = [(said, address.rpartition(":")[0].strip("[]")) for said, address in addresses]
+        return tuple(said for said, host in hosts if host and host != "localhost" and not _is_loopback(host))
 
     @property
     def folder(self) -> Path | None:

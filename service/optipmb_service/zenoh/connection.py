@@ -13,6 +13,7 @@ import contextlib
 import json
 import os
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import optipmb_schemas as schemas
@@ -23,8 +24,6 @@ from optipmb_service.runtime.ports import TransportError
 from optipmb_service.zenoh import key_numbers
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from optipmb_service.settings.model import Settings
 
 WAIT_BEFORE_DROP_US: Final = 50_000
@@ -46,6 +45,9 @@ RUNTIME: Final = "(rx: (handover: app))"
 By default one thread waits and wakes one of two others to read: two more threads are woken for each message. What is
 sent has a thread of its own, so a callback that waits for the lock of the interpreter keeps nothing from leaving.
 """
+
+LISTENING: Final = "zenoh_listen"
+"""Use of the certificate of a listener, which Zenoh reads at its start alone."""
 
 MESSAGE_HEADROOM: Final = 4
 """A message up to this many times the limit is received and answered by a problem; a larger one is dropped by Zenoh."""
@@ -156,6 +158,18 @@ def _configuration(settings: Settings) -> zenoh.Config:
         except zenoh.ZError as error:
             raise TransportError(f"setting {key}: {line(error)}") from error
     return config
+
+
+def certificates_of(settings: Settings) -> dict[str, Path]:
+    """Return the files of the certificates that the Zenoh configuration names, by their use.
+
+    Raises:
+        TransportError: the file of the configuration cannot be read.
+    """
+    config = _base(settings.zenoh_config)
+    uses = {"zenoh": "connect_certificate", LISTENING: "listen_certificate", "zenoh_authority": "root_ca_certificate"}
+    found = {use: json.loads(config.get_json(f"transport/link/tls/{name}")) for use, name in uses.items()}
+    return {use: Path(file) for use, file in found.items() if file}
 
 
 def _base(file: Path | None) -> zenoh.Config:

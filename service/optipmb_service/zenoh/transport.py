@@ -124,6 +124,9 @@ class Transport:
             "points": Topic("points", self._session, lambda one: self._receive(one, str(one.key_expr), on_cloud)),
         }
         self._returned = ReturnedPublishers(self._session, self._topics["detections"].due)
+        # A name with a part too few or too many matches no other subscription: it is received to be refused.
+        for names in ("*/*", "*/*/*/*"):
+            self._topics["detections"].subscribe(names, f"{self._prefix}/{names}/detections", detected, cached=False)
 
     def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
         """Receive the detections or clouds of a stream, or of all of them where it is empty; `discovery` is of all.

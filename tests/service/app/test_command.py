@@ -10,7 +10,7 @@ import sys
 from typing import TYPE_CHECKING
 
 import pytest
-from optipmb_schemas import Keys, ServiceStatus, SessionParameters
+from optipmb_schemas import Keys, ServiceStatus, SessionParameters, decode
 from optipmb_schemas.installation import install_command
 from optipmb_service.app import cli, nats
 from optipmb_service.app.worker import run_alone
@@ -263,6 +263,69 @@ def test_settings_have_an_order(
         "file",
         "default",
     ]
+
+
+def test_config_prints_no_password(capsys: pytest.CaptureFixture[str]) -> None:
+    """User, password and token in the address of a NATS server are not shown."""
+    servers = "nats://user:secret@10.0.0.1:4222,nats://token@10.0.0.2:4222,nats://10.0.0.3:4222"
+    for option in ("--json", "--no-router"):
+        shown = config(capsys, option, "--connect", "tcp/127.0.0.1:1", "--cluster", servers)
+        assert "secret" not in shown
+        assert "token@" not in shown
+        assert "nats://***@10.0.0.1:4222" in shown
+        assert "nats://10.0.0.3:4222" in shown
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--listen", "tcp/0.0.0.0:0"), ["tcp/0.0.0.0:0"]),
+        (("--listen", "tcp/[::]:0,tcp/127.0.0.1:0"), ["tcp/[::]:0"]),
+        (("--listen", "tcp/localhost:0", "--grpc", "10.0.0.1:1"), ["grpc 10.0.0.1:1"]),
+        (("--listen", "tcp/[::1]:0", "--grpc", "127.0.0.1:1"), []),
+        (("--listen", "unixsock-stream//tmp/a"), []),
+        (("--listen", "tcp/0.0.0.0:0", "--zenoh-config", "own.json5"), []),
+    ],
+)
+def test_who_listens_for_others_without_protection_is_told(options: tuple[str, ...], said: list[str]) -> None:
+    """Addresses beyond this machine without TLS or access control are named; those of this machine are not."""
+    pairs = dict(zip(options[::2], options[1::2], strict=True))
+    assert (
+        list(load(None, {name[2:].replace("-", "_"): value for name, value in pairs.items()}).settings.unprotected)
+        == said
+    )
+
+
+def test_a_service_without_protection_says_so() -> None:
+    """The log has one warning about it, and none on the loopback interface."""
+    with ServiceProcess("--listen", "tcp/0.0.0.0:0", "--log-format", "json", listen=False) as service:
+        service.wait_ready()
+        assert service.errors.count('"event": "unprotected"') == 1
+        assert service.end()[0] == 0
+
+
+def test_a_store_that_never_opened_is_a_failure_at_the_end(tmp_path: Path) -> None:
+    """A service that could not keep anything tracks, and ends with status 1."""
+    (tmp_path / "file").write_text("")
+    with ServiceProcess(environment={"OPTIPMB_STORE": str(tmp_path / "file" / "folder")}) as service:
+        service.wait_ready()
+        assert service.end()[0] == 1
+
+
+def test_a_stream_name_with_a_part_too_many_is_reported() -> None:
+    """Detections under two or four names are refused with a line that has the key; the others are tracked."""
+    with ServiceProcess("--log-format", "json") as service:
+        service.wait_ready()
+        with Node(service.endpoint) as node:
+            wrong = f"{KEYS.prefix}/plant/hall/robot/lidar/detections"
+            for seq in range(5):
+                node.send_raw(wrong, b"anything")
+                node.send(SENSOR.detections(seq))
+            node.tracks(SENSOR.stream, 5)
+            node.send_raw(f"{KEYS.prefix}/robot/lidar/detections", b"anything")
+            service.wait_log(wrong)
+            (status,) = [decode(one[2], ServiceStatus) for one in node.query(KEYS.all_status())]
+        assert status.refused >= 5
 
 
 def test_what_config_prints_is_a_settings_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

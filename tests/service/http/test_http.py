@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import re
@@ -9,6 +10,8 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -17,6 +20,7 @@ import pytest
 from optipmb_schemas import Keys, ServiceStatus
 from optipmb_service.app.health_command import ask
 from optipmb_service.http import KnownHosts, Server, application
+from optipmb_service.http.server import CONNECTIONS, REQUESTS
 from optipmb_service.observability.metrics import NAMESPACE, SERVICE_METRICS
 from optipmb_service.runtime.ports import HttpError
 from prometheus_client.parser import text_string_to_metric_families
@@ -35,6 +39,7 @@ if TYPE_CHECKING:
 KEYS = Keys()
 SENSOR = Sensor()
 END_S = 30.0
+NOT_MADE = {http.client.NOT_FOUND, http.client.SERVICE_UNAVAILABLE}
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 
@@ -83,7 +88,7 @@ def get(address: str, path: str) -> tuple[int, str]:
     try:
         connection.request("GET", path)
         response = connection.getresponse()
-        assert response.getheader("cache-control") == "no-store" or response.status == http.client.NOT_FOUND
+        assert response.getheader("cache-control") == "no-store" or response.status in NOT_MADE
         return response.status, response.read().decode()
     finally:
         connection.close()
@@ -140,12 +145,59 @@ def test_health_follows_the_heartbeat() -> None:
 )
 def test_a_host_that_is_not_the_service_s_is_refused(host: str, status: int) -> None:
     """A name that a stranger lets point here gets no answer; addresses, plain names and those of the settings do."""
+    page = Route("/page", lambda _request: PlainTextResponse("a page"))
+    with served(Said(), page) as address:
+        name, _, port = address.rpartition(":")
+        connection = http.client.HTTPConnection(name, int(port), timeout=10)
+        connection.request("GET", "/page", headers={"host": host})
+        assert connection.getresponse().status == status
+        connection.close()
+
+
+@pytest.mark.parametrize("path", ["/healthz", "/readyz", "/metrics"])
+@pytest.mark.parametrize("host", ["tracker.site.svc.cluster.local:8080", "tracker.plant.example.org."])
+def test_programs_that_monitor_ask_by_any_name(path: str, host: str) -> None:
+    """Probes and Prometheus get answers by names with a domain or a trailing dot, without a setting."""
     with served(Said()) as address:
         name, _, port = address.rpartition(":")
         connection = http.client.HTTPConnection(name, int(port), timeout=10)
-        connection.request("GET", "/healthz", headers={"host": host})
-        assert connection.getresponse().status == status
+        connection.request("GET", path, headers={"host": host})
+        assert connection.getresponse().status == 200
         connection.close()
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET /healthz HTTP/1.1\r\nhost: a\r\n"])
+def test_connections_without_a_request_keep_no_probe_out(sent: bytes) -> None:
+    """However many connections send nothing, or half a request, `/healthz` says 200; in the end they are closed."""
+    with served(Said()) as address, contextlib.ExitStack() as stack:
+        host, _, port = address.rpartition(":")
+        idle = [stack.enter_context(socket.create_connection((host, int(port)))) for _ in range(2 * CONNECTIONS)]
+        for one in idle:
+            with contextlib.suppress(OSError):  # it had to make room
+                one.sendall(sent)
+        assert get(address, "/healthz")[0] == 200
+        for one in idle:
+            one.settimeout(END_S)
+            with contextlib.suppress(ConnectionResetError):
+                assert one.recv(1) == b""
+
+
+def test_slow_requests_keep_no_probe_out() -> None:
+    """While all the requests that are answered at once hang, probes are answered and others refused."""
+    gate = threading.Event()
+
+    def hang(_request: Request) -> PlainTextResponse:
+        gate.wait(END_S)
+        return PlainTextResponse("late", headers={"cache-control": "no-store"})
+
+    with served(Said(), Route("/hang", hang)) as address, ThreadPoolExecutor(REQUESTS) as pool:
+        try:
+            hanging = [pool.submit(get, address, "/hang") for _ in range(REQUESTS)]
+            until(lambda: get(address, "/nothing")[0] == 503, "all are busy")
+            assert get(address, "/healthz")[0] == get(address, "/readyz")[0] == 200
+        finally:
+            gate.set()
+        assert {one.result()[0] for one in hanging} == {200}
 
 
 @pytest.mark.parametrize("state", ["starting", "stopping"])

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any
 
+from hypothesis import given
+from hypothesis import strategies as st
 from optipmb_schemas import Keys
+from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
 from router import SECOND, Node, Sensor, until
 
@@ -12,7 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 KEYS = Keys()
-IDLE_NS = 30 * SECOND
 
 
 def test_a_rate_is_a_bucket_of_a_second() -> None:
@@ -49,13 +52,45 @@ def test_sessions_are_counted_per_node_and_site() -> None:
 
 def test_the_least_recently_used_makes_room() -> None:
     """A silent session goes first; else one of the site that has most, and never one of a site that has no more."""
-    now_ns = 100 * SECOND
-    silent = [("a/n/1", 99 * SECOND), ("b/n/1", 60 * SECOND), ("a/n/2", 98 * SECOND)]
-    assert victim_of("c/n/1", silent, now_ns, IDLE_NS) == "b/n/1"
-    busy = [("a/n/1", 99 * SECOND), ("b/n/1", 97 * SECOND), ("a/n/2", 98 * SECOND)]
-    assert victim_of("c/n/1", busy, now_ns, IDLE_NS) == "a/n/2"
-    assert victim_of("a/n/3", busy, now_ns, IDLE_NS) is None
-    assert victim_of("b/n/2", busy, now_ns, IDLE_NS) is None
+    silent = [("a/n/1", 99, False), ("b/n/1", 97, True), ("a/n/2", 96, False), ("a/n/3", 98, True)]
+    assert victim_of("c/n/1", silent) == "b/n/1"
+    busy = [("a/n/1", 99, False), ("b/n/1", 97, False), ("a/n/2", 98, False)]
+    assert victim_of("c/n/1", busy) == "a/n/2"
+    assert victim_of("a/n/3", busy) is None
+    assert victim_of("b/n/2", busy) is None
+
+
+@given(st.lists(st.integers(1, 10**10), min_size=1, max_size=50))
+def test_a_stream_that_keeps_its_period_is_never_silent(distances: list[int]) -> None:
+    """Frames in a burst, then at the stream's own period: it is silent three of its periods later, not before."""
+    meter = StreamMeter(0)
+    now_ns = 0
+    assert meter.is_silent(now_ns)
+    for distance in distances:
+        meter.arrived(now_ns, frame=True)
+        now_ns += distance
+    meter.arrived(now_ns, frame=True)
+    period = max(distances[-4:])
+    assert not meter.is_silent(now_ns + period)
+    assert meter.is_silent(now_ns + 3 * period + 1)
+
+
+def test_strangers_of_one_frame_evict_nobody_who_sends(start: Callable[..., Any]) -> None:
+    """Every session is taken, and streams of strangers send one frame each: no frame of a regular stream is lost."""
+    service, endpoint = start(max_sessions=6)
+    regular = [Sensor(f"plant/robot/lidar-{number}") for number in range(4)]
+    frames = 40
+    with Node(endpoint) as node:
+        for seq in range(frames):
+            node.send(*(sensor.detections(seq) for sensor in regular))
+            strangers = [Sensor(f"stranger-{seq}-{number}/node/lidar") for number in range(3)]
+            node.send_plain(*(sensor.detections(0) for sensor in strangers if seq > 1))
+            received = 4 * (seq + 1) + 3 * max(0, seq - 1)
+            until(lambda received=received: service._registry.totals().received >= received, "it is received")  # type: ignore[misc]
+            time.sleep(0.05)  # a period of the regular streams
+        for sensor in regular:
+            assert [tracks.seq for tracks in node.tracks(sensor.stream, frames)] == list(range(frames))
+        assert not [key for key, _, _ in node.problems_seen.items if "/plant/" in key]
 
 
 def test_one_site_does_not_keep_the_others_out(start: Callable[..., Any]) -> None:

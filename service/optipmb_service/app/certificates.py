@@ -1,0 +1,95 @@
+"""The certificates that a process uses: how long they hold, in metrics and log, and which of them has ended.
+
+A listener of Zenoh has the certificate that its file had at the start. Links of a client, gRPC and NATS read the file
+again, so that one that is renewed holds without a restart.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+import structlog
+from optipmb_schemas.certificates import end_of, ended
+
+from optipmb_service.zenoh.connection import LISTENING, certificates_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from optipmb_service.observability.metrics import Value
+    from optipmb_service.settings.model import Settings
+
+LOOK_S: Final = 5.0
+"""Files are read again after so long."""
+
+WARN_DAYS: Final = 7.0
+WARN_S: Final = 86_400.0
+
+DAY_S: Final = 86_400.0
+
+log = structlog.get_logger("optipmb_service")
+
+
+class Certificates:
+    """The certificates of one process.
+
+    Args:
+        settings: which name them.
+
+    Raises:
+        TransportError: the Zenoh configuration cannot be read.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._files = certificates_of(settings)
+        for use, folder in (("grpc", settings.grpc_tls if settings.grpc else None), ("cluster", settings.cluster_tls)):
+            if folder is not None:
+                self._files |= {use: folder / "cert.pem", f"{use}_authority": folder / "ca.pem"}
+        self._ends: dict[str, datetime] = {}
+        self._looked = -LOOK_S
+        self._look()
+
+    def figures(self) -> Iterator[Value]:
+        """Return how many days each certificate still holds."""
+        now = datetime.now(UTC)
+        for use, end in self._look().items():
+            yield "certificate_days", (use,), (end - now).total_seconds() / DAY_S
+
+    @property
+    def failure(self) -> str:
+        """Which certificates have ended; empty while all hold."""
+        return "; ".join(self._ended())
+
+    @property
+    def cut_off(self) -> bool:
+        """Whether one of Zenoh's has ended: there is no link to the network."""
+        return any("zenoh" in use for use in self._ended().values())
+
+    async def watch(self) -> None:
+        """Log certificates that end soon once a day, and each that has ended, for ever."""
+        warned = -WARN_S
+        told: set[str] = set()
+        while True:
+            now_ended = self._ended().keys()
+            for why in now_ended - told:
+                log.error("certificate_ended", error=why)
+            told = set(now_ended)
+            soon = {use: round(days, 1) for _, (use,), days in self.figures() if 0 < days < WARN_DAYS}
+            if soon and time.monotonic() - warned >= WARN_S:
+                warned = time.monotonic()
+                log.warning("certificate_ends", days=soon)
+            await asyncio.sleep(LOOK_S)
+
+    def _ended(self) -> dict[str, str]:
+        """Return one line for each certificate that has ended, with its use."""
+        return {why: use for use, end in self._look().items() if (why := ended(self._files[use], end))}
+
+    def _look(self) -> dict[str, datetime]:
+        if (now := time.monotonic()) - self._looked >= LOOK_S:
+            found = {use: end for use, file in self._files.items() if (end := end_of(file)) is not None}
+            kept = {use: end for use, end in self._ends.items() if use == LISTENING}
+            self._ends, self._looked = found | kept, now
+        return self._ends
