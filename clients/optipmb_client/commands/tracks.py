@@ -1,17 +1,15 @@
 """`optipmb tracks`: what was tracked a while ago."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import typer
-from optipmb_schemas import PREFIX, Tracks
+from optipmb_schemas import PREFIX
 
 from optipmb_client.commands.options import AsJson, Config, Connect, Prefix, print_json, say
 from optipmb_client.errors import ServiceUnavailable, UsageError
 from optipmb_client.history import kept_tracks
-from optipmb_client.results.table import TrackColumns
+from optipmb_client.results.table import track_columns
 from optipmb_client.sessions import session_state
 from optipmb_client.table_files import SUFFIXES, write_table
 from optipmb_client.zenoh import Connection
@@ -19,15 +17,8 @@ from optipmb_client.zenoh import Connection
 SECOND = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class _Kept:
-    """Tracks as a sequence of frames."""
-
+class _Kept(NamedTuple):
     name: str
-    found: Sequence[Tracks]
-
-    def frames(self) -> Iterator[Tracks]:
-        return iter(self.found)
 
 
 def tracks(  # noqa: PLR0913  these are the command's options
@@ -57,10 +48,7 @@ def tracks(  # noqa: PLR0913  these are the command's options
             from_ns = max(0, state.stamp_ns - round(last * SECOND))
         found = list(kept_tracks(connection, stream, from_ns, to_ns, prefix=prefix))
     if out is not None:
-        columns = TrackColumns(_Kept(stream, found))
-        for index, one in enumerate(found):
-            columns.add(index, one)
-        write_table(out, columns.columns())
+        write_table(out, track_columns(_Kept(stream), dict(enumerate(found))))
     stamps = [found[0].stamp_ns, found[-1].stamp_ns] if found else []
     if as_json:
         print_json({"command": "tracks", "stream": stream, "frames": len(found), "stamps_ns": stamps, "out": out})

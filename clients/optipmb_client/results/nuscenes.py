@@ -12,14 +12,15 @@ Each scene is first a file of its own, `scenes/NAME.json`, in the same layout; a
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
+from optipmb_schemas import Tracks
 
 from optipmb_client.files import AtomicText, DatasetError, read_text
 from optipmb_client.geometry import Ints, PoseLike
 from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES, NUSCENES_META, Submission, read_submission
-from optipmb_client.results.rows import ResultTable, TrackRows
+from optipmb_client.results.rows import ResultTable, ResultWriter, stacked
 
 NUSCENES_FILE = "tracking_results.json"
 NUSCENES_MAX_BOXES = 500
@@ -60,7 +61,7 @@ def _head(meta: Mapping[str, Any]) -> str:
     return f'{{"meta": {json.dumps(used)}, "results": {{\n'
 
 
-class NuScenesResultWriter:
+class NuScenesResultWriter(ResultWriter):
     """Writes the tracks of one scene; use it as a context manager, or call `close` at the end.
 
     Args:
@@ -71,18 +72,14 @@ class NuScenesResultWriter:
     """
 
     def __init__(self, out: Path, scene: str, samples: Sequence[str], meta: Mapping[str, Any]) -> None:
+        super().__init__(scene_file(out, scene))
         self._scene = scene
         self._samples = samples
         self._head = _head(meta)
         self._lines: dict[int, str] = {}
-        self._file = AtomicText(scene_file(out, scene))
+        self._file = AtomicText(self.path)
 
-    @property
-    def path(self) -> Path:
-        """The finished file of the scene."""
-        return self._file.path
-
-    def add(self, index: int, pose: PoseLike, tracks: TrackRows) -> None:  # noqa: ARG002  boxes are global
+    def add(self, index: int, pose: PoseLike, tracks: Tracks) -> None:  # noqa: ARG002  boxes are global
         """Write the tracks (world frame) of frame `index`; the benchmark wants no sensor frame, so no pose.
 
         Raises:
@@ -134,15 +131,6 @@ class NuScenesResultWriter:
         """Drop what was written."""
         self._file.discard()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.discard()
-
 
 def read_nuscenes_results(path: Path) -> Submission:
     """Return a result file, or the one in a folder.
@@ -175,18 +163,9 @@ def result_table(results: Submission, scene: str, samples: Sequence[str]) -> Res
         if len(set(boxes.id)) < len(boxes):
             twice = next(name for i, name in enumerate(boxes.id) if name in boxes.id[:i])
             raise DatasetError(results.path, f"a tracking_id once in results.{token}", f"{twice!r} again")
-    count = len(names)
-    return ResultTable(
-        labels=NUSCENES_CLASSES,
-        frame=np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames]),
-        id=_numbers(scene, names),
-        label=np.concatenate([np.empty(0, dtype=np.int64), *(boxes.label for boxes in frames)]),
-        center=np.concatenate([np.empty((0, 3)), *(boxes.center for boxes in frames)]),
-        size=np.concatenate([np.empty((0, 3)), *(boxes.size for boxes in frames)]),
-        yaw=np.concatenate([np.empty(0), *(boxes.yaw for boxes in frames)]),
-        score=np.concatenate([np.empty(0), *(boxes.score for boxes in frames)]),
-        box2d=np.full((count, 4), np.nan),
-    )
+    label, center, size, yaw, score = (stacked(frames, name) for name in ("label", "center", "size", "yaw", "score"))
+    frame, image = np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames]), np.full((len(names), 4), np.nan)
+    return ResultTable(NUSCENES_CLASSES, frame, _numbers(scene, names), label, center, size, yaw, score, image)
 
 
 def _numbers(scene: str, names: Sequence[str]) -> Ints:
