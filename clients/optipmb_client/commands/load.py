@@ -1,5 +1,6 @@
 """`optipmb load`: how much a running service carries."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -10,13 +11,9 @@ from optipmb_client.commands.options import (
     AsJson,
     Config,
     Connect,
-    Detections,
-    Options,
+    DatasetOptions,
     Prefix,
     Profile,
-    Root,
-    Sequences,
-    asked_for,
     open_sequences,
     print_json,
     print_table,
@@ -28,17 +25,20 @@ from optipmb_client.progress import FrameProgress
 from optipmb_client.zenoh import Connection
 
 
+@dataclass(frozen=True, kw_only=True)
+class RecordedOptions(DatasetOptions):
+    """Options of recorded frames to send."""
+
+    dataset: Annotated[str | None, typer.Option("--dataset", help="Recorded frames in the place of generated.")] = None
+
+
 def load(  # noqa: PLR0913  these are the command's options
     *,
     streams: Annotated[int, typer.Option(min=1, max=10_000, help="Sensors.")] = 10,
     rate: Annotated[float, typer.Option(min=0.1, max=10_000, help="Frames per second of each.")] = 10.0,
     objects: Annotated[int, typer.Option(min=0, max=5000, help="Objects in a generated frame.")] = 40,
     points: Annotated[int, typer.Option(min=0, max=1_000_000, help="Points of a generated cloud; 0: no clouds.")] = 0,
-    dataset: Annotated[str | None, typer.Option("--dataset", help="Recorded frames in the place of generated.")] = None,
-    root: Root = None,
-    detections: Detections = None,
-    sequences: Sequences = None,
-    option: Options = None,
+    data: RecordedOptions,
     clouds: Annotated[bool, typer.Option("--clouds/--no-clouds", help="Send the clouds of recorded frames.")] = True,
     profile: Profile = None,
     seconds: Annotated[float, typer.Option(min=1.0, help="How long one run takes.")] = 20.0,
@@ -59,9 +59,8 @@ def load(  # noqa: PLR0913  these are the command's options
     if limit:
         latency_ms = latency_ms or 20.0
     material: Frames | None = None
-    if dataset is not None:
-        asked = asked_for(None, dataset, root, detections, option)
-        opened, chosen = open_sequences(asked, sequences)
+    if data.dataset is not None:
+        opened, chosen = open_sequences(data.asked(), data.sequences)
         material, profile = recorded(chosen, clouds=clouds), profile or opened.profile
         if not len(material):
             raise UsageError("--sequences: they have no frames")

@@ -13,21 +13,16 @@ from optipmb_client.commands.options import (
     Config,
     Connect,
     Full,
-    Patience,
+    PaceOptions,
     Prefix,
-    Speed,
-    Wait,
-    Window,
     mcap_needed,
     print_json,
     say,
     warn,
 )
-from optipmb_client.commands.replay import speed_of
 from optipmb_client.datasets import open_dataset
 from optipmb_client.progress import FrameProgress
 from optipmb_client.recording import Results
-from optipmb_client.replay import Pace
 from optipmb_client.zenoh import Connection
 
 if TYPE_CHECKING:
@@ -53,10 +48,7 @@ def play(  # noqa: PLR0913  these are the command's options
     full: Full = False,
     connect: Connect = None,
     config: Config = None,
-    speed: Speed = "max",
-    window: Window = 8,
-    wait: Wait = 10.0,
-    patience: Patience = 30.0,
+    pace: PaceOptions,
     prefix: Prefix = PREFIX,
     as_json: AsJson = False,
 ) -> None:
@@ -70,20 +62,20 @@ def play(  # noqa: PLR0913  these are the command's options
         from optipmb_client.mcap_files.play import choose  # noqa: PLC0415  as above
         from optipmb_client.mcap_files.play import play as play_streams  # noqa: PLC0415  as above
         from optipmb_client.mcap_files.reading import RecordingFile  # noqa: PLC0415  packages of an extra
-    pace = Pace(speed_of(speed), window, patience, wait)
+    chosen_pace = pace.pace()
     recording = RecordingFile(file)
     plans = choose(recording, streams or ())
     if recording.cut:
         typer.echo(f"optipmb: {file} was cut off; everything up to the cut is played", err=True)
     with (
-        Connection(connect, config=config, timeout=wait) as connection,
+        Connection(connect, config=config, timeout=pace.wait) as connection,
         FrameProgress("playing", sum(len(one.frames) for one in plans.values())) as progress,
     ):
         results = play_streams(
             connection,
             recording,
             plans,
-            pace=pace,
+            pace=chosen_pace,
             site=None if as_recorded else f"play-{secrets.token_hex(3)}",
             profile=profile,
             prefix=prefix,

@@ -24,8 +24,7 @@ from optipmb_schemas import (
 )
 
 from optipmb_client.asking import DensityAsker
-from optipmb_client.commands.options import Config, Connect, Prefix, mcap_needed, say
-from optipmb_client.commands.replay import speed_of
+from optipmb_client.commands.options import Config, Connect, Prefix, mcap_needed, say, speed_of
 from optipmb_client.errors import UsageError
 from optipmb_client.extras import needed
 from optipmb_client.incoming import Inbox
