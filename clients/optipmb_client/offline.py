@@ -48,6 +48,8 @@ __all__ = [
     "doubts",
     "profile_compared",
     "profile_for",
+    "profile_source",
+    "profiles",
     "read_profile",
     "track_fields",
     "track_sequence",
@@ -92,16 +94,6 @@ def read_profile(profile: str) -> Parameters:
         return load_profile(profile)
     except OptipmbError as error:
         raise UsageError(f"--profile {profile}: {error}") from error
-
-
-def profile_names() -> tuple[str, ...]:
-    """Return the names of the profiles that come along."""
-    return profiles()
-
-
-def profile_text(profile: str) -> str:
-    """Return a profile as the text of its TOML file."""
-    return profile_source(profile)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from optipmb_client.tuning.material import load, of_class
 from optipmb_client.tuning.objective import Bench
 from optipmb_client.tuning.scoring import rules_of, scorer_of
 from optipmb_client.tuning.values import Value, only, value_of, with_values
-from optipmb_client.tuning.watch import Quiet
+from optipmb_client.tuning.watch import Watch
 from tuning_cases import Habits, recorded
 
 import optipmb
@@ -30,9 +30,9 @@ def test_a_change_that_does_not_pay_is_taken_back(bench: Bench) -> None:
     before: dict[str, Value] = {"gate": 0.1, "birth.acceleration": value_of(start, "Car", "birth.acceleration")}
     made = partial(with_values, start, "Car")
     jury = Jury(bench, range(3), start)
-    chosen = prune(jury, made, before, {"gate": 4.0, "birth.acceleration": 1.1}, 1.0, Quiet())
+    chosen = prune(jury, made, before, {"gate": 4.0, "birth.acceleration": 1.1}, 1.0, Watch())
     assert chosen == {"gate": 4.0}
-    (found,) = weigh(jury, made, before, chosen, Quiet())
+    (found,) = weigh(jury, made, before, chosen, Watch())
     assert (found.path, found.start, found.value, found.positive, found.groups) == ("gate", 0.1, 4.0, 3, 3)
     assert found.gain > 3.0 * found.error > 0.0
 

@@ -35,7 +35,7 @@ def profiles(
 
     if name is None:
         if copy is not None or explain:
-            raise UsageError("which profile? " + ", ".join(offline.profile_names()))
+            raise UsageError("which profile? " + ", ".join(offline.profiles()))
         _list(as_json=as_json)
         return
     parameters = offline.read_profile(name)
@@ -43,7 +43,7 @@ def profiles(
         if copy.exists():
             raise UsageError(f"--copy {copy}: it is there already")
         file = AtomicText(copy)
-        file.write(offline.profile_text(name))
+        file.write(offline.profile_source(name))
         file.close()
         say(f"{name} in {copy}; its name field is still {parameters.name!r}")
     elif as_json:
@@ -51,7 +51,7 @@ def profiles(
     elif explain:
         print_table(Group(*(Text(_line(field)) for field in offline.fields_of(parameters))))
     else:
-        say(offline.profile_text(name).rstrip())
+        say(offline.profile_source(name).rstrip())
 
 
 def _line(field: "FieldOfProfile") -> str:
@@ -62,7 +62,7 @@ def _line(field: "FieldOfProfile") -> str:
 def _list(*, as_json: bool) -> None:
     from optipmb_client import offline  # noqa: PLC0415  as above
 
-    known = {one: offline.read_profile(one) for one in offline.profile_names()}
+    known = {one: offline.read_profile(one) for one in offline.profiles()}
     if as_json:
         print_json({"command": "profiles", "profiles": {one: list(it.labels) for one, it in known.items()}})
         return

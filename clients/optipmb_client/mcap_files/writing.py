@@ -7,7 +7,6 @@ kill; the index at the end of the file comes with `close`.
 import json
 import threading
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Self
 
 from mcap.writer import CompressionType, Writer
@@ -63,9 +62,7 @@ class RecordingWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def add(self, key: str, payload: bytes, encoding: str, received_ns: int) -> Message | None:

@@ -5,18 +5,19 @@ On a terminal a bar; elsewhere (a log file, CI) a plain line every ten seconds.
 
 import sys
 import time
-from types import TracebackType
 from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from optipmb_client.tuning.watch import Watch
 
 __all__ = ["TrialDisplay"]
 
 PLAIN_PERIOD_S = 10.0
 
 
-class TrialDisplay:
+class TrialDisplay(Watch):
     """Shows the trials of one class after the other; trials that an earlier session has done take no time."""
 
     def __init__(self, *, terminal: bool | None = None) -> None:
@@ -38,9 +39,7 @@ class TrialDisplay:
             self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 

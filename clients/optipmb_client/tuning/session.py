@@ -32,7 +32,7 @@ from optipmb_client.tuning.scoring import Measured, Scorer
 from optipmb_client.tuning.search import Outcome, Search
 from optipmb_client.tuning.space import Dimension, dimensions, penalty, repaired
 from optipmb_client.tuning.values import Value, only, value_of, with_calibration, with_heading_sign, with_values
-from optipmb_client.tuning.watch import Quiet, Watch
+from optipmb_client.tuning.watch import Watch
 
 __all__ = ["FoldResult", "Plan", "Refined", "refine"]
 
@@ -171,7 +171,7 @@ def refine(
         UsageError: the storage holds trials of another session.
 
     """
-    name, watch = scorer.name, watch or Quiet()
+    name, watch = scorer.name, watch or Watch()
     base = only(parameters, name)
     variants = [clips, *([degrade(clip, plan.degradation, plan.seed, i) for clip in clips] for i in range(plan.copies))]
     everyone = tuple(range(len(clips)))
