@@ -38,6 +38,7 @@ from optipmb import (
 )
 from optipmb_client.datasets import DataSequence, DetectionFrame
 from optipmb_client.datasets.interface import DETECTION_COLUMNS
+from optipmb_client.datasets.motion import LEAST_ALONG, SURE_MOVES, headings_along
 from optipmb_client.errors import UsageError
 from optipmb_client.recording import selected_frames
 from optipmb_client.smoothing import Smoother
@@ -169,6 +170,9 @@ def doubts(parameters: Parameters, sequences: Sequence[DataSequence]) -> Iterato
             f"frames come at {1.0 / period:.3g} Hz, profile {parameters.name} is for {1.0 / nominal:.3g} Hz: "
             "--profile auto, or a profile tuned at this rate, may track better"
         )
+    share, moves = headings_along(one for one in sequences if not hasattr(one, "time_column"))  # tables told theirs
+    if share < LEAST_ALONG and moves >= SURE_MOVES:
+        yield f"headings and motion disagree: {share:.0%} of {moves} moves of boxes are along their headings"
 
 
 def _labels(sequences: Sequence[DataSequence]) -> tuple[str, ...]:

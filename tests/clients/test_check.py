@@ -76,6 +76,7 @@ INDEX = np.round(np.repeat(np.arange(FRAMES), 2)).astype(np.int64)
         ({"timestamp": -2.0 + INDEX / 10.0}, "stamps are in seconds: frames at 10 Hz"),
         ({"timestamp": INDEX - 30}, None),
         ({"timestamp": INDEX / 10.0 + np.tile([0.0, 0.004], FRAMES)}, "stamps differ by up to 0.004 s within a frame"),
+        ({"timestamp": INDEX * 10**8 + np.tile([0, 80_000_000], FRAMES), "frame": INDEX}, "the first one of its frame"),
         ({"sec": 1_600_000_000 + INDEX // 10, "nanosec": INDEX % 10 * 100_000_000}, "stamps are sec + nanosec"),
         ({"frame": 371 + 5 * INDEX}, "frames of column frame are taken to come at 10 Hz (numbers in steps of 5)"),
     ],
@@ -375,6 +376,17 @@ def test_a_table_without_classes_is_of_class_object(tmp_path: Path, capsys: pyte
     assert set(
         tracked(capsys, data, "--option", "invalid=skip", "--option", "class.CAR=Auto")[0]["class"].tolist()
     ) == {"Auto"}
+
+
+def test_numbers_of_classes_are_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A class is called `1` also where an empty cell turns the numbers of the column into fractions."""
+    data = write(tmp_path / "d.csv", street(), **{"class": np.where(np.arange(2 * FRAMES) == 11, np.nan, 1.0)})
+    assert "d.csv:13: expected class" in refused(capsys, data)
+    assert set(tracked(capsys, data, "--option", "invalid=skip")[0]["class"].tolist()) == {1}
+    options = ("--option", "invalid=skip", "--option", "class.1=car", "--option", "class.2=bus")
+    notes = tracked(capsys, data, *options)[1]
+    assert "car as car" in notes
+    assert "no box is of class 2" in notes
 
 
 def test_check_prints_the_findings_without_tracking(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -444,3 +444,16 @@ def test_real_poses_are_read_as_written(real: KittiDataset) -> None:
         np.testing.assert_allclose(rotation_of(pose.quaternion), turned, atol=1e-6)
         np.testing.assert_allclose(pose.translation, SENSOR_FROM_CAMERA @ matrix[:3, 3], atol=1e-12)
     np.testing.assert_allclose(sequence.poses[0].quaternion, [1, 0, 0, 0], atol=1e-9)
+
+
+def test_headings_across_the_motion_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`track` says so where the boxes of a detector do not move along their headings, and only there."""
+    for name, rotation in (("along", -1.57), ("across", 0.0)):
+        root = tmp_path / name
+        write_root(root, frames=40)
+        row = "{frame},2,10,20,30,40,0.9,1.5,1.6,4.0,1.0,1.7,{z},{rotation},-1.6"
+        boxes = (row.format(frame=i, z=20.0 - i, rotation=rotation) for i in range(40))  # 1 m/frame ahead in the world
+        (root / "detections/rcnn/Car/0000.txt").write_text("\n".join(boxes) + "\n")
+        done = run_here(capsys, "track", "--dataset", "kitti", "--root", root, "--out", tmp_path / "out")
+        assert done.returncode == 0, done.stderr
+        assert ("headings and motion disagree" in done.stderr) == (name == "across"), done.stderr

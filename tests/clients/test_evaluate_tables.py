@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import result_of, run_here
-from optipmb_client.table_files import write_table
+from optipmb_client.table_files import read_table, write_table
 
 FRAMES, CARS = 50, 2
 
@@ -94,15 +94,26 @@ def test_the_unit_of_time_reaches_truth_and_own_tracks(bench: Bench) -> None:
     assert counts(done) == RIGHT
 
 
-def test_own_tracks_keep_their_units(bench: Bench) -> None:
-    """Options of degrees and of the order of sizes are those of detections and truth, not of a table of OptiPMB."""
-    other = {"x": cars()["y"], "y": cars()["x"], "yaw": np.full(100, 90.0), "l": cars()["w"], "w": cars()["l"]}
-    data = bench.table("d.csv", cars(id=None, score=np.full(FRAMES * CARS, 90.0), **other))
-    truth = bench.table("truth.csv", cars(**other))
-    out, options = bench.folder / "t.csv", ["yaw=degrees", "sizes=wlh", "score=percent", "class.car=Auto"]
+NORTH = {"x": cars()["y"], "y": cars()["x"]}
+"""The cars drive along y."""
+
+
+@pytest.mark.parametrize(
+    ("changed", "options"),
+    [
+        ({"yaw": np.full(100, 90.0)}, ["yaw=degrees", "time=s"]),
+        ({"yaw": np.full(100, np.pi / 2), "l": cars()["w"], "w": cars()["l"]}, ["sizes=wlh", "class.car=Auto"]),
+        ({"yaw": np.zeros(100)}, ["heading=y", "score=percent"]),
+    ],
+)
+def test_own_tracks_keep_their_units(bench: Bench, changed: dict[str, np.ndarray], options: list[str]) -> None:
+    """Options of headings and of the order of sizes are those of detections and truth, not of a table of OptiPMB."""
+    scores = np.full(FRAMES * CARS, 90.0 if "score=percent" in options else 0.9)
+    data = bench.table("d.csv", cars(id=None, score=scores, **NORTH, **changed))
+    truth, out = bench.table("truth.csv", cars(**NORTH, **changed)), bench.folder / "t.csv"
     assert bench.run("track", data, "--out", out, options=options).returncode == 0
-    asked = ("evaluate", data, "--truth", truth, "--tracks", out, "--json", "--iou", "0.8")
-    assert counts(bench.run(*asked, options=[*options, "time=s"]), "Auto") == RIGHT
+    done = bench.run("evaluate", data, "--truth", truth, "--tracks", out, "--json", "--iou", "0.8", options=options)
+    assert counts(done, "Auto" if "class.car=Auto" in options else "car") == RIGHT
 
 
 def test_all_options_reach_tracks_of_others(bench: Bench) -> None:
@@ -148,6 +159,19 @@ def test_the_truth_of_a_folder_is_matched_by_the_names_of_files(bench: Bench) ->
     assert "sequence two: expected annotations" in done.stderr
 
 
+def test_recordings_without_rows_are_compared(bench: Bench) -> None:
+    """A truth with a header alone has no objects, detections with a header alone have no frames; both are said."""
+    for name in ("one", "two", "three"):
+        bench.table(f"d/{name}.csv", take(cars(score=np.full(100, 0.9)), slice(0 if name == "three" else 100)))
+        bench.table(f"truth/{name}.csv", take(cars(), slice(0 if name == "two" else 100)))
+        bench.table(f"tracks/{name}.csv", take(cars(), slice(0 if name == "three" else 100)))
+    asked = ("evaluate", bench.folder / "d", "--truth", bench.folder / "truth", "--tracks", bench.folder / "tracks")
+    done = bench.run(*asked, "--json")
+    assert counts(done) == (0.0, 100, 100, 0)
+    assert "two.csv: truth has 0 of 50 frames of two: the others count as frames without objects" in done.stderr
+    assert "three.csv: 100 rows are at no frame of three: left out" in done.stderr
+
+
 def test_only_the_frames_of_a_sparse_truth_are_compared(bench: Bench) -> None:
     """Labels at 2 Hz compare a fifth of the frames, in every figure; a false track counts in these frames alone."""
     truth = cars(np.arange(0, FRAMES, 5) / 10)
@@ -161,6 +185,15 @@ def test_only_the_frames_of_a_sparse_truth_are_compared(bench: Bench) -> None:
     found = bench.evaluate(truth, false)
     assert counts(found) == (0.0, 20, 10, 10)
     assert result_of(found)["classes"]["car"]["gospa"]["all"]["missed"] == pytest.approx(np.sqrt(2.0))
+
+
+def test_a_sparse_truth_is_refused_by_tune(bench: Bench) -> None:
+    """Detections between the labels of a sparse truth are not clutter, so `tune` says what to do instead."""
+    data = bench.table("d.csv", cars(id=None, score=np.full(FRAMES * CARS, 0.9)))
+    truth = bench.table("truth.csv", cars(np.arange(0, FRAMES, 5) / 10))
+    done = bench.run("tune", data, "--truth", truth, "--profile", "auto", "--out", bench.folder / "tuned")
+    assert done.returncode == 2
+    assert "expected a truth of every frame to tune by, received labels in 10 of 50" in done.stderr
 
 
 def test_frames_without_objects_count_where_the_truth_is_dense(bench: Bench) -> None:
@@ -258,12 +291,37 @@ def test_classes_that_are_compared_with_nothing_are_named(bench: Bench) -> None:
     assert "no class is in both: truth has tree, tracks have car" in done.stderr
 
 
-def test_frame_numbers_are_matched(bench: Bench) -> None:
-    """Tables that count frames, of any origin and step, are matched by their numbers with the rate of detections."""
+@pytest.mark.parametrize("stamped", [False, True])
+def test_tables_without_stamps_are_matched_by_the_numbers_of_frames(bench: Bench, *, stamped: bool) -> None:
+    """Numbers of any origin and step, also of a sparse truth, are those of detections with or without stamps."""
     frames = np.repeat(371 + 5 * np.arange(FRAMES), CARS)
     numbered = cars(t=None, frame=frames)
-    detections = {**cars(t=None, id=None, frame=frames), "score": np.full(FRAMES * CARS, 0.9)}
-    assert counts(bench.evaluate(numbered, numbered, detections=detections, options=["rate=50"])) == RIGHT
+    detections = cars(id=None, frame=frames, score=np.full(FRAMES * CARS, 0.9))
+    if not stamped:
+        detections.pop("t")
+    assert counts(bench.evaluate(numbered, numbered, detections=detections)) == RIGHT
+    sparse = take(numbered, np.isin(frames, 371 + 25 * np.arange(10)))
+    assert counts(bench.evaluate(sparse, numbered, detections=detections)) == (100.0, 20, 0, 0)
+    if not stamped:
+        assert counts(bench.evaluate(numbered, numbered, detections=detections, options=["rate=50"])) == RIGHT
+        data, truth = bench.table("d.csv", detections), bench.table("truth.csv", numbered)
+        out = bench.folder / "own.csv"
+        assert bench.run("track", data, "--out", out).returncode == 0
+        assert set(read_table(out)["frame"].tolist()) <= set(frames.tolist())
+        assert counts(bench.run("evaluate", data, "--truth", truth, "--tracks", out, "--json")) == RIGHT
+
+
+def test_own_tracks_of_a_table_in_another_encoding_are_read(bench: Bench) -> None:
+    """Options of encoding and decimals are those of the tables of the user, not of a table of OptiPMB."""
+    paths = []
+    for name, columns in (("d", cars(id=None, score=np.full(FRAMES * CARS, 0.9))), ("truth", cars())):
+        text = bench.table(f"{name}.csv", columns).read_text().replace(",", ";").replace(".", ",")
+        paths.append(bench.folder / f"{name}16.csv")
+        paths[-1].write_text(text, encoding="utf-16")
+    out, options = bench.folder / "own.csv", ["encoding=utf-16", "decimal=,"]
+    assert bench.run("track", paths[0], "--out", out, options=options).returncode == 0
+    asked = ("evaluate", paths[0], "--truth", paths[1], "--tracks", out, "--json")
+    assert counts(bench.run(*asked, options=options)) == RIGHT
 
 
 def test_a_shift_of_all_scores_changes_no_figure(bench: Bench) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from commands import result_of, run_here
 from evaluation_cases import write_kitti
@@ -14,6 +15,7 @@ from optipmb_client.datasets.kitti import KittiSequence
 from optipmb_client.evaluation.figures import Settings, evaluate_figures, load_recordings
 from optipmb_client.results import read_kitti_results
 from optipmb_client.results.kitti import LEAST_SHOWN
+from optipmb_client.table_files import write_table
 from real_data import kitti_root, nuscenes_root
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
@@ -158,14 +160,30 @@ def test_results_without_image_boxes_are_projected(
     expected, said = figures_of(kitti, shown, capsys)
     assert said == ""
     assert expected["Car"]["ab3dmot"]["0.25"]["FP"] > 0
-    for text in ("-1", "0"):
+    for text in ("-1", "0", "table"):
         bare = rewritten(kitti, tmp_path / text, lambda line, text=text: [*line[:6], *[text] * 4, *line[10:]])  # type: ignore[misc]  # its default
+        if text == "table":
+            bare = as_table(kitti, tmp_path / "tracks.parquet")
         found, said = figures_of(kitti, bare, capsys)
         assert "boxes without an image box: their 3D boxes are projected into the image" in said
         for name in CLASSES:
             for limit, result in expected[name]["ab3dmot"].items():
-                assert found[name]["ab3dmot"][limit] == result
+                assert found[name]["ab3dmot"][limit] == pytest.approx(result)
             assert found[name]["hota_2d"]["all"] == pytest.approx(expected[name]["hota_2d"]["all"], abs=1e-4)
+
+
+def as_table(kitti: tuple[Path, Path], path: Path) -> Path:
+    """Write the results as a table of tracks, and give its path."""
+    parts: list[dict[str, Any]] = []
+    for one in open_dataset("kitti", kitti[0]).sequences(["all"]):
+        boxes = read_kitti_results(kitti[1] / f"{one.name}.txt").to_world(one.poses)
+        names = np.array(boxes.labels)[boxes.label]
+        columns = {"sequence": np.full(len(names), one.name), "id": boxes.id, "class": names, "score": boxes.score}
+        columns |= {"stamp_ns": boxes.frame * 100_000_000, "yaw": boxes.yaw}
+        columns |= dict(zip("xyz", boxes.center.T, strict=True)) | dict(zip("lwh", boxes.size.T, strict=True))
+        parts.append(columns)
+    write_table(path, {name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    return path
 
 
 def test_classes_of_kitti_are_matched_without_case(

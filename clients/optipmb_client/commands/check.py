@@ -17,8 +17,7 @@ from optipmb_client.commands.options import (
     print_json,
     print_table,
 )
-from optipmb_client.datasets.motion import MOST_FRAMES, SAME_DIRECTION, Moves, find_moves
-from optipmb_client.geometry import Floats, stack_poses, to_world
+from optipmb_client.datasets.motion import headings_along
 
 KINDS = ("car", "truck", "bus", "trailer", "pedestrian", "bicycle", "motorcycle")
 """Kinds of objects that a profile for unknown detectors tells apart."""
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence as Many
 
     from optipmb_client.datasets import DataSequence
+    from optipmb_client.geometry import Floats
 
 
 def check(
@@ -48,7 +48,9 @@ def check(
         findings: list[dict[str, Any]] = [asdict(one) for one in table.findings]
     else:
         _, chosen = open_sequences(asked, data.sequences)
-        findings = [{"topic": "yaw", "text": _headings(chosen), "option": "", "wrong": False}]
+        share, moves = headings_along(chosen)
+        text = f"{share:.0%} of {moves} moves are along the heading" if moves else "no box moves far enough to compare"
+        findings = [{"topic": "yaw", "text": text, "option": "", "wrong": False}]
     recordings = [_recording(one) for one in chosen]
     classes = _classes(chosen)
     wrong = any(one["wrong"] for one in findings)
@@ -87,28 +89,6 @@ def _classes(sequences: "Many[DataSequence]") -> list[dict[str, Any]]:
         tracked = class_like(name, KINDS) or "other"
         found.append({"class": name, "kind": tracked, "boxes": len(values), "size": size, "scores": scores})
     return found
-
-
-def _headings(sequences: "Many[DataSequence]") -> str:
-    """Compare headings with the motion of the boxes of the first frames."""
-    parts: list[tuple[Floats, ...]] = []
-    names: dict[str, int] = {}
-    for number, sequence in enumerate(sequences):
-        for frame in itertools.islice(sequence.frames(), MOST_FRAMES):
-            rotation, translation = stack_poses([frame.pose])
-            center, yaw = to_world(rotation[0], translation[0], frame.center, frame.yaw)
-            kind = np.array([names.setdefault(label, len(names)) for label in frame.labels], dtype=np.int64)
-            count = np.ones(len(frame))
-            parts.append(
-                (number * count, frame.stamp_ns / 1e9 * count, *center[:, :2].T, yaw, kind[frame.label] * count)
-            )
-    key, seconds, x, y, heading, label = (np.concatenate(column) for column in zip(*parts, strict=True))
-    moves: Moves = find_moves(key.astype(np.int64), seconds, np.column_stack([x, y]), label.astype(np.int64))
-    if not len(moves):
-        return "no box moves far enough to compare headings with motion"
-    off = np.abs(moves.turn(heading[moves.start]))
-    share = float(np.mean(np.minimum(off, np.pi - off) < SAME_DIRECTION))
-    return f"{share:.0%} of {len(moves)} moves are along the heading"
 
 
 def _print(

@@ -191,7 +191,9 @@ class LabelledOptions(DataOptions):
 
     truth: Annotated[
         Path | None,
-        typer.Option("--truth", help="Table of the true objects, for data that are a table.", show_default=False),
+        typer.Option(
+            "--truth", help="Table of the true objects, or a folder of one per recording.", show_default=False
+        ),
     ] = None
 
 

@@ -106,6 +106,8 @@ def _nuscenes(root: Path, detections: str | Path | None, options: _Options) -> D
     _known(options, {"clouds", "z_bottom", "submission"})
     z_bottom = bool(options["z_bottom"]) if "z_bottom" in options else None
     clouds, submission = bool(options.get("clouds", True)), "submission" in options
+    if str(options.get("submission", "default")) != "default":
+        raise DatasetError("--submission", "no score: AMOTA of nuScenes counts all tracks", str(options["submission"]))
     return NuScenesDataset(root, detections, clouds=clouds, z_bottom=z_bottom, submission=submission)
 
 

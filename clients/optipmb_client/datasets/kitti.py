@@ -140,6 +140,11 @@ class KittiSequence:
             frames += [int(fields[0]) for _, fields in rows if fields[0].strip().isdigit()]
         return max(frames, default=-1)
 
+    @property
+    def stamps(self) -> Ints:
+        """(F,) nanoseconds, which need no detections."""
+        return np.arange(len(self), dtype=np.int64) * PERIOD_NS
+
     @cached_property
     def poses(self) -> tuple[Pose, ...]:
         """World from sensor, one per frame, both z up."""

@@ -6,13 +6,18 @@ as near. A move is a chain of such links over `LEAST_MOVE` metres; its direction
 
 import itertools
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from optipmb_client.geometry import Bools, Floats, Ints, wrap_angle
+from optipmb_client.geometry import Bools, Floats, Ints, stack_poses, to_world, wrap_angle
 
-__all__ = ["Moves", "find_moves", "overlapping"]
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from optipmb_client.datasets.interface import DataSequence
+
+__all__ = ["Moves", "find_moves", "headings_along", "overlapping"]
 
 LEAST_MOVE: Final = 1.5
 LONGEST_CHAIN: Final = 15
@@ -21,6 +26,9 @@ REACH: Final = (1.0, 40.0, 12.0)
 """Longest link: metres, plus metres per second of the step, up to a limit."""
 DISTINCT: Final = 1.5
 """A second box of the class must be so many times as far away."""
+SURE_MOVES: Final = 10
+LEAST_ALONG: Final = 0.3
+"""Moves from which headings are refused or doubted, and the share along them below which they are doubted."""
 MOST_FRAMES: Final = 600
 MOST_BOXES: Final = 300
 """Boxes of a frame that are looked at; bounds the work."""
@@ -97,6 +105,25 @@ def find_moves(key: Ints, seconds: Floats, xy: Floats, kind: Ints) -> Moves:
     start, end = _chains(following, xy)
     duration = seconds[end] - seconds[start]
     return Moves(start, end, xy[end] - xy[start], duration, common / pairs if pairs else 0.0)
+
+
+def headings_along(sequences: "Iterable[DataSequence]") -> tuple[float, int]:
+    """Return the share of moves along the headings of the boxes in the first frames, and the number of moves."""
+    parts: list[tuple[Floats, ...]] = []
+    names: dict[str, int] = {}
+    frames = ((number, frame) for number, one in enumerate(sequences) for frame in one.frames())
+    for number, frame in itertools.islice(frames, MOST_FRAMES):
+        rotation, translation = stack_poses([frame.pose])
+        center, yaw = to_world(rotation[0], translation[0], frame.center, frame.yaw)
+        kind = np.array([names.setdefault(label, len(names)) for label in frame.labels], dtype=np.float64)
+        same = np.ones(len(frame))
+        parts.append((number * same, frame.stamp_ns / 1e9 * same, *center[:, :2].T, yaw, kind[frame.label]))
+    if not parts:
+        return 1.0, 0
+    key, seconds, x, y, heading, label = (np.concatenate(column) for column in zip(*parts, strict=True))
+    moves = find_moves(key.astype(np.int64), seconds, np.column_stack([x, y]), label.astype(np.int64))
+    off = np.abs(moves.turn(heading[moves.start]))
+    return float(np.mean(np.minimum(off, np.pi - off) < SAME_DIRECTION)) if len(moves) else 1.0, len(moves)
 
 
 def _linked(before: Ints, after: Ints, xy: Floats, kind: Ints, passed: float) -> tuple[Ints, Ints]:

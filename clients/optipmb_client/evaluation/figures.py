@@ -123,14 +123,16 @@ def load_recordings(
 
 
 def class_average(figures: Sequence[ClassFigures]) -> dict[str, dict[str, float | None]]:
-    """Return HOTA of centres as means over classes (TrackEval: `cls_comb_cls_av`), of all tracks and of the best.
+    """Return HOTA of centres as means over the classes that the truth has, of all tracks and of the best.
 
-    A class without a best threshold has no tracks and counts 0 among the best.
+    It is what TrackEval calls class averaged (`cls_comb_cls_av`). A class without a best threshold has no tracks: 0.
     """
+    known = [one for one in figures if (one.everything.hota.true + one.everything.hota.missed).any()]
     found = {}
-    for key, parts in (("all", [one.everything for one in figures]), ("best", [one.best for one in figures])):
+    for key, parts in (("all", [one.everything for one in known]), ("best", [one.best for one in known])):
         values = [(one.hota.hota, one.hota.deta, one.hota.assa) if one else (0.0, 0.0, 0.0) for one in parts]
-        found[key] = dict(zip(("HOTA", "DetA", "AssA"), map(plain, np.nanmean(values, axis=0).tolist()), strict=True))
+        means = np.mean(values or [(np.nan, np.nan, np.nan)], axis=0).tolist()
+        found[key] = dict(zip(("HOTA", "DetA", "AssA"), map(plain, means), strict=True))
     return found
 
 
@@ -202,11 +204,8 @@ class _Cases:
         self._centres = world(self.near)
         self._cutoff = default_rules(dataset, "distance", settings.cutoff)
         self._sets = world(self._cutoff)
-        labelled = [one.truth.labelled for one in recordings]
-        self._frames = [
-            len(one.sequence) if mask is None else int(mask.sum())
-            for one, mask in zip(recordings, labelled, strict=True)
-        ]
+        pairs = [(one.sequence, one.truth.labelled) for one in recordings]
+        self._frames = [len(sequence) if mask is None else int(mask.sum()) for sequence, mask in pairs]
         self._order = settings.order
 
     def evaluate(self, threshold: float) -> TrackFigures:

@@ -53,7 +53,7 @@ def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
     """Read one sequence into memory: detections of the classes of the parameters, clouds, and the truth.
 
     Raises:
-        DatasetError: it has no truth.
+        DatasetError: it has no truth, or one of some frames only, by which clutter cannot be counted.
         UsageError: it has values that the tracker refuses.
 
     """
@@ -61,6 +61,11 @@ def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
     truth = sequence.truth()
     if truth is None:
         raise DatasetError(f"sequence {sequence.name}", "annotations to compare with", "none")
+    if truth.labelled is not None:
+        received = (
+            f"labels in {int(truth.labelled.sum())} of {len(frames)}: interpolate them, or take detections of these"
+        )
+        raise DatasetError(f"sequence {sequence.name}", "a truth of every frame to tune by", received)
     alike = {name for label in parameters.labels for name in (label, *rules.neighbours.get(label, ()))}
     kept = truth.take(np.isin(truth.names, sorted(alike)))
     rotation, translation = stack_poses(sequence.poses)

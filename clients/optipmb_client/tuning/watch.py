@@ -4,7 +4,7 @@ __all__ = ["Watch"]
 
 
 class Watch:
-    """Told how far a session has come; this one shows nothing."""
+    """Told how far a session has come; this one says nothing."""
 
     def begin(self, name: str, trials: int) -> None:
         """Hear that a class begins, with so many trials."""

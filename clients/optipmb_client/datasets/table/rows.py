@@ -138,7 +138,8 @@ def read_tables(
         columns = _joined([tables[path] for path in members])
         if not columns:
             raise DatasetError(members[0], "a first line with the names of the columns", "no column")
-        boxes = _Table(reading, columns).read(scored=scored)
+        judged = reading if any(lengths) else replace(reading, findings=[])  # rows that are not there tell nothing
+        boxes = _Table(judged, columns).read(scored=scored)
         found |= {path: boxes.rows(start, end) for path, start, end in zip(members, starts, ends, strict=True)}
     return [(path, found[path]) for path in paths]
 
@@ -283,6 +284,8 @@ class _Table:
             values = np.zeros(self._rows)
         if rate is not None:
             return np.round(values * (1e9 / rate)).astype(np.int64), values, column.name
+        if self._rows and "frame" in found and "nanosec" not in found:
+            values = self._first_of_frames(values, series)
         if "nanosec" in found:
             whole = np.asarray(values == np.floor(values))
             self._time.first("time", ~whole, f"whole seconds in column {column.name}", values)
@@ -292,6 +295,20 @@ class _Table:
             stamp = values.astype(np.int64) * 1_000_000_000 + part.astype(np.int64)
             return stamp, stamp, "stamp_ns"
         return read_stamps(reading, values, series, column.unit), values, column.name
+
+    def _first_of_frames(self, values: NDArray[Any], series: Ints) -> NDArray[Any]:
+        """Return the first time of each row's frame, where the frames of the table follow each other in time."""
+        number = np.unique(self._columns[self._found["frame"].name], return_inverse=True)[1]
+        frame = np.unique(series * len(values) + number, return_inverse=True)[1]
+        order = np.lexsort((frame, values, series))
+        begins = np.r_[True, np.diff(frame[order]) != 0]
+        first = np.empty_like(values)
+        first[order] = values[order][np.flatnonzero(begins)[np.cumsum(begins) - 1]]
+        if int(begins.sum()) > frame.max() + 1 or np.array_equal(first, values):
+            return values
+        column = self._found["frame"].name
+        self._reading.note("time", f"stamps differ within a frame: each has the first one of its {column}")
+        return first
 
     def _counted(self, series: Ints, rate: float | None) -> tuple[Ints, NDArray[Any], str]:
         """Return what `_stamps` does from the numbers of frames."""
@@ -326,7 +343,7 @@ class _Table:
         if asked is not None:
             return group_stamps(stamp, series, asked * 1e9) if asked else stamp
         found = frame_starts(stamp, series)
-        if found is not None and crowded(found) < 1.0 - _CROWDED:
+        if found is not None and crowded(found) < 0.5 * _CROWDED:
             apart = (stamp - found).max() / 1e9
             frames = len(np.unique(found))
             text = f"stamps differ by up to {apart:.3g} s within a frame: grouped into {frames} frames"
@@ -415,14 +432,20 @@ class _Table:
             names = np.full(self._rows, NO_CLASS)
             self._reading.note("class", f"no column for class: every box is of class {NO_CLASS}")
         else:
-            names = np.char.strip(self._columns[column.name].astype(np.str_))
+            values = self._columns[column.name]
+            if values.dtype.kind == "f":  # numbers with an empty cell
+                values = np.where(np.isnan(values), "", np.char.mod("%g", values))
+            names = np.char.strip(values.astype(np.str_))
         renamed = {
             key.removeprefix("class."): name for key, name in self._reading.options.items() if key.startswith("class.")
         }
         have = sorted(set(names.tolist()))
         folded = {name.lower(): name for name in renamed}
         for name in renamed if self._rows else ():
-            self._reading.name(f"class.{name}", have, "a class of the table", name)
+            if not name.isdigit():  # classes are counted: a recording need not have all of them
+                self._reading.name(f"class.{name}", have, "a class of the table", name)
+            elif name not in have:
+                self._reading.note("class", f"no box is of class {name}")
         new = {one: renamed[folded[one.lower()]] if one.lower() in folded else one for one in have}
         return np.array([new[name] for name in names.tolist()], dtype=np.str_)
 

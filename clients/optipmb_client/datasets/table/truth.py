@@ -73,8 +73,9 @@ class ObjectTable:
         boxes, times, frames = self.boxes, self.boxes.frame_stamp, stamps
         if boxes.id is None:
             raise DatasetError(self.path, "a column of ids (id, track_id …; --option column.id=NAME)", "none")
-        if numbers is not None and boxes.frame_number is not None and (boxes.frame_number == boxes.frame_time).all():
-            times, frames = boxes.frame_number, numbers
+        counted = [one for one in (boxes.frame_number, numbers) if one is not None and one.dtype.kind in "if"]
+        if len(counted) > 1 and np.array_equal(counted[0], boxes.frame_time):
+            times, frames = counted
         rows = np.flatnonzero(boxes.frame_key[boxes.row] == key)
         known = boxes.id[rows] != NO_ID
         notes = [] if known.all() else [f"{self.path}: {int((~known).sum())} rows with no id, or -1, are left out"]
@@ -86,7 +87,7 @@ class ObjectTable:
             line = self.line(int(rows[twice.min()]))
             raise DatasetError(self.path, "an id once per frame", "an id again at the same stamp", line=line)
         frame = match_stamps(frames, time)
-        order = np.lexsort((np.abs(frames[frame] - time), identity, frame))
+        order = np.lexsort((np.abs(np.append(frames, 0)[frame] - time), identity, frame))
         again = (np.diff(frame[order]) == 0) & (np.diff(identity[order]) == 0) & (frame[order[1:]] >= 0)
         if again.any():
             notes.append(f"{self.path}: of several rows of an object at a frame the nearest counts, in time")
@@ -163,12 +164,12 @@ def truth_at(name: str, stamps: Ints, numbers: NDArray[Any] | None, table: Objec
     boxes, path = table.boxes, table.path
     rows, frame, seen, notes = table.at(key, stamps, numbers)
     outside, count, steps = int((frame < 0).sum()), int(seen.sum()), np.diff(stamps[seen])
-    if outside == len(rows):
+    if outside == len(rows) and outside and len(stamps):
         raise DatasetError(path, f"boxes at the stamps of {name}", "none of its stamps")
     if outside:
         notes.append(f"{path}: {outside} rows are at no frame of {name}: left out")
     rows, frame = rows[outside:], frame[outside:]
-    sparse = count < len(stamps) and (not len(steps) or np.median(steps) >= SPARSE * np.median(np.diff(stamps)))
+    sparse = 0 < count < len(stamps) and (not len(steps) or np.median(steps) >= SPARSE * np.median(np.diff(stamps)))
     if count < len(stamps):
         meaning = "only these are compared" if sparse else "the others count as frames without objects"
         notes.append(f"{path}: truth has {count} of {len(stamps)} frames of {name}: {meaning}")

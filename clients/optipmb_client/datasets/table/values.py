@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from optipmb_client.class_names import class_like
-from optipmb_client.datasets.motion import SAME_DIRECTION, Moves
+from optipmb_client.datasets.motion import LEAST_ALONG, SAME_DIRECTION, SURE_MOVES, Moves
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Ints, wrap_angle
 from optipmb_client.table_files import line_of
@@ -59,12 +59,9 @@ ROUNDING: Final = 1e-3
 FEW: Final = 0.05
 """Share of scores outside 0 to 1 up to which they are mistakes and not of another kind."""
 ENOUGH_MOVES: Final = 5
-SURE_MOVES: Final = 10
-"""Moves from which headings are compared with motion, and from which they are refused."""
+"""Moves from which headings are compared with motion."""
 AGREED: Final = 0.5
 """Share of moves along headings of another convention from which it is likely."""
-SOME: Final = 0.3
-"""Share of moves along headings below which a note says that they disagree."""
 DOUBTFUL: Final = 0.7
 CERTAIN: Final = 0.8
 """Headings are in degrees where fewer moves than the first share are along them in radians, more than the second go
@@ -344,7 +341,7 @@ def read_heading(
         choice = f"--option heading={best}, or heading=x to keep it"
         reading.refuse("yaw", "headings along the motion of the boxes", text, choice)
         return readings[found, axis]
-    doubt = "headings and motion disagree: " if share < SOME else ""
+    doubt = "headings and motion disagree: " if share < LEAST_ALONG else ""
     reading.note("yaw", f"{what.format(found)}: {doubt}{text}", option)
     return readings[found, axis]
 
