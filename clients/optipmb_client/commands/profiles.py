@@ -10,7 +10,7 @@ from rich.text import Text
 
 from optipmb_client.commands.options import AsJson, print_json, print_table, say
 from optipmb_client.errors import UsageError
-from optipmb_client.files import AtomicText
+from optipmb_client.files import write_whole
 
 if TYPE_CHECKING:
     from optipmb_client.offline import FieldOfProfile
@@ -42,9 +42,7 @@ def profiles(
     if copy is not None:
         if copy.exists():
             raise UsageError(f"--copy {copy}: it is there already")
-        file = AtomicText(copy)
-        file.write(offline.profile_source(name))
-        file.close()
+        write_whole(copy, [offline.profile_source(name)])
         say(f"{name} in {copy}; its name field is still {parameters.name!r}")
     elif as_json:
         print_json({"command": "profiles", "profile": parameters.model_dump()})

@@ -15,7 +15,7 @@ from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile
 import numpy as np
 from optipmb_schemas import PATHS, Tracks
 
-from optipmb_client.files import AtomicText, DatasetError
+from optipmb_client.files import DatasetError, write_whole
 from optipmb_client.geometry import Floats, Ints
 from optipmb_client.results.rows import BoxTable, column_shape, stacked
 
@@ -70,12 +70,7 @@ def write_full(path: Path, tracks: Mapping[int, Tracks]) -> None:
         for name, column in columns.items():
             with archive.open(f"{name}.npy", "w") as entry:
                 np.lib.format.write_array(entry, column, allow_pickle=False)
-    file = AtomicText(path)
-    try:
-        file.write_bytes(content.getvalue())
-        file.close()
-    finally:
-        file.discard()
+    write_whole(path, content.getvalue())
 
 
 def read_full(path: Path) -> FullTable:

@@ -21,7 +21,7 @@ from optipmb_schemas import Tracks
 
 from optipmb_client.camera import Camera, alpha_of, kitti_from_sensor, sensor_from_kitti
 from optipmb_client.class_names import class_like
-from optipmb_client.files import AtomicText, DatasetError, numbers, read_rows
+from optipmb_client.files import DatasetError, numbers, read_rows, write_whole
 from optipmb_client.geometry import PoseLike, rotation_of, to_sensor
 from optipmb_client.results.rows import ResultTable, ResultWriter
 
@@ -50,7 +50,6 @@ class KittiResultWriter(ResultWriter):
         self._least = least
         self._lines: list[tuple[int, str, float, bool, str]] = []  # id, class, score, whether the image shows it, text
         self._confirmed: set[int] = set()
-        self._file = AtomicText(path)
 
     def add(self, index: int, pose: PoseLike, tracks: Tracks) -> None:
         """Write the tracks (world frame) of frame `index`, whose sensor stood at `pose`."""
@@ -81,15 +80,12 @@ class KittiResultWriter(ResultWriter):
             if shown and identity in self._confirmed:
                 scores.setdefault(identity, []).append(score)
         mean = {identity: fmean(values) for identity, values in scores.items()}
-        for identity, name, _, shown, line in self._lines:
-            if self._least is None or (shown and mean.get(identity, -1.0) >= self._least[name]):
-                self._file.write(line)
-        self._lines.clear()
-        self._file.close()
-
-    def discard(self) -> None:
-        """Drop what was written."""
-        self._file.discard()
+        lines = (
+            line
+            for identity, name, _, shown, line in self._lines
+            if self._least is None or (shown and mean.get(identity, -1.0) >= self._least[name])
+        )
+        write_whole(self.path, lines)
 
 
 def read_kitti_results(path: Path, labels: Sequence[str] = ()) -> ResultTable:

@@ -9,6 +9,7 @@ Each scene is first a file of its own, `scenes/NAME.json`, in the same layout; a
 `tracking_results.json`. A run that is interrupted leaves the scenes that it finished.
 """
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from optipmb_schemas import Tracks
 
-from optipmb_client.files import AtomicText, DatasetError, read_text
+from optipmb_client.files import DatasetError, read_text, write_whole
 from optipmb_client.geometry import Ints, PoseLike
 from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES, NUSCENES_META, Submission, read_submission
 from optipmb_client.results.rows import ResultTable, ResultWriter, stacked
@@ -44,16 +45,9 @@ def join_scenes(out: Path, scenes: Sequence[str], meta: Mapping[str, Any]) -> No
 
     """
     head = _head(meta)
-    whole = AtomicText(out / NUSCENES_FILE)
-    try:
-        whole.write(head)
-        for i, name in enumerate(scenes):
-            text = read_text(scene_file(out, name), "the results of a scene")
-            whole.write((",\n" if i else "") + text[len(head) : -len(_END)])
-        whole.write(_END)
-        whole.close()
-    finally:
-        whole.discard()
+    texts = (read_text(scene_file(out, name), "the results of a scene") for name in scenes)
+    parts = ((",\n" if i else "") + text[len(head) : -len(_END)] for i, text in enumerate(texts))
+    write_whole(out / NUSCENES_FILE, itertools.chain([head], parts, [_END]))
 
 
 def _head(meta: Mapping[str, Any]) -> str:
@@ -77,7 +71,6 @@ class NuScenesResultWriter(ResultWriter):
         self._samples = samples
         self._head = _head(meta)
         self._lines: dict[int, str] = {}
-        self._file = AtomicText(self.path)
 
     def add(self, index: int, pose: PoseLike, tracks: Tracks) -> None:  # noqa: ARG002  boxes are global
         """Write the tracks (world frame) of frame `index`; the benchmark wants no sensor frame, so no pose.
@@ -124,12 +117,7 @@ class NuScenesResultWriter(ResultWriter):
     def close(self) -> None:
         """Put the file in its place, with an empty list for every sample without tracks."""
         lines = (f"{json.dumps(token)}: {self._lines.get(i, '[]')}" for i, token in enumerate(self._samples))
-        self._file.write(self._head + ",\n".join(lines) + _END)
-        self._file.close()
-
-    def discard(self) -> None:
-        """Drop what was written."""
-        self._file.discard()
+        write_whole(self.path, [self._head, ",\n".join(lines), _END])
 
 
 def read_nuscenes_results(path: Path) -> Submission:

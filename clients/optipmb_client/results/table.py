@@ -95,6 +95,3 @@ class TableResultWriter(ResultWriter):
     def close(self) -> None:
         """Write the file."""
         write_table(self.path, track_columns(self._sequence, self._tracks))
-
-    def discard(self) -> None:
-        """Drop what was taken."""
