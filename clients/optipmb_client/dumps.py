@@ -17,7 +17,6 @@ from optipmb_schemas import (
     Points,
     Pose,
     Tracks,
-    class_fields,
     decode_dump,
 )
 
@@ -122,9 +121,6 @@ def _step(
         cloud=None if given.points is None else optipmb.PointCloud(given.points.xyz, _pose(given.points)),
     )
     found = steps.step(density, frame)
-    columns = track_fields(found.tracks, found.paths)
-    if found.class_probability is not None:
-        columns |= class_fields(found.class_probability)
     Tracks(
         stream=message.stream,
         epoch=message.epoch,
@@ -134,7 +130,7 @@ def _step(
         profile=parameters.name,
         cloud_used=given.points is not None,
         labels=tuple(parameters.classes),
-        **columns,
+        **track_fields(found.tracks, found.paths, found.class_probability),
     )
     return found.density
 

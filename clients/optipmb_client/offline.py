@@ -13,7 +13,7 @@ from statistics import median
 from typing import Any, Final
 
 import numpy as np
-from optipmb_schemas import Tracks, path_fields
+from optipmb_schemas import Tracks, class_fields, path_fields
 
 import optipmb
 from optipmb import (
@@ -40,6 +40,7 @@ from optipmb_client.datasets import DataSequence, DetectionFrame
 from optipmb_client.datasets.interface import DETECTION_COLUMNS
 from optipmb_client.datasets.motion import LEAST_ALONG, SURE_MOVES, headings_along
 from optipmb_client.errors import UsageError
+from optipmb_client.geometry import Floats
 from optipmb_client.recording import selected_frames
 from optipmb_client.smoothing import Smoother
 
@@ -53,7 +54,6 @@ __all__ = [
     "profiles",
     "read_profile",
     "track_fields",
-    "track_sequence",
     "track_whole",
     "tracker_frame",
     "warm_up",
@@ -202,36 +202,6 @@ def _made_for(sequences: Sequence[DataSequence]) -> Parameters:
         raise UsageError(f"--profile {AUTO}: {error}") from error
 
 
-def track_sequence(
-    parameters: Parameters, sequence: DataSequence, classes: Sequence[str] = (), modules: Modules | None = None
-) -> Iterator[tuple[DetectionFrame, Tracks, int, int]]:
-    """Track one sequence.
-
-    Yields each frame with its tracks, how many detections were left out because the profile lacks their class, and the
-    nanoseconds that the step took.
-
-    Raises:
-        UsageError: A frame holds values that the tracker refuses.
-    """
-    for given, frame, result, took in _steps(parameters, sequence, classes, modules):
-        yield given, _message(parameters, sequence, given, result), len(given) - len(frame.score), took
-
-
-def _steps(
-    parameters: Parameters, sequence: DataSequence, classes: Sequence[str], modules: Modules | None
-) -> Iterator[tuple[DetectionFrame, Frame, StepResult, int]]:
-    """Yield what `track_sequence` does, with what the tracker was given and the whole result of each step."""
-    tracker = Tracker(parameters, modules)
-    density = tracker.initial()
-    for given in selected_frames(sequence, classes):
-        frame = tracker_frame(parameters, sequence.name, given)
-        begun = time.perf_counter_ns()
-        result = tracker.step(density, frame)
-        took = time.perf_counter_ns() - begun
-        density = result.density
-        yield given, frame, result, took
-
-
 def tracker_frame(parameters: Parameters, sequence: str, given: DetectionFrame) -> Frame:
     """Return a frame of a sequence for the tracker.
 
@@ -282,11 +252,17 @@ def track_whole(
     least = np.array([one.score_filter for one in parameters.classes.values()])
     names = tuple(parameters.classes)
     smoother = Smoother(parameters) if smooth else None
-    for frame, taken, result, took in _steps(parameters, sequence, classes, modules):
+    tracker = Tracker(parameters, modules)
+    density = tracker.initial()
+    for frame in selected_frames(sequence, classes):
+        taken = tracker_frame(parameters, sequence.name, frame)
+        started = time.perf_counter_ns()
+        result = tracker.step(density, taken)
+        steps.append(time.perf_counter_ns() - started)
+        density = result.density
         found[frame.index] = _message(parameters, sequence, frame, result)
         if smoother is not None:
-            smoother.add(frame.index, result.density, result.tracks)
-        steps.append(took)
+            smoother.add(frame.index, density, result.tracks)
         clouds += frame.cloud is not None
         detections += len(frame)
         if len(taken.source) < len(frame):
@@ -301,14 +277,18 @@ def track_whole(
     return Tracked(found, clouds, detections, dict(left_out), tuple(steps), time.monotonic() - begun)
 
 
-def track_fields(tracks: optipmb.Tracks, paths: PredictedPaths | None) -> dict[str, Any]:
-    """Return tracks and their paths as fields of the message.
+def track_fields(
+    tracks: optipmb.Tracks, paths: PredictedPaths | None, class_probability: Floats | None = None
+) -> dict[str, Any]:
+    """Return tracks, their paths and classes as fields of the message.
 
     Raises:
-        MessageError: The paths hold numbers that no message may.
+        MessageError: Paths or classes hold numbers that no message may.
     """
     fields = dict(tracks.columns()) | {"confirmed": tracks.confirmed.astype(np.int64)}
-    return fields | ({} if paths is None else path_fields(paths.horizons, paths.mean, paths.covariance))
+    if paths is not None:
+        fields |= path_fields(paths.horizons, paths.mean, paths.covariance)
+    return fields if class_probability is None else fields | class_fields(class_probability)
 
 
 def _message(parameters: Parameters, sequence: DataSequence, frame: DetectionFrame, result: StepResult) -> Tracks:
@@ -323,4 +303,4 @@ def _message(parameters: Parameters, sequence: DataSequence, frame: DetectionFra
         "cloud_used": frame.cloud is not None,
         "labels": parameters.labels,
     }
-    return Tracks.trusted(header | track_fields(result.tracks, result.paths))
+    return Tracks.trusted(header | track_fields(result.tracks, result.paths, result.class_probability))
