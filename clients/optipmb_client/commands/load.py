@@ -5,15 +5,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from optipmb_schemas import PREFIX
 
 from optipmb_client.commands.options import (
     AsJson,
-    Config,
-    Connect,
     DatasetOptions,
-    Prefix,
     Profile,
+    ServiceOptions,
     open_sequences,
     print_json,
     print_table,
@@ -22,7 +19,6 @@ from optipmb_client.commands.options import (
 from optipmb_client.errors import UsageError
 from optipmb_client.load import Frames, Load, Run, draw_runs, find_limit, generated, recorded, run_load, table_of
 from optipmb_client.progress import FrameProgress
-from optipmb_client.zenoh import Connection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +43,7 @@ def load(  # noqa: PLR0913  these are the command's options
         float | None, typer.Option(min=0.1, help="What 99 of 100 frames must not exceed; 20 with --find-limit.")
     ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Picture of latency against throughput, a file.")] = None,
-    connect: Connect = None,
-    config: Config = None,
-    prefix: Prefix = PREFIX,
+    service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
     """Send frames of many sensors through a running service, and show how long their tracks take and what is lost.
@@ -69,10 +63,10 @@ def load(  # noqa: PLR0913  these are the command's options
         frames = generated(objects, points, at) if material is None else material
         one = Load(streams, at, seconds, profile)
         with (
-            Connection(connect, config=config) as connection,
+            service.connection() as connection,
             FrameProgress(f"load at {at:.1f} Hz", one.frames * streams) as progress,
         ):
-            result = run_load(connection, one, frames, prefix=prefix, on_frame=progress.advance)
+            result = run_load(connection, one, frames, prefix=service.prefix, on_frame=progress.advance)
             progress.note(
                 f"{at:.1f} Hz: {result.throughput:.0f} frames/s, lost {result.lost},"
                 f" p50 {result.p50_ms:.2f} ms, p99 {result.p99_ms:.2f} ms"

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
+from optipmb_schemas import PREFIX
 from optipmb_schemas.installation import install_command
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
@@ -23,24 +24,22 @@ from optipmb_client.datasets import DATASETS, DataSequence, Dataset, DatasetArgu
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.replay import Pace
 from optipmb_client.table_files import SUFFIXES
-from optipmb_client.zenoh import DEFAULT_ENDPOINT
+from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 
 __all__ = [
     "MANY",
     "RAY_ADDRESS",
     "AsJson",
     "Classes",
-    "Config",
-    "Connect",
     "DataOptions",
     "DatasetOptions",
     "Full",
     "LabelledOptions",
     "Out",
     "PaceOptions",
-    "Prefix",
     "Profile",
     "Ray",
+    "ServiceOptions",
     "Speed",
     "Tracks",
     "executor_of",
@@ -92,20 +91,9 @@ Profile = Annotated[
         "--profile", help="Parameter profile, or auto for a detector that nobody tuned; default: the dataset's own."
     ),
 ]
-Connect = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--connect",
-        metavar="ENDPOINT",
-        help=f"Router or service, several times for several; default: {DEFAULT_ENDPOINT}, or what --config says.",
-        show_default=False,
-    ),
-]
-Config = Annotated[Path | None, typer.Option("--config", help="Zenoh configuration file, for TLS and passwords.")]
 Speed = Annotated[
     str, typer.Option("--speed", help="1: as recorded, 10: ten times as fast, max: as fast as tracks come back.")
 ]
-Prefix = Annotated[str, typer.Option("--prefix", help="First part of all keys, as the service has it.")]
 RAY_ADDRESS: Final = re.compile(r"auto|local|(ray://)?[^\s/]+:\d+")
 """What may follow --ray."""
 Ray = Annotated[
@@ -211,6 +199,29 @@ class PaceOptions:
     def pace(self) -> Pace:
         """Return the pace that is asked for."""
         return Pace(speed_of(self.speed), self.window, self.patience, self.wait)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServiceOptions:
+    """Options that say where a service is."""
+
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--connect",
+            metavar="ENDPOINT",
+            help=f"Router or service, several times for several; default: {DEFAULT_ENDPOINT}, or what --config says.",
+            show_default=False,
+        ),
+    ] = None
+    config: Annotated[
+        Path | None, typer.Option("--config", help="Zenoh configuration file, for TLS and passwords.")
+    ] = None
+    prefix: Annotated[str, typer.Option("--prefix", help="First part of all keys, as the service has it.")] = PREFIX
+
+    def connection(self, timeout: float = 5.0) -> Connection:
+        """Return a connection over Zenoh."""
+        return Connection(self.connect, config=self.config, timeout=timeout)
 
 
 def speed_of(text: str) -> float | None:

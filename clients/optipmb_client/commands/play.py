@@ -6,15 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from optipmb_schemas import PREFIX
 
 from optipmb_client.commands.options import (
     AsJson,
-    Config,
-    Connect,
     Full,
     PaceOptions,
-    Prefix,
+    ServiceOptions,
     mcap_needed,
     print_json,
     say,
@@ -23,7 +20,6 @@ from optipmb_client.commands.options import (
 from optipmb_client.datasets import open_dataset
 from optipmb_client.progress import FrameProgress
 from optipmb_client.recording import Results
-from optipmb_client.zenoh import Connection
 
 if TYPE_CHECKING:
     from optipmb_client.mcap_files.play import PlayedStream
@@ -46,10 +42,8 @@ def play(  # noqa: PLR0913  these are the command's options
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for result files of the tracks.")] = None,
     full: Full = False,
-    connect: Connect = None,
-    config: Config = None,
+    service: ServiceOptions,
     pace: PaceOptions,
-    prefix: Prefix = PREFIX,
     as_json: AsJson = False,
 ) -> None:
     """Play a recording into a running service and compare the tracks with the recorded ones, byte for byte.
@@ -68,7 +62,7 @@ def play(  # noqa: PLR0913  these are the command's options
     if recording.cut:
         typer.echo(f"optipmb: {file} was cut off; everything up to the cut is played", err=True)
     with (
-        Connection(connect, config=config, timeout=pace.wait) as connection,
+        service.connection(pace.wait) as connection,
         FrameProgress("playing", sum(len(one.frames) for one in plans.values())) as progress,
     ):
         results = play_streams(
@@ -78,7 +72,7 @@ def play(  # noqa: PLR0913  these are the command's options
             pace=chosen_pace,
             site=None if as_recorded else f"play-{secrets.token_hex(3)}",
             profile=profile,
-            prefix=prefix,
+            prefix=service.prefix,
             on_frame=progress.advance,
         )
     if out is not None:

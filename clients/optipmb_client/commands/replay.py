@@ -5,19 +5,16 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from optipmb_schemas import PREFIX
 
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
-    Config,
-    Connect,
     DataOptions,
     Full,
     Out,
     PaceOptions,
-    Prefix,
     Profile,
+    ServiceOptions,
     open_sequences,
     print_json,
     say,
@@ -37,11 +34,9 @@ def replay(  # noqa: PLR0913  these are the command's options
     profile: Profile = None,
     classes: Classes = None,
     full: Full = False,
-    connect: Connect = None,
-    config: Config = None,
+    service: ServiceOptions,
     pace: PaceOptions,
     streams: Annotated[int, typer.Option(min=1, help="Sequences sent at the same time.")] = 1,
-    prefix: Prefix = PREFIX,
     as_json: AsJson = False,
 ) -> None:
     """Send a dataset through a running service, collect the tracks, and write its result files.
@@ -57,7 +52,7 @@ def replay(  # noqa: PLR0913  these are the command's options
             "--profile: one that the service knows; auto is made for offline tracking (see: optipmb profiles)"
         )
     with (
-        closing(linked(connect, config=config, timeout=pace.wait)) as connection,
+        closing(linked(service.connect, config=service.config, timeout=pace.wait)) as connection,
         FrameProgress("replaying", sum(map(len, chosen))) as progress,
     ):
         results = replay_sequences(
@@ -69,7 +64,7 @@ def replay(  # noqa: PLR0913  these are the command's options
             pace=chosen_pace,
             classes=classes or (),
             streams=streams,
-            prefix=prefix,
+            prefix=service.prefix,
             full=full,
             on_frame=progress.advance,
         )
