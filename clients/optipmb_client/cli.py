@@ -21,7 +21,7 @@ from optipmb_client.commands.drain import drain
 from optipmb_client.commands.evaluate import evaluate
 from optipmb_client.commands.load import load
 from optipmb_client.commands.move import move
-from optipmb_client.commands.options import MANY, RAY_ADDRESS
+from optipmb_client.commands.options import MANY, RAY_ADDRESS, grouped
 from optipmb_client.commands.play import play
 from optipmb_client.commands.plot import plot
 from optipmb_client.commands.profiles import profiles
@@ -95,7 +95,7 @@ for command in (
     warm_up,
 ):
     paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
-    app.command(cls=_Command, help="\n\n".join(" ".join(part.split()) for part in paragraphs))(command)
+    app.command(cls=_Command, help="\n\n".join(" ".join(part.split()) for part in paragraphs))(grouped(command))
 
 
 def _version(value: bool) -> None:  # noqa: FBT001  the parser calls it so

@@ -7,9 +7,8 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-import numpy as np
 from optipmb_schemas import (
     Detections,
     Dump,
@@ -18,13 +17,12 @@ from optipmb_schemas import (
     Points,
     Pose,
     Tracks,
-    class_fields,
     decode_dump,
-    path_fields,
 )
 
 import optipmb
 from optipmb_client.errors import UsageError
+from optipmb_client.offline import track_fields
 
 __all__ = ["Replayed", "read", "replay"]
 
@@ -125,11 +123,6 @@ def _step(
         cloud=None if given.points is None else optipmb.PointCloud(given.points.xyz, _pose(given.points)),
     )
     found = steps.step(density, frame)
-    columns: dict[str, Any] = dict(found.tracks.columns())
-    if (paths := found.paths) is not None:
-        columns |= path_fields(paths.horizons, paths.mean, paths.covariance)
-    if found.class_probability is not None:
-        columns |= class_fields(found.class_probability)
     Tracks(
         stream=message.stream,
         epoch=message.epoch,
@@ -139,7 +132,7 @@ def _step(
         profile=parameters.name,
         cloud_used=given.points is not None,
         labels=tuple(parameters.classes),
-        **columns | {"confirmed": found.tracks.confirmed.astype(np.int64)},
+        **track_fields(found.tracks, found.paths, found.class_probability),
     )
     return found.density
 

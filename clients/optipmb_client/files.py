@@ -94,47 +94,23 @@ def _number(path: Path, line: int, field: str) -> float:
         raise DatasetError(path, "a number", repr(field), line=line) from error
 
 
-class AtomicText:
-    """A file, of text as a rule, that appears under its name all at once, when it is closed.
-
-    Until then its lines stand in a temporary file in the same folder; `discard` removes that one and leaves what was
-    there.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        self._temporary = Path(name)
-        self._file = os.fdopen(descriptor, "w", encoding="utf-8", newline="\n")
-
-    def write(self, text: str) -> None:
-        """Append text."""
-        self._file.write(text)
-
-    def write_bytes(self, data: bytes) -> None:
-        """Append bytes."""
-        self._file.flush()
-        self._file.buffer.write(data)
-
-    def close(self) -> None:
-        """Put the file in its place; a second call does nothing."""
-        if self._file.closed:
-            return
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
+def write_whole(path: Path, content: bytes | Iterable[str]) -> None:
+    """Write a file of bytes, or of texts one after the other; it appears under its name complete, or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    temporary = Path(name)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.writelines([content] if isinstance(content, bytes) else map(str.encode, content))
+            file.flush()
+            os.fsync(file.fileno())
         # A temporary file is private to its owner; the finished one is to be as readable as any other new file.
         mask = os.umask(0)
         os.umask(mask)
-        self._temporary.chmod(0o666 & ~mask)
-        self._temporary.replace(self.path)
-
-    def discard(self) -> None:
-        """Drop what was written, unless the file is already in its place."""
-        if not self._file.closed:
-            self._file.close()
-            self._temporary.unlink(missing_ok=True)
+        temporary.chmod(0o666 & ~mask)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def remove_unfinished(paths: Iterable[Path]) -> None:

@@ -1,6 +1,5 @@
 """What comes in, served live to Foxglove over a WebSocket: `optipmb watch --foxglove`."""
 
-from types import TracebackType
 from typing import Self
 
 import foxglove
@@ -56,7 +55,5 @@ class FoxgloveServer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

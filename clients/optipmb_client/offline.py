@@ -8,14 +8,14 @@ import itertools
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import median
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
-from optipmb_schemas import path_fields
+from optipmb_schemas import Tracks, class_fields, path_fields
 
+import optipmb
 from optipmb import (
     FieldOfView,
     Frame,
@@ -27,7 +27,6 @@ from optipmb import (
     PredictedPaths,
     StepResult,
     Tracker,
-    Tracks,
     class_indices,
     generic_parameters,
     load_profile,
@@ -38,22 +37,25 @@ from optipmb import (
     warm_up,
 )
 from optipmb_client.datasets import DataSequence, DetectionFrame
+from optipmb_client.datasets.interface import DETECTION_COLUMNS
 from optipmb_client.datasets.motion import LEAST_ALONG, SURE_MOVES, headings_along
 from optipmb_client.errors import UsageError
-from optipmb_client.geometry import Bools, Floats, Ints
+from optipmb_client.geometry import Floats
 from optipmb_client.recording import selected_frames
 from optipmb_client.smoothing import Smoother
 
 __all__ = [
     "AUTO",
-    "NamedTracks",
     "Tracked",
     "doubts",
     "profile_compared",
     "profile_for",
+    "profile_source",
+    "profiles",
     "read_profile",
-    "track_sequence",
+    "track_fields",
     "track_whole",
+    "tracker_frame",
     "warm_up",
 ]
 
@@ -71,120 +73,10 @@ GLANCE: Final = 20
 
 
 @dataclass(frozen=True)
-class NamedTracks:
-    """The tracker's tracks of one frame together with the names that their labels point into."""
-
-    tracks: Tracks
-    labels: tuple[str, ...]
-    paths: PredictedPaths | None = None
-    class_probability: Floats | None = None
-
-    @functools.cached_property
-    def _path_fields(self) -> dict[str, NDArray[Any]]:
-        """The predicted paths as messages have them."""
-        return {} if self.paths is None else path_fields(self.paths.horizons, self.paths.mean, self.paths.covariance)
-
-    @property
-    def horizons(self) -> Floats | None:
-        """(H,) of the predicted paths; this and the next three are None without paths."""
-        return self._path_fields.get("horizons")
-
-    @property
-    def path_position(self) -> Floats | None:
-        """(N, H, 2)."""
-        return self._path_fields.get("path_position")
-
-    @property
-    def path_yaw(self) -> NDArray[np.float32] | None:
-        """(N, H)."""
-        return self._path_fields.get("path_yaw")
-
-    @property
-    def path_covariance(self) -> NDArray[np.float32] | None:
-        """(N, H, 2, 2)."""
-        return self._path_fields.get("path_covariance")
-
-    @property
-    def id(self) -> Ints:
-        """(N,)."""
-        return self.tracks.id
-
-    @property
-    def label(self) -> Ints:
-        """(N,) index into `labels`."""
-        return self.tracks.label
-
-    @property
-    def center(self) -> Floats:
-        """(N, 3)."""
-        return self.tracks.center
-
-    @property
-    def size(self) -> Floats:
-        """(N, 3) length, width, height."""
-        return self.tracks.size
-
-    @property
-    def yaw(self) -> Floats:
-        """(N,)."""
-        return self.tracks.yaw
-
-    @property
-    def velocity(self) -> Floats:
-        """(N, 2)."""
-        return self.tracks.velocity
-
-    @property
-    def score(self) -> Floats:
-        """(N,)."""
-        return self.tracks.score
-
-    @property
-    def confirmed(self) -> Bools:
-        """(N,)."""
-        return self.tracks.confirmed
-
-    @property
-    def existence(self) -> Floats:
-        """(N,)."""
-        return self.tracks.existence
-
-    @property
-    def yaw_rate(self) -> Floats:
-        """(N,)."""
-        return self.tracks.yaw_rate
-
-    @property
-    def acceleration(self) -> Floats:
-        """(N,)."""
-        return self.tracks.acceleration
-
-    @property
-    def covariance(self) -> Floats:
-        """(N, 6, 6)."""
-        return self.tracks.covariance
-
-    @property
-    def age(self) -> Floats:
-        """(N,)."""
-        return self.tracks.age
-
-    @property
-    def time_since_detection(self) -> Floats:
-        """(N,)."""
-        return self.tracks.time_since_detection
-
-    @property
-    def detection(self) -> Ints:
-        """(N,)."""
-        return self.tracks.detection
-
-
-@dataclass(frozen=True)
 class Tracked:
     """The tracks of one sequence by frame index, and what they took."""
 
-    tracks: dict[int, NamedTracks]
+    tracks: dict[int, Tracks]
     clouds: int
     detections: int
     left_out: dict[str, int]
@@ -203,16 +95,6 @@ def read_profile(profile: str) -> Parameters:
         return load_profile(profile)
     except OptipmbError as error:
         raise UsageError(f"--profile {profile}: {error}") from error
-
-
-def profile_names() -> tuple[str, ...]:
-    """Return the names of the profiles that come along."""
-    return profiles()
-
-
-def profile_text(profile: str) -> str:
-    """Return a profile as the text of its TOML file."""
-    return profile_source(profile)
 
 
 @dataclass(frozen=True)
@@ -320,54 +202,26 @@ def _made_for(sequences: Sequence[DataSequence]) -> Parameters:
         raise UsageError(f"--profile {AUTO}: {error}") from error
 
 
-def track_sequence(
-    parameters: Parameters, sequence: DataSequence, classes: Sequence[str] = (), modules: Modules | None = None
-) -> Iterator[tuple[DetectionFrame, NamedTracks, int, int]]:
-    """Track one sequence.
-
-    Yields each frame with its tracks, how many detections were left out because the profile lacks their class, and the
-    nanoseconds that the step took.
+def tracker_frame(parameters: Parameters, sequence: str, given: DetectionFrame) -> Frame:
+    """Return a frame of a sequence for the tracker.
 
     Raises:
-        UsageError: A frame holds values that the tracker refuses.
+        UsageError: It holds values that the tracker refuses.
     """
-    names = tuple(parameters.classes)
-    for given, frame, result, took in _steps(parameters, sequence, classes, modules):
-        left_out = len(given) - len(frame.score)
-        yield given, NamedTracks(result.tracks, names, result.paths, result.class_probability), left_out, took
-
-
-def _steps(
-    parameters: Parameters, sequence: DataSequence, classes: Sequence[str], modules: Modules | None
-) -> Iterator[tuple[DetectionFrame, Frame, StepResult, int]]:
-    """Yield what `track_sequence` does, with what the tracker was given and the whole result of each step."""
-    tracker = Tracker(parameters, modules)
-    density = tracker.initial()
-    for given in selected_frames(sequence, classes):
-        try:
-            cloud = given.cloud
-            frame, _ = make_frame(
-                parameters,
-                stamp_ns=given.stamp_ns,
-                labels=given.labels,
-                label=given.label,
-                center=given.center,
-                size=given.size,
-                yaw=given.yaw,
-                score=given.score,
-                velocity=given.velocity,
-                pose=Pose(given.pose.translation, given.pose.quaternion),
-                cloud=None if cloud is None else PointCloud(cloud.xyz, Pose(cloud.translation, cloud.quaternion)),
-                field_of_view=FieldOfView.of(given.field_of_view, None),
-                position_covariance=given.position_covariance,
-            )
-        except OptipmbError as error:
-            raise UsageError(f"sequence {sequence.name}, frame {given.index}: {error}") from error
-        begun = time.perf_counter_ns()
-        result = tracker.step(density, frame)
-        took = time.perf_counter_ns() - begun
-        density = result.density
-        yield given, frame, result, took
+    cloud = given.cloud
+    try:
+        frame, _ = make_frame(
+            parameters,
+            stamp_ns=given.stamp_ns,
+            labels=given.labels,
+            pose=Pose(*given.pose),
+            cloud=None if cloud is None else PointCloud(cloud.xyz, Pose(cloud.translation, cloud.quaternion)),
+            field_of_view=FieldOfView.of(given.field_of_view, None),
+            **{name: getattr(given, name) for name in DETECTION_COLUMNS},
+        )
+    except OptipmbError as error:
+        raise UsageError(f"sequence {sequence}, frame {given.index}: {error}") from error
+    return frame
 
 
 _warm = functools.cache(warm_up)
@@ -391,18 +245,24 @@ def track_whole(
     """
     _warm()
     begun = time.monotonic()
-    found: dict[int, NamedTracks] = {}
+    found: dict[int, Tracks] = {}
     steps: list[int] = []
     clouds = detections = 0
     left_out: Counter[str] = Counter()
     least = np.array([one.score_filter for one in parameters.classes.values()])
     names = tuple(parameters.classes)
     smoother = Smoother(parameters) if smooth else None
-    for frame, taken, result, took in _steps(parameters, sequence, classes, modules):
-        found[frame.index] = NamedTracks(result.tracks, names, result.paths, result.class_probability)
+    tracker = Tracker(parameters, modules)
+    density = tracker.initial()
+    for frame in selected_frames(sequence, classes):
+        taken = tracker_frame(parameters, sequence.name, frame)
+        started = time.perf_counter_ns()
+        result = tracker.step(density, taken)
+        steps.append(time.perf_counter_ns() - started)
+        density = result.density
+        found[frame.index] = _message(parameters, sequence, frame, result)
         if smoother is not None:
-            smoother.add(frame.index, result.density, result.tracks)
-        steps.append(took)
+            smoother.add(frame.index, density, result.tracks)
         clouds += frame.cloud is not None
         detections += len(frame)
         if len(taken.source) < len(frame):
@@ -411,11 +271,36 @@ def track_whole(
         left_out.update(f"{names[i]} below its score_filter" for i in low)
         on_frame()
     if smoother is not None:
-        found = {index: _with_paths(parameters, NamedTracks(one, names)) for index, one in smoother.tracks()}
+        for index, one in smoother.tracks():
+            paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None
+            found[index] = found[index].model_copy(update=track_fields(one, paths))
     return Tracked(found, clouds, detections, dict(left_out), tuple(steps), time.monotonic() - begun)
 
 
-def _with_paths(parameters: Parameters, named: NamedTracks) -> NamedTracks:
-    """Return tracks with the paths that the profile asks for."""
-    horizons = parameters.horizons
-    return replace(named, paths=predict_tracks(named.tracks, horizons, parameters)) if horizons else named
+def track_fields(
+    tracks: optipmb.Tracks, paths: PredictedPaths | None, class_probability: Floats | None = None
+) -> dict[str, Any]:
+    """Return tracks, their paths and classes as fields of the message.
+
+    Raises:
+        MessageError: Paths or classes hold numbers that no message may.
+    """
+    fields = dict(tracks.columns()) | {"confirmed": tracks.confirmed.astype(np.int64)}
+    if paths is not None:
+        fields |= path_fields(paths.horizons, paths.mean, paths.covariance)
+    return fields if class_probability is None else fields | class_fields(class_probability)
+
+
+def _message(parameters: Parameters, sequence: DataSequence, frame: DetectionFrame, result: StepResult) -> Tracks:
+    """Return the tracks of a frame as the service publishes them, in a session that has no name."""
+    header = {
+        "stream": sequence.name,
+        "epoch": bytes(16),
+        "seq": frame.index,
+        "stamp_ns": frame.stamp_ns,
+        "session": "0" * 32,
+        "profile": parameters.name,
+        "cloud_used": frame.cloud is not None,
+        "labels": parameters.labels,
+    }
+    return Tracks.trusted(header | track_fields(result.tracks, result.paths, result.class_probability))

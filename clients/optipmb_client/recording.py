@@ -4,17 +4,18 @@ Both paths must give the same bytes, so everything that decides about content st
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from optipmb_schemas import Tracks
 
 from optipmb_client.class_names import class_like
 from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame, Truth
 from optipmb_client.datasets.nuscenes import NuScenesDataset
 from optipmb_client.errors import UsageError
-from optipmb_client.results.full import FullRows, full_path, write_full
-from optipmb_client.results.table import TrackColumns, join
+from optipmb_client.results.full import full_path, write_full
+from optipmb_client.results.table import join, track_columns
 from optipmb_client.table_files import Columns, is_table, write_table
 
 __all__ = ["Latency", "Preloaded", "Results", "horizons_for", "latency", "selected_frames"]
@@ -77,16 +78,7 @@ def selected_frames(sequence: DataSequence, classes: Sequence[str]) -> Iterator[
             known = ", ".join(frame.labels)
             raise UsageError(f"sequence {sequence.name} has no detections of class {unknown[0]!r} (it has: {known})")
         rows = np.isin(frame.label, [i for i, name in enumerate(frame.labels) if name in dict(wanted).values()])
-        yield replace(
-            frame,
-            label=frame.label[rows],
-            center=frame.center[rows],
-            size=frame.size[rows],
-            yaw=frame.yaw[rows],
-            score=frame.score[rows],
-            velocity=None if frame.velocity is None else frame.velocity[rows],
-            position_covariance=None if frame.position_covariance is None else frame.position_covariance[rows],
-        )
+        yield frame.take(rows)
 
 
 def horizons_for(out: Path) -> tuple[float, ...] | None:
@@ -117,13 +109,10 @@ class Results:
         self._table = is_table(out) and not out.is_dir()
         self._taken: dict[str, Path | Columns] = {}
 
-    def write(self, sequence: DataSequence, tracks: Mapping[int, FullRows]) -> Path | Columns:
+    def write(self, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path | Columns:
         """Write the tracks of a sequence by frame index; return the file, or its rows of the table of all."""
         if self._table:
-            columns = TrackColumns(sequence, full=self._full)
-            for index, one in tracks.items():
-                columns.add(index, one)
-            return columns.columns()
+            return track_columns(sequence, tracks, full=self._full)
         with self._dataset.writer(self._out, sequence) as writer:
             for index in sorted(tracks):
                 writer.add(index, sequence.poses[index], tracks[index])

@@ -21,6 +21,7 @@ import numpy as np
 from optipmb_schemas import PREFIX, Problem, SessionParameters, Tracks
 
 from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame
+from optipmb_client.datasets.interface import DETECTION_COLUMNS
 from optipmb_client.links import Link
 from optipmb_client.publisher import Publisher
 from optipmb_client.recording import Latency, Results, horizons_for, latency, selected_frames
@@ -236,18 +237,12 @@ class _Replay:
         number = publisher.publish(
             stamp_ns=frame.stamp_ns,
             labels=frame.labels,
-            label=frame.label,
-            center=frame.center,
-            size=frame.size,
-            yaw=frame.yaw,
-            score=frame.score,
-            velocity=frame.velocity,
+            **{name: getattr(frame, name) for name in DETECTION_COLUMNS},
             pose=frame.pose,
             points=None if cloud is None else cloud.xyz,
             points_pose=None if cloud is None else (cloud.translation, cloud.quaternion),
             has_points=cloud is not None,
             field_of_view=frame.field_of_view,
-            position_covariance=frame.position_covariance,
         )
         if self._newest == self.sent - 1:
             self._progress = time.monotonic()  # nothing was under way: patience begins now

@@ -18,7 +18,7 @@ from optipmb_schemas.installation import install_command
 
 from optipmb_client.detector_files import LISTS, frame_files, is_kitti_object, read_frames, read_json, split_boxes
 from optipmb_client.errors import ClientError
-from optipmb_client.files import AtomicText, DatasetError
+from optipmb_client.files import DatasetError, write_whole
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -365,9 +365,4 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
         feather.write_feather(table, content)
     else:
         raise DatasetError(path, f"a table ({', '.join(SUFFIXES)})", f"a file named *{kind}")
-    file = AtomicText(path)
-    try:
-        file.write_bytes(content.getvalue())
-        file.close()
-    finally:
-        file.discard()
+    write_whole(path, content.getvalue())

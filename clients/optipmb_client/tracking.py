@@ -121,7 +121,7 @@ def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Col
         found.left_out,
         (sum(beyond), len(beyond)),
         len({int(number) for one in found.tracks.values() for number in one.id}),
-        len({int(number) for one in found.tracks.values() for number in one.id[one.tracks.confirmed]}),
+        len({int(number) for one in found.tracks.values() for number in one.id[one.confirmed == 1]}),
         found.seconds,
         latency(found.steps_ns),
     ), written

@@ -1,9 +1,10 @@
 """Text files of datasets and results: errors that name the place, and no half files."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from optipmb_client.files import AtomicText, DatasetError, numbers, read_rows
+from optipmb_client.files import DatasetError, numbers, read_rows, write_whole
 
 
 def test_a_number_that_is_none_is_named_with_its_line(tmp_path: Path) -> None:
@@ -43,25 +44,27 @@ def test_a_missing_file_and_bytes_that_are_no_text_are_dataset_errors(tmp_path: 
 
 
 def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
-    """Before close the old content stands; after discard too; after close the new one, and nothing else is left."""
+    """While it is written, and after an error, the old content stands; then the new one, and nothing else is left."""
     path = tmp_path / "out.txt"
     path.write_text("old")
-    dropped = AtomicText(path)
-    dropped.write("half")
+
+    def parts(*, fail: bool) -> Iterator[str]:
+        yield "half"
+        assert path.read_text() == "old"
+        if fail:
+            raise ValueError("half")
+        yield "new\n"
+
+    with pytest.raises(ValueError, match="half"):
+        write_whole(path, parts(fail=True))
     assert path.read_text() == "old"
-    dropped.discard()
-    assert path.read_text() == "old"
-    kept = AtomicText(path)
-    kept.write("new\n")
-    kept.close()
-    kept.close()
-    kept.discard()
-    assert path.read_text() == "new\n"
+    write_whole(path, parts(fail=False))
+    assert path.read_text() == "halfnew\n"
     assert [entry.name for entry in tmp_path.iterdir()] == ["out.txt"]
 
 
 def test_a_finished_file_is_as_readable_as_any_other(tmp_path: Path) -> None:
     """Its permissions are those of an ordinary new file, not those of a private temporary one."""
     (tmp_path / "ordinary").touch()
-    AtomicText(tmp_path / "ours").close()
+    write_whole(tmp_path / "ours", b"")
     assert (tmp_path / "ours").stat().st_mode == (tmp_path / "ordinary").stat().st_mode

@@ -12,7 +12,7 @@ from fusing import FRONT, FUSED, REAR, SIDE, drive
 from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.datasets.fused import FusedSequence
 from optipmb_client.mcap_files.writing import RecordingWriter
-from optipmb_client.offline import track_sequence
+from optipmb_client.offline import track_whole
 from optipmb_schemas import Keys, Tracks, encode, encoding_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
@@ -63,7 +63,7 @@ def tabled(path: Path, frames: list[Detections]) -> Path:
 
 def same(sequence: FusedSequence, wanted: list[Tracks]) -> None:
     """Compare the tracks of a sequence with those of a service, byte for byte."""
-    found = [named for _, named, _, _ in track_sequence(KITTI, sequence)]
+    found = track_whole(KITTI, sequence).tracks.values()
     assert len(found) == len(wanted)
     for ours, theirs in zip(found, wanted, strict=True):
         for name in COLUMNS:

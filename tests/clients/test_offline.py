@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from optipmb_client.datasets import Dataset, open_dataset
 from optipmb_client.errors import UsageError
-from optipmb_client.offline import read_profile, track_sequence
+from optipmb_client.offline import read_profile, track_whole
 from optipmb_client.recording import Preloaded, latency, selected_frames
 from optipmb_client.tracking import track
 from optipmb_schemas import PATHS
@@ -72,7 +72,7 @@ def test_clouds_change_the_tracks(dataset: Dataset) -> None:
     bare = Preloaded(sequence)
     bare._frames = [replace(frame, cloud=None) for frame in bare._frames]
     with_clouds, without = (
-        np.concatenate([tracks.existence for _, tracks, _, _ in track_sequence(parameters, one)])
+        np.concatenate([tracks.existence for tracks in track_whole(parameters, one).tracks.values()])
         for one in (sequence, bare)
     )
     assert with_clouds.shape != without.shape or not np.array_equal(with_clouds, without)
@@ -116,7 +116,7 @@ def test_values_that_the_tracker_refuses_are_placed(dataset: Dataset) -> None:
     loaded = Preloaded(sequence)
     loaded._frames[3] = replace(loaded._frames[3], score=loaded._frames[3].score + 1.0)
     with pytest.raises(UsageError, match=r"sequence 0000, frame 3: score"):
-        list(track_sequence(read_profile("kitti"), loaded))
+        track_whole(read_profile("kitti"), loaded)
 
 
 def test_a_preloaded_sequence_is_the_same(dataset: Dataset) -> None:

@@ -12,9 +12,10 @@ from commands import run_here
 from numpy.typing import NDArray
 from optipmb_client.datasets import DataSequence, open_dataset
 from optipmb_client.geometry import wrap_angle
-from optipmb_client.offline import NamedTracks, read_profile, track_whole
+from optipmb_client.offline import read_profile, track_whole
 from optipmb_client.recording import Preloaded
 from optipmb_client.smoothing import smooth
+from optipmb_schemas import Tracks
 
 from optipmb import load_profile
 from optipmb.heading import turn_around
@@ -59,12 +60,12 @@ def test_states_are_smoothed_as_the_article_has_it(*, turned: bool) -> None:
     assert told[1::3] == pytest.approx((1.5 * 4 - 4) / 8 if turned else 1.0)
 
 
-def tracked(sequence: DataSequence, *, smooth: bool) -> dict[int, NamedTracks]:
+def tracked(sequence: DataSequence, *, smooth: bool) -> dict[int, Tracks]:
     """Track the sequence."""
     return track_whole(read_profile("kitti"), sequence, smooth=smooth).tracks
 
 
-def errors(sequence: DataSequence, tracks: dict[int, NamedTracks]) -> Iterator[tuple[float, float]]:
+def errors(sequence: DataSequence, tracks: dict[int, Tracks]) -> Iterator[tuple[float, float]]:
     """Give the distance from the nearest true object, m, and the error of the heading, rad, for boxes of objects."""
     truth = sequence.truth()
     assert truth is not None

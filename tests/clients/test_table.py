@@ -10,7 +10,7 @@ from commands import result_of, run_here
 from optipmb_client.datasets import DataSequence, DatasetError, open_dataset
 from optipmb_client.datasets.table import TableDataset, TableSequence, match_stamps
 from optipmb_client.datasets.table.names import find_columns
-from optipmb_client.offline import track_sequence
+from optipmb_client.offline import track_whole
 from optipmb_client.table_files import read_table, write_table
 from own_tables import FRAMES, boxes
 
@@ -198,7 +198,7 @@ def test_columns_of_covariances_are_those_of_the_positions(tmp_path: Path) -> No
         assert np.isnan(found[2]).all()
     kitti = load_profile("kitti")
     noisy, plain = (
-        [named for _, named, _, _ in track_sequence(kitti, one)]
+        list(track_whole(kitti, one).tracks.values())
         for one in (sequence, only(TableDataset(table(tmp_path / "b.csv", boxes()))))
     )
     assert noisy[-1].covariance[1, 0, 0] > 1.2 * plain[-1].covariance[1, 0, 0]

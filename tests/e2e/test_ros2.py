@@ -13,7 +13,7 @@ import pytest
 import zenoh
 import zenoh.ext
 from optipmb_client.datasets import DataSequence, open_dataset
-from optipmb_client.offline import read_profile, track_sequence
+from optipmb_client.offline import read_profile, track_whole
 from optipmb_schemas import Keys, SessionParameters, decode
 from optipmb_schemas.ros2.arrays import CLOUD
 from optipmb_schemas.ros2.tracks import HORIZONS, TOPICS, TRACKED
@@ -198,7 +198,7 @@ def test_topics_become_tracks_of_another_node(robot: Robot, scene: DataSequence,
     assert {len(path.path) for path in paths_of(predicted[-1])} == {7}
     assert ids(of_humble) == ids(tracked[-1])
     assert process.process.poll() is not None
-    expected = [step[1] for step in track_sequence(read_profile("scene"), scene)]
+    expected = track_whole(read_profile("scene"), scene).tracks.values()
     assert sum(len(tracks.id) for tracks in expected) > 30
     for index, (message, tracks) in enumerate(zip(tracked, expected, strict=True)):
         assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS + index * 10**8

@@ -13,13 +13,12 @@ import threading
 from concurrent.futures import Future
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import ray
 from ray.exceptions import RayError, RayTaskError
 
-from optipmb_client.bulk.executors import ATTEMPTS
+from optipmb_client.bulk.executors import ATTEMPTS, Executor
 from optipmb_client.bulk.task import Done, Failed, Function, WorkerDiedError, attempt
 from optipmb_client.errors import ClientError
 
@@ -35,7 +34,7 @@ PATIENCE_S: Final = 10.0
 """For the connection to a head."""
 
 
-class RayCluster:
+class RayCluster(Executor):
     """A Ray cluster.
 
     Args:
@@ -47,7 +46,6 @@ class RayCluster:
     """
 
     attempts = 1  # Ray repeats them
-    here = False
 
     def __init__(self, address: str, jobs: int = 0) -> None:
         self._jobs = jobs
@@ -76,7 +74,7 @@ class RayCluster:
             signal.signal(signal.SIGTERM, handler)  # Ray has put its own in the place of the command's
 
     @property
-    def width(self) -> int:
+    def width(self) -> int:  # type: ignore[override]  # nobody sets it
         """Tasks under way at once; a cluster may grow and shrink."""
         return self._jobs or max(1, WAITING * int(ray.cluster_resources().get("CPU", 1)))
 
@@ -100,12 +98,7 @@ class RayCluster:
             raise WorkerDiedError(f"Ray has given up after {ATTEMPTS} attempts ({type(error).__name__})") from error
         return result
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         ray.shutdown()
         self._cleanup()
 

@@ -8,13 +8,13 @@ import signal
 import tempfile
 import threading
 import uuid
+from abc import ABC, abstractmethod
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Protocol, Self
+from typing import Any, Final, Self
 
 from optipmb_client.bulk.task import Done, Failed, Function, WorkerDiedError, attempt
 
@@ -24,27 +24,25 @@ ATTEMPTS: Final = 3
 """How often a task is started whose process dies."""
 
 
-class Executor(Protocol):
+class Executor(ABC):
     """Runs tasks. Use it as a context manager: at its end nothing of it is left, whatever was under way."""
 
-    @property
-    def width(self) -> int:
-        """Tasks that are to be under way at once."""
+    width: int
+    """Tasks that are to be under way at once."""
+    attempts: int
+    """How often the loop starts a task whose process dies."""
+    here = False
+    """Whether tasks run in this process, and share its objects."""
 
-    @property
-    def attempts(self) -> int:
-        """How often the loop starts a task whose process dies."""
-
-    @property
-    def here(self) -> bool:
-        """Whether tasks run in this process, and share its objects."""
-
+    @abstractmethod
     def start(self, function: Function, shared: Any) -> None:
         """Make ready to call `function(shared, task)`; a second call changes what is called."""
 
+    @abstractmethod
     def submit(self, task: Any) -> Future[Any]:
         """Start a task."""
 
+    @abstractmethod
     def take(self, future: Future[Any]) -> Done[Any] | Failed:
         """Return what a task gave; called once for each that has ended.
 
@@ -52,14 +50,14 @@ class Executor(Protocol):
             WorkerDiedError: nothing came back.
         """
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None:  # noqa: B027  not all hold something
+        """End what is under way, and leave nothing of it."""
 
 
-class Here:
+class Here(Executor):
     """One task after the other, in this process."""
 
     width = attempts = 1
@@ -80,16 +78,8 @@ class Here:
         result: Done[Any] | Failed = future.result()
         return result
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Nothing is held."""
-
-
-class Processes:
+class Processes(Executor):
     """So many processes of this machine; each is a pool of its own, so that one that dies takes no other task with it.
 
     Results come back as files: a process that is killed while it sends a large one through a pipe would leave the
@@ -97,7 +87,6 @@ class Processes:
     """
 
     attempts = ATTEMPTS
-    here = False
 
     def __init__(self, width: int) -> None:
         self.width = width
@@ -140,12 +129,7 @@ class Processes:
         file.unlink()
         return result
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._close()
 
     def _new(self) -> ProcessPoolExecutor:

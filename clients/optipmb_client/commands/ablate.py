@@ -9,15 +9,8 @@ from rich.table import Table
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
-    DatasetName,
-    Detections,
-    Options,
+    LabelledOptions,
     Profile,
-    Root,
-    Sequences,
-    Source,
-    Truth,
-    asked_for,
     open_sequences,
     print_json,
     print_table,
@@ -35,15 +28,9 @@ MODULES = ("adp", "habm", "rpp", "ote")
 SHOWN = ("AMOTA", "AMOTP", "FN", "FP", "IDS", "sAMOTA", "MOTA", "MOTP", "HOTA", "HOTA, all")
 
 
-def ablate(  # noqa: PLR0913  these are the command's options
-    data: Source = None,
+def ablate(
+    data: LabelledOptions,
     *,
-    dataset: DatasetName = None,
-    root: Root = None,
-    detections: Detections = None,
-    sequences: Sequences = None,
-    option: Options = None,
-    truth: Truth = None,
     profile: Profile = None,
     classes: Classes = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown.")] = False,
@@ -56,8 +43,8 @@ def ablate(  # noqa: PLR0913  these are the command's options
     from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
     from optipmb_client.offline import profile_compared  # noqa: PLC0415  as above
 
-    asked = asked_for(data, dataset, root, detections, option, truth)
-    opened, chosen = open_sequences(asked, sequences)
+    asked = data.asked()
+    opened, chosen = open_sequences(asked, data.sequences)
     name = profile or opened.profile
     parameters = profile_compared(name, chosen)
     source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, classes)

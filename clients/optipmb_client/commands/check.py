@@ -12,13 +12,7 @@ from rich.table import Table
 from optipmb_client.class_names import class_like
 from optipmb_client.commands.options import (
     AsJson,
-    DatasetName,
-    Detections,
-    Options,
-    Root,
-    Sequences,
-    Source,
-    asked_for,
+    DataOptions,
     open_sequences,
     print_json,
     print_table,
@@ -36,13 +30,8 @@ if TYPE_CHECKING:
 
 
 def check(
-    data: Source = None,
+    data: DataOptions,
     *,
-    dataset: DatasetName = None,
-    root: Root = None,
-    detections: Detections = None,
-    sequences: Sequences = None,
-    option: Options = None,
     as_json: AsJson = False,
 ) -> None:
     """Show how your data are read, without tracking: optipmb check detections.csv.
@@ -50,15 +39,15 @@ def check(
     Units, rate, classes, headings against the motion of the boxes, suspicious rows, and the options that read them
     otherwise. Status 1: track would refuse the data; the findings marked as wrong say why.
     """
-    asked = asked_for(data, dataset, root, detections, option)
+    asked = data.asked()
     if asked.name == "table" and asked.root is not None:
         from optipmb_client.datasets.table import TableDataset  # noqa: PLC0415  packages of an extra
 
         table = TableDataset(Path(asked.root), {name: str(value) for name, value in asked.options}, lenient=True)
-        chosen = list(table.sequences(sequences or ["all"]))
+        chosen = list(table.sequences(data.sequences or ["all"]))
         findings: list[dict[str, Any]] = [asdict(one) for one in table.findings]
     else:
-        _, chosen = open_sequences(asked, sequences)
+        _, chosen = open_sequences(asked, data.sequences)
         share, moves = headings_along(chosen)
         text = f"{share:.0%} of {moves} moves are along the heading" if moves else "no box moves far enough to compare"
         findings = [{"topic": "yaw", "text": text, "option": "", "wrong": False}]

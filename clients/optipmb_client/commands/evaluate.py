@@ -12,15 +12,8 @@ import typer
 from optipmb_client.bulk import Executor, values
 from optipmb_client.commands.options import (
     AsJson,
-    DatasetName,
-    Detections,
-    Options,
+    LabelledOptions,
     Ray,
-    Root,
-    Sequences,
-    Source,
-    Truth,
-    asked_for,
     executor_of,
     open_sequences,
     print_json,
@@ -39,9 +32,8 @@ if TYPE_CHECKING:
 
 
 def evaluate(  # noqa: PLR0913  these are the command's options
-    data: Source = None,
+    data: LabelledOptions,
     *,
-    dataset: DatasetName = None,
     tracks: Annotated[
         list[Path],
         typer.Option(
@@ -49,11 +41,6 @@ def evaluate(  # noqa: PLR0913  these are the command's options
             help="Folder with the result files of track or replay, or a table of tracks; several times: compared.",
         ),
     ],
-    root: Root = None,
-    detections: Detections = None,
-    sequences: Sequences = None,
-    option: Options = None,
-    truth: Truth = None,
     classes: Annotated[
         list[str] | None,
         typer.Option("--class", "--classes", metavar="NAME...", help="Classes to evaluate.", show_default=False),
@@ -85,10 +72,10 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     needed("optipmb evaluate", "evaluation", "scipy")
     from optipmb_client.commands.tables import comparison_tables  # noqa: PLC0415  loads the solvers of scipy
 
-    asked = asked_for(data, dataset, root, detections, option, truth)
+    asked = data.asked()
     if asked.name == "table":
         asked = replace(asked, options=(*asked.options, ("tracks", " ".join(map(str, tracks)))))
-    _, chosen = open_sequences(asked, sequences)
+    _, chosen = open_sequences(asked, data.sequences)
     labels = labels_of(chosen)
     spelt = {label.lower(): label for label in labels}
     names = tuple(one if one in labels else spelt.get(one.lower(), one) for one in classes or labels)

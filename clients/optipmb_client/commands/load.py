@@ -1,22 +1,16 @@
 """`optipmb load`: how much a running service carries."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from optipmb_schemas import PREFIX
 
 from optipmb_client.commands.options import (
     AsJson,
-    Config,
-    Connect,
-    Detections,
-    Options,
-    Prefix,
+    DatasetOptions,
     Profile,
-    Root,
-    Sequences,
-    asked_for,
+    ServiceOptions,
     open_sequences,
     print_json,
     print_table,
@@ -25,7 +19,13 @@ from optipmb_client.commands.options import (
 from optipmb_client.errors import UsageError
 from optipmb_client.load import Frames, Load, Run, draw_runs, find_limit, generated, recorded, run_load, table_of
 from optipmb_client.progress import FrameProgress
-from optipmb_client.zenoh import Connection
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedOptions(DatasetOptions):
+    """Options of recorded frames to send."""
+
+    dataset: Annotated[str | None, typer.Option("--dataset", help="Recorded frames in the place of generated.")] = None
 
 
 def load(  # noqa: PLR0913  these are the command's options
@@ -34,11 +34,7 @@ def load(  # noqa: PLR0913  these are the command's options
     rate: Annotated[float, typer.Option(min=0.1, max=10_000, help="Frames per second of each.")] = 10.0,
     objects: Annotated[int, typer.Option(min=0, max=5000, help="Objects in a generated frame.")] = 40,
     points: Annotated[int, typer.Option(min=0, max=1_000_000, help="Points of a generated cloud; 0: no clouds.")] = 0,
-    dataset: Annotated[str | None, typer.Option("--dataset", help="Recorded frames in the place of generated.")] = None,
-    root: Root = None,
-    detections: Detections = None,
-    sequences: Sequences = None,
-    option: Options = None,
+    data: RecordedOptions,
     clouds: Annotated[bool, typer.Option("--clouds/--no-clouds", help="Send the clouds of recorded frames.")] = True,
     profile: Profile = None,
     seconds: Annotated[float, typer.Option(min=1.0, help="How long one run takes.")] = 20.0,
@@ -47,9 +43,7 @@ def load(  # noqa: PLR0913  these are the command's options
         float | None, typer.Option(min=0.1, help="What 99 of 100 frames must not exceed; 20 with --find-limit.")
     ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Picture of latency against throughput, a file.")] = None,
-    connect: Connect = None,
-    config: Config = None,
-    prefix: Prefix = PREFIX,
+    service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
     """Send frames of many sensors through a running service, and show how long their tracks take and what is lost.
@@ -59,9 +53,8 @@ def load(  # noqa: PLR0913  these are the command's options
     if limit:
         latency_ms = latency_ms or 20.0
     material: Frames | None = None
-    if dataset is not None:
-        asked = asked_for(None, dataset, root, detections, option)
-        opened, chosen = open_sequences(asked, sequences)
+    if data.dataset is not None:
+        opened, chosen = open_sequences(data.asked(), data.sequences)
         material, profile = recorded(chosen, clouds=clouds), profile or opened.profile
         if not len(material):
             raise UsageError("--sequences: they have no frames")
@@ -70,10 +63,10 @@ def load(  # noqa: PLR0913  these are the command's options
         frames = generated(objects, points, at) if material is None else material
         one = Load(streams, at, seconds, profile)
         with (
-            Connection(connect, config=config) as connection,
+            service.connection() as connection,
             FrameProgress(f"load at {at:.1f} Hz", one.frames * streams) as progress,
         ):
-            result = run_load(connection, one, frames, prefix=prefix, on_frame=progress.advance)
+            result = run_load(connection, one, frames, prefix=service.prefix, on_frame=progress.advance)
             progress.note(
                 f"{at:.1f} Hz: {result.throughput:.0f} frames/s, lost {result.lost},"
                 f" p50 {result.p50_ms:.2f} ms, p99 {result.p99_ms:.2f} ms"

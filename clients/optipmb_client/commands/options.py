@@ -2,15 +2,18 @@
 
 import contextlib
 import dataclasses
+import inspect
 import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
+from optipmb_schemas import PREFIX
 from optipmb_schemas.installation import install_command
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
@@ -19,40 +22,34 @@ from optipmb_client.bulk import Executor, executor_for
 from optipmb_client.columns import parts
 from optipmb_client.datasets import DATASETS, DataSequence, Dataset, DatasetArguments, dataset_at
 from optipmb_client.errors import ClientError, UsageError
+from optipmb_client.replay import Pace
 from optipmb_client.table_files import SUFFIXES
-from optipmb_client.zenoh import DEFAULT_ENDPOINT
+from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 
 __all__ = [
     "MANY",
     "RAY_ADDRESS",
     "AsJson",
     "Classes",
-    "Config",
-    "Connect",
-    "DatasetName",
-    "Detections",
+    "DataOptions",
+    "DatasetOptions",
     "Full",
-    "Options",
+    "LabelledOptions",
     "Out",
-    "Patience",
-    "Prefix",
+    "PaceOptions",
     "Profile",
     "Ray",
-    "Root",
-    "Sequences",
-    "Source",
+    "ServiceOptions",
     "Speed",
     "Tracks",
-    "Truth",
-    "Wait",
-    "Window",
-    "asked_for",
     "executor_of",
+    "grouped",
     "mcap_needed",
     "open_sequences",
     "print_json",
     "print_table",
     "say",
+    "speed_of",
     "warn",
 ]
 
@@ -62,40 +59,9 @@ WORTH_PROCESSES: Final = 3000
 WIDE = 200
 MANY = ("--sequences", "--classes", "--class", "--streams")  # options that take several values after one flag
 
-Source = Annotated[
-    Path | None,
-    typer.Argument(
-        metavar="[DATA]",
-        help="Your data: a table (CSV, Parquet, JSON Lines, Feather) or a folder of them, a bag of ROS 2, a recording "
-        "(.mcap), or a folder of KITTI or nuScenes. In the place of --dataset and --root.",
-        show_default=False,
-    ),
-]
-DatasetName = Annotated[
-    str | None,
-    typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False),
-]
-Truth = Annotated[
-    Path | None,
-    typer.Option("--truth", help="Table of the true objects, or a folder of one per recording.", show_default=False),
-]
-Root = Annotated[Path | None, typer.Option("--root", help="File or folder of the dataset; scenes need none.")]
-Detections = Annotated[
-    str | None, typer.Option("--detections", help="Detector: name of a folder in detections/, or a path.")
-]
-Sequences = Annotated[
-    list[str] | None,
-    typer.Option("--sequences", metavar="NAME...", help="Sequences, splits, or all.", show_default=False),
-]
 Classes = Annotated[
     list[str] | None,
     typer.Option("--classes", metavar="NAME...", help="Only objects of these classes.", show_default=False),
-]
-Options = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--option", metavar="NAME=VALUE", help="Option of the dataset: frames=50 of a scene, yaw=degrees of a table."
-    ),
 ]
 Tracks = Annotated[
     Path, typer.Option("--tracks", help="Folder with the result files of track or replay, or a table of tracks.")
@@ -125,23 +91,9 @@ Profile = Annotated[
         "--profile", help="Parameter profile, or auto for a detector that nobody tuned; default: the dataset's own."
     ),
 ]
-Connect = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--connect",
-        metavar="ENDPOINT",
-        help=f"Router or service, several times for several; default: {DEFAULT_ENDPOINT}, or what --config says.",
-        show_default=False,
-    ),
-]
-Config = Annotated[Path | None, typer.Option("--config", help="Zenoh configuration file, for TLS and passwords.")]
 Speed = Annotated[
     str, typer.Option("--speed", help="1: as recorded, 10: ten times as fast, max: as fast as tracks come back.")
 ]
-Window = Annotated[int, typer.Option("--window", min=1, help="Frames under way at most, with --speed max.")]
-Wait = Annotated[float, typer.Option("--wait", min=0.0, help="Seconds to wait for a service at the start.")]
-Patience = Annotated[float, typer.Option("--patience", min=1.0, help="End when no tracks come for so many seconds.")]
-Prefix = Annotated[str, typer.Option("--prefix", help="First part of all keys, as the service has it.")]
 RAY_ADDRESS: Final = re.compile(r"auto|local|(ray://)?[^\s/]+:\d+")
 """What may follow --ray."""
 Ray = Annotated[
@@ -157,32 +109,152 @@ Ray = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
-def asked_for(
-    source: Path | None,
-    dataset: str | None,
-    root: Path | None,
-    detections: str | None,
-    options: list[str] | None,
-    truth: Path | None = None,
-) -> DatasetArguments:
-    """Return which data the options of a command name.
+@dataclass(frozen=True, kw_only=True)
+class DatasetOptions:
+    """Options that name a dataset and what is used of it."""
 
-    Raises:
-        DatasetError: The source looks like no data that are known.
-        UsageError: No data are named, or two, or an option is not `NAME=VALUE`.
-    """
-    if source is not None:
-        if root is not None:
-            raise UsageError(f"{source} and --root {root}: one of them names the data")
-        dataset, root = dataset or dataset_at(source), source
-    if dataset is None:
-        raise UsageError("no data: name a table, a recording or a folder, or give --dataset and --root")
-    chosen = dict(_option(text) for text in options or ())
-    if truth is not None:
-        if dataset != "table":
-            raise UsageError(f"--truth: for tables; {dataset} has annotations of its own")
-        chosen["truth"] = str(truth)
-    return DatasetArguments(dataset, root, detections, tuple(chosen.items()))
+    data: Path | None = field(default=None, init=False)
+    dataset: Annotated[
+        str | None,
+        typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False),
+    ] = None
+    root: Annotated[Path | None, typer.Option("--root", help="File or folder of the dataset; scenes need none.")] = None
+    detections: Annotated[
+        str | None, typer.Option("--detections", help="Detector: name of a folder in detections/, or a path.")
+    ] = None
+    sequences: Annotated[
+        list[str] | None,
+        typer.Option("--sequences", metavar="NAME...", help="Sequences, splits, or all.", show_default=False),
+    ] = None
+    option: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--option",
+            metavar="NAME=VALUE",
+            help="Option of the dataset: frames=50 of a scene, yaw=degrees of a table.",
+        ),
+    ] = None
+    truth: Path | None = field(default=None, init=False)
+
+    def asked(self, *more: str) -> DatasetArguments:
+        """Return which data are named, with `more` options NAME=VALUE.
+
+        Raises:
+            DatasetError: The argument looks like no data that are known.
+            UsageError: No data are named, or two, or an option is not `NAME=VALUE`.
+        """
+        dataset, root = self.dataset, self.root
+        if self.data is not None:
+            if root is not None:
+                raise UsageError(f"{self.data} and --root {root}: one of them names the data")
+            dataset, root = dataset or dataset_at(self.data), self.data
+        if dataset is None:
+            raise UsageError("no data: name a table, a recording or a folder, or give --dataset and --root")
+        chosen = dict(_option(text) for text in (*(self.option or ()), *more))
+        if self.truth is not None:
+            if dataset != "table":
+                raise UsageError(f"--truth: for tables; {dataset} has annotations of its own")
+            chosen["truth"] = str(self.truth)
+        return DatasetArguments(dataset, root, self.detections, tuple(chosen.items()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataOptions(DatasetOptions):
+    """Options of a dataset, which an argument may name too."""
+
+    data: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[DATA]",
+            help="Your data: a table (CSV, Parquet, JSON Lines, Feather) or a folder of them, a bag of ROS 2, a "
+            "recording (.mcap), or a folder of KITTI or nuScenes. In the place of --dataset and --root.",
+            show_default=False,
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelledOptions(DataOptions):
+    """Options of data whose truth is needed."""
+
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            "--truth", help="Table of the true objects, or a folder of one per recording.", show_default=False
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaceOptions:
+    """Options of how fast frames are sent."""
+
+    speed: Speed = "max"
+    window: Annotated[int, typer.Option("--window", min=1, help="Frames under way at most, with --speed max.")] = 8
+    wait: Annotated[float, typer.Option("--wait", min=0.0, help="Seconds to wait for a service at the start.")] = 10.0
+    patience: Annotated[
+        float, typer.Option("--patience", min=1.0, help="End when no tracks come for so many seconds.")
+    ] = 30.0
+
+    def pace(self) -> Pace:
+        """Return the pace that is asked for."""
+        return Pace(speed_of(self.speed), self.window, self.patience, self.wait)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServiceOptions:
+    """Options that say where a service is."""
+
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--connect",
+            metavar="ENDPOINT",
+            help=f"Router or service, several times for several; default: {DEFAULT_ENDPOINT}, or what --config says.",
+            show_default=False,
+        ),
+    ] = None
+    config: Annotated[
+        Path | None, typer.Option("--config", help="Zenoh configuration file, for TLS and passwords.")
+    ] = None
+    prefix: Annotated[str, typer.Option("--prefix", help="First part of all keys, as the service has it.")] = PREFIX
+
+    def connection(self, timeout: float = 5.0) -> Connection:
+        """Return a connection over Zenoh."""
+        return Connection(self.connect, config=self.config, timeout=timeout)
+
+
+def speed_of(text: str) -> float | None:
+    """Return the multiple of the recorded rate that an option asks for; None for `max`."""
+    if text == "max":
+        return None
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = 0.0
+    if not 0.0 < speed < float("inf"):
+        raise typer.BadParameter(f"a positive number, or max, received {text!r}", param_hint="--speed")
+    return speed
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command with the options of its groups as parameters of its own, which is how typer reads them."""
+    given = inspect.signature(command, eval_str=True).parameters
+    groups = {name: one.annotation for name, one in given.items() if hasattr(one.annotation, "__dataclass_fields__")}
+    members = {
+        name: list(inspect.signature(group, eval_str=True).parameters.values()) for name, group in groups.items()
+    }
+
+    def call(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{one.name: values.pop(one.name) for one in members[name]})
+        command(**values)
+
+    spread = [one for name, whole in given.items() for one in members.get(name, [whole])]
+    own = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in spread]
+    call.__dict__["__signature__"] = inspect.Signature(own)
+    call.__name__, call.__doc__ = command.__name__, command.__doc__
+    return call
 
 
 def open_sequences(asked: DatasetArguments, sequences: list[str] | None) -> tuple[Dataset, list[DataSequence]]:

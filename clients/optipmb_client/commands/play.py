@@ -6,29 +6,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from optipmb_schemas import PREFIX
 
 from optipmb_client.commands.options import (
     AsJson,
-    Config,
-    Connect,
     Full,
-    Patience,
-    Prefix,
-    Speed,
-    Wait,
-    Window,
+    PaceOptions,
+    ServiceOptions,
     mcap_needed,
     print_json,
     say,
     warn,
 )
-from optipmb_client.commands.replay import speed_of
 from optipmb_client.datasets import open_dataset
 from optipmb_client.progress import FrameProgress
 from optipmb_client.recording import Results
-from optipmb_client.replay import Pace
-from optipmb_client.zenoh import Connection
 
 if TYPE_CHECKING:
     from optipmb_client.mcap_files.play import PlayedStream
@@ -51,13 +42,8 @@ def play(  # noqa: PLR0913  these are the command's options
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for result files of the tracks.")] = None,
     full: Full = False,
-    connect: Connect = None,
-    config: Config = None,
-    speed: Speed = "max",
-    window: Window = 8,
-    wait: Wait = 10.0,
-    patience: Patience = 30.0,
-    prefix: Prefix = PREFIX,
+    service: ServiceOptions,
+    pace: PaceOptions,
     as_json: AsJson = False,
 ) -> None:
     """Play a recording into a running service and compare the tracks with the recorded ones, byte for byte.
@@ -70,23 +56,23 @@ def play(  # noqa: PLR0913  these are the command's options
         from optipmb_client.mcap_files.play import choose  # noqa: PLC0415  as above
         from optipmb_client.mcap_files.play import play as play_streams  # noqa: PLC0415  as above
         from optipmb_client.mcap_files.reading import RecordingFile  # noqa: PLC0415  packages of an extra
-    pace = Pace(speed_of(speed), window, patience, wait)
+    chosen_pace = pace.pace()
     recording = RecordingFile(file)
     plans = choose(recording, streams or ())
     if recording.cut:
         typer.echo(f"optipmb: {file} was cut off; everything up to the cut is played", err=True)
     with (
-        Connection(connect, config=config, timeout=wait) as connection,
+        service.connection(pace.wait) as connection,
         FrameProgress("playing", sum(len(one.frames) for one in plans.values())) as progress,
     ):
         results = play_streams(
             connection,
             recording,
             plans,
-            pace=pace,
+            pace=chosen_pace,
             site=None if as_recorded else f"play-{secrets.token_hex(3)}",
             profile=profile,
-            prefix=prefix,
+            prefix=service.prefix,
             on_frame=progress.advance,
         )
     if out is not None:

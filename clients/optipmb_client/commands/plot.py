@@ -8,14 +8,7 @@ import typer
 from optipmb_client.commands.evaluate import labels_of
 from optipmb_client.commands.options import (
     AsJson,
-    DatasetName,
-    Detections,
-    Options,
-    Root,
-    Sequences,
-    Source,
-    Truth,
-    asked_for,
+    LabelledOptions,
     open_sequences,
     print_json,
     say,
@@ -23,10 +16,9 @@ from optipmb_client.commands.options import (
 from optipmb_client.errors import UsageError
 
 
-def plot(  # noqa: PLR0913  these are the command's options
-    data: Source = None,
+def plot(
+    data: LabelledOptions,
     *,
-    dataset: DatasetName = None,
     tracks: Annotated[
         list[Path],
         typer.Option(
@@ -35,11 +27,6 @@ def plot(  # noqa: PLR0913  these are the command's options
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="The PNG file, or a GIF file of a moving picture.")],
-    root: Root = None,
-    detections: Detections = None,
-    sequences: Sequences = None,
-    option: Options = None,
-    truth: Truth = None,
     score: Annotated[float | None, typer.Option(help="Least mean score of a track; default: the best one.")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -49,8 +36,8 @@ def plot(  # noqa: PLR0913  these are the command's options
 
     if out.suffix == ".gif" and len(tracks) > 1:
         raise UsageError(f"--out {out}: a moving picture shows one --tracks, received {len(tracks)}; name a PNG file")
-    asked = asked_for(data, dataset, root, detections, option, truth)
-    _, chosen = open_sequences(asked, sequences)
+    asked = data.asked()
+    _, chosen = open_sequences(asked, data.sequences)
     if len(chosen) != 1:
         raise UsageError(f"--sequences: one sequence makes a picture, received {len(chosen)}")
     (sequence,) = chosen

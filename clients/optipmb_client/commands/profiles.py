@@ -10,7 +10,7 @@ from rich.text import Text
 
 from optipmb_client.commands.options import AsJson, print_json, print_table, say
 from optipmb_client.errors import UsageError
-from optipmb_client.files import AtomicText
+from optipmb_client.files import write_whole
 
 if TYPE_CHECKING:
     from optipmb_client.offline import FieldOfProfile
@@ -35,23 +35,21 @@ def profiles(
 
     if name is None:
         if copy is not None or explain:
-            raise UsageError("which profile? " + ", ".join(offline.profile_names()))
+            raise UsageError("which profile? " + ", ".join(offline.profiles()))
         _list(as_json=as_json)
         return
     parameters = offline.read_profile(name)
     if copy is not None:
         if copy.exists():
             raise UsageError(f"--copy {copy}: it is there already")
-        file = AtomicText(copy)
-        file.write(offline.profile_text(name))
-        file.close()
+        write_whole(copy, [offline.profile_source(name)])
         say(f"{name} in {copy}; its name field is still {parameters.name!r}")
     elif as_json:
         print_json({"command": "profiles", "profile": parameters.model_dump()})
     elif explain:
         print_table(Group(*(Text(_line(field)) for field in offline.fields_of(parameters))))
     else:
-        say(offline.profile_text(name).rstrip())
+        say(offline.profile_source(name).rstrip())
 
 
 def _line(field: "FieldOfProfile") -> str:
@@ -62,7 +60,7 @@ def _line(field: "FieldOfProfile") -> str:
 def _list(*, as_json: bool) -> None:
     from optipmb_client import offline  # noqa: PLC0415  as above
 
-    known = {one: offline.read_profile(one) for one in offline.profile_names()}
+    known = {one: offline.read_profile(one) for one in offline.profiles()}
     if as_json:
         print_json({"command": "profiles", "profiles": {one: list(it.labels) for one, it in known.items()}})
         return

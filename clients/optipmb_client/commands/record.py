@@ -9,18 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from optipmb_schemas import PREFIX
 
-from optipmb_client.commands.options import AsJson, Config, Connect, Prefix, mcap_needed, print_json, say
+from optipmb_client.commands.options import AsJson, ServiceOptions, mcap_needed, print_json, say
 from optipmb_client.errors import UsageError
 from optipmb_client.progress import StatusLine
-from optipmb_client.zenoh import Connection
 
 if TYPE_CHECKING:
     from optipmb_client.mcap_files.record import Recording
 
 
-def record(  # noqa: PLR0913  these are the command's options
+def record(
     *,
     out: Annotated[Path, typer.Option("--out", help="The MCAP file; it must not be there yet.")],
     streams: Annotated[
@@ -31,10 +29,8 @@ def record(  # noqa: PLR0913  these are the command's options
     duration: Annotated[
         float | None, typer.Option(min=0.1, help="End after so many seconds. Default: at SIGINT or SIGTERM.")
     ] = None,
-    connect: Connect = None,
-    config: Config = None,
+    service: ServiceOptions,
     timeout: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a router.")] = 5.0,
-    prefix: Prefix = PREFIX,
     as_json: AsJson = False,
 ) -> None:
     """Record everything on the keys of streams: detections, clouds, tracks, problems, and the parameters in force.
@@ -46,11 +42,11 @@ def record(  # noqa: PLR0913  these are the command's options
         from optipmb_client.mcap_files.record import record as record_streams  # noqa: PLC0415  packages of an extra
     patterns = streams or ["*/*/*"]
     stop = threading.Event()
-    about = {"made_by": f"optipmb {version('optipmb')}", "prefix": prefix, "streams": " ".join(patterns)}
+    about = {"made_by": f"optipmb {version('optipmb')}", "prefix": service.prefix, "streams": " ".join(patterns)}
     if out.exists():
         raise UsageError(f"--out: expected a new file, there is {out} already")
     with (
-        Connection(connect, config=config, timeout=timeout) as connection,
+        service.connection(timeout) as connection,
         _ended_by(stop),
         StatusLine() as progress,
     ):
@@ -61,7 +57,7 @@ def record(  # noqa: PLR0913  these are the command's options
             stop=stop,
             points=points,
             duration=duration,
-            prefix=prefix,
+            prefix=service.prefix,
             about=about,
             on_flush=lambda so_far: progress.show(_line(so_far, duration)),
         )

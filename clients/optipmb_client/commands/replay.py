@@ -5,28 +5,16 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from optipmb_schemas import PREFIX
 
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
-    Config,
-    Connect,
-    DatasetName,
-    Detections,
+    DataOptions,
     Full,
-    Options,
     Out,
-    Patience,
-    Prefix,
+    PaceOptions,
     Profile,
-    Root,
-    Sequences,
-    Source,
-    Speed,
-    Wait,
-    Window,
-    asked_for,
+    ServiceOptions,
     open_sequences,
     print_json,
     say,
@@ -35,46 +23,36 @@ from optipmb_client.errors import UsageError
 from optipmb_client.links import linked
 from optipmb_client.progress import FrameProgress
 from optipmb_client.recording import latency
-from optipmb_client.replay import Pace, ReplayedSequence
+from optipmb_client.replay import ReplayedSequence
 from optipmb_client.replay import replay as replay_sequences
 
 
 def replay(  # noqa: PLR0913  these are the command's options
-    data: Source = None,
+    data: DataOptions,
     *,
-    dataset: DatasetName = None,
-    root: Root = None,
-    detections: Detections = None,
-    sequences: Sequences = None,
-    option: Options = None,
     out: Out = Path("out/replay"),
     profile: Profile = None,
     classes: Classes = None,
     full: Full = False,
-    connect: Connect = None,
-    config: Config = None,
-    speed: Speed = "max",
+    service: ServiceOptions,
+    pace: PaceOptions,
     streams: Annotated[int, typer.Option(min=1, help="Sequences sent at the same time.")] = 1,
-    window: Window = 8,
-    wait: Wait = 10.0,
-    patience: Patience = 30.0,
-    prefix: Prefix = PREFIX,
     as_json: AsJson = False,
 ) -> None:
     """Send a dataset through a running service, collect the tracks, and write its result files.
 
     The profile is one that the service knows. Ends with status 1 when tracks of some frames did not come back.
     """
-    pace = Pace(speed_of(speed), window, patience, wait)
-    asked = asked_for(data, dataset, root, detections, option)
-    opened, chosen = open_sequences(asked, sequences)
+    chosen_pace = pace.pace()
+    asked = data.asked()
+    opened, chosen = open_sequences(asked, data.sequences)
     name = profile or opened.profile
     if name == "auto":
         raise UsageError(
             "--profile: one that the service knows; auto is made for offline tracking (see: optipmb profiles)"
         )
     with (
-        closing(linked(connect, config=config, timeout=wait)) as connection,
+        closing(linked(service.connect, config=service.config, timeout=pace.wait)) as connection,
         FrameProgress("replaying", sum(map(len, chosen))) as progress,
     ):
         results = replay_sequences(
@@ -83,10 +61,10 @@ def replay(  # noqa: PLR0913  these are the command's options
             chosen,
             out,
             profile=name,
-            pace=pace,
+            pace=chosen_pace,
             classes=classes or (),
             streams=streams,
-            prefix=prefix,
+            prefix=service.prefix,
             full=full,
             on_frame=progress.advance,
         )
@@ -124,19 +102,6 @@ def complain(results: list[ReplayedSequence]) -> None:
             typer.echo(text, err=True)
     if missing or clouds:
         raise typer.Exit(1)
-
-
-def speed_of(text: str) -> float | None:
-    """Return the multiple of the recorded rate that an option asks for; None for `max`."""
-    if text == "max":
-        return None
-    try:
-        speed = float(text)
-    except ValueError:
-        speed = 0.0
-    if not 0.0 < speed < float("inf"):
-        raise typer.BadParameter(f"a positive number, or max, received {text!r}", param_hint="--speed")
-    return speed
 
 
 def _line(result: ReplayedSequence) -> str:

@@ -6,12 +6,12 @@ import time
 from typing import Annotated
 
 import typer
-from optipmb_schemas import PREFIX, encode_json
+from optipmb_schemas import encode_json
 from rich.console import Console
 from rich.live import Live
 
 from optipmb_client.board import Board
-from optipmb_client.commands.options import AsJson, Config, Connect, Prefix, print_json, print_table
+from optipmb_client.commands.options import AsJson, ServiceOptions, print_json, print_table
 from optipmb_client.errors import ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
 from optipmb_client.sessions import find_services
 from optipmb_client.status import render
@@ -19,11 +19,9 @@ from optipmb_client.zenoh import Connection
 
 
 def status(
-    connect: Connect = None,
-    config: Config = None,
     timeout: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a router, and for a service.")] = 2.0,
-    prefix: Prefix = PREFIX,
     *,
+    service: ServiceOptions,
     watch: Annotated[bool, typer.Option("--watch", help="Update until Ctrl-C, the worst streams on top.")] = False,
     interval: Annotated[float, typer.Option(min=0.1, help="Seconds between updates, with --watch.")] = 1.0,
     as_json: AsJson = False,
@@ -31,15 +29,15 @@ def status(
     """Show the services that are alive, their streams, rates and latencies, and their newest problems."""
     if watch and as_json:
         raise UsageError("--watch: draws for people; for programs ask again and again with --json")
-    with Connection(connect, config=config, timeout=timeout) as connection:
+    with service.connection(timeout) as connection:
         if watch:
-            _watch(connection, prefix, interval)
+            _watch(connection, service.prefix, interval)
             return
-        services = find_services(connection, prefix=prefix, patience_s=timeout)
+        services = find_services(connection, prefix=service.prefix, patience_s=timeout)
     if not services:
-        raise ServiceUnavailable(f"no tracking service is alive at {connection.where} (prefix {prefix})")
+        raise ServiceUnavailable(f"no tracking service is alive at {connection.where} (prefix {service.prefix})")
     if as_json:
-        print_json({"command": "status", "services": [json.loads(encode_json(service)) for service in services]})
+        print_json({"command": "status", "services": [json.loads(encode_json(one)) for one in services]})
         return
     print_table(render(services))
 

@@ -10,15 +10,8 @@ from optipmb_client.commands.ablate import by_class, cells_of, measured, print_r
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
-    DatasetName,
-    Detections,
-    Options,
+    LabelledOptions,
     Profile,
-    Root,
-    Sequences,
-    Source,
-    Truth,
-    asked_for,
     open_sequences,
     print_json,
     say,
@@ -31,15 +24,9 @@ FIGURE_5 = ("survival=0.9,0.95,0.99,0.999,1", "clutter_rate=0.1,0.3,1,3,10,30", 
 SHOWN = ("sAMOTA", "AMOTA", "MOTA", "HOTA", "HOTA, all", "IDS", "FP", "FN")
 
 
-def sweep(  # noqa: PLR0913  these are the command's options
-    data: Source = None,
+def sweep(
+    data: LabelledOptions,
     *,
-    dataset: DatasetName = None,
-    root: Root = None,
-    detections: Detections = None,
-    sequences: Sequences = None,
-    option: Options = None,
-    truth: Truth = None,
     profile: Profile = None,
     classes: Classes = None,
     parameter: Annotated[
@@ -63,8 +50,8 @@ def sweep(  # noqa: PLR0913  these are the command's options
     from optipmb_client.tuning.picture import write_sweep  # noqa: PLC0415  as above
 
     wanted = [_values(text) for text in parameter or FIGURE_5]
-    asked = asked_for(data, dataset, root, detections, option, truth)
-    opened, chosen = open_sequences(asked, sequences)
+    asked = data.asked()
+    opened, chosen = open_sequences(asked, data.sequences)
     name = profile or opened.profile
     parameters = profile_compared(name, chosen)
     source = tuning.Source.of(asked.name, asked.detections, chosen, parameters, classes)

@@ -10,17 +10,11 @@ import typer
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
-    DatasetName,
-    Detections,
+    DataOptions,
     Full,
-    Options,
     Out,
     Profile,
     Ray,
-    Root,
-    Sequences,
-    Source,
-    asked_for,
     executor_of,
     open_sequences,
     print_json,
@@ -40,13 +34,8 @@ if TYPE_CHECKING:
 
 
 def track(  # noqa: PLR0913  these are the command's options
-    data: Source = None,
+    data: DataOptions,
     *,
-    dataset: DatasetName = None,
-    root: Root = None,
-    detections: Detections = None,
-    sequences: Sequences = None,
-    option: Options = None,
     out: Out = Path("out/track"),
     profile: Profile = None,
     classes: Classes = None,
@@ -93,9 +82,8 @@ def track(  # noqa: PLR0913  these are the command's options
     from optipmb_client import offline, tracking  # noqa: PLC0415  loads the tracker and its compiler
 
     flags = {"keep_input": keep_input and 1, "fuse": fuse and 1, "submission": submission}
-    option = [*(option or ()), *(f"{name}={given}" for name, given in flags.items() if given)]
-    asked = asked_for(data, dataset, root, detections, option)
-    opened, chosen = open_sequences(asked, sequences)
+    asked = data.asked(*(f"{name}={given}" for name, given in flags.items() if given))
+    opened, chosen = open_sequences(asked, data.sequences)
     _check_out(out, asked.name, chosen, alone=submission is not None, full=full)
     name = profile or opened.profile
     parameters = offline.profile_for(name, chosen)

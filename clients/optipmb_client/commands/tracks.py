@@ -1,36 +1,25 @@
 """`optipmb tracks`: what was tracked a while ago."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import typer
-from optipmb_schemas import PREFIX, Tracks
 
-from optipmb_client.commands.options import AsJson, Config, Connect, Prefix, print_json, say
+from optipmb_client.commands.options import AsJson, ServiceOptions, print_json, say
 from optipmb_client.errors import ServiceUnavailable, UsageError
 from optipmb_client.history import kept_tracks
-from optipmb_client.results.table import TrackColumns
+from optipmb_client.results.table import track_columns
 from optipmb_client.sessions import session_state
 from optipmb_client.table_files import SUFFIXES, write_table
-from optipmb_client.zenoh import Connection
 
 SECOND = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class _Kept:
-    """Tracks as a sequence of frames."""
-
+class _Kept(NamedTuple):
     name: str
-    found: Sequence[Tracks]
-
-    def frames(self) -> Iterator[Tracks]:
-        return iter(self.found)
 
 
-def tracks(  # noqa: PLR0913  these are the command's options
+def tracks(
     stream: Annotated[str, typer.Argument(help="Name of the stream, site/node/sensor.")],
     from_ns: Annotated[int, typer.Option("--from", min=0, metavar="STAMP", help="First stamp, nanoseconds.")] = 0,
     to_ns: Annotated[
@@ -38,10 +27,8 @@ def tracks(  # noqa: PLR0913  these are the command's options
     ] = None,
     last: Annotated[float | None, typer.Option(min=0.0, help="Instead: seconds up to the newest frame.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write a table: .csv, .parquet, .jsonl or .feather.")] = None,
-    connect: Connect = None,
-    config: Config = None,
-    prefix: Prefix = PREFIX,
     *,
+    service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
     """Get the tracks of a stream that the service still has: some seconds, or an hour where there is a log."""
@@ -49,18 +36,15 @@ def tracks(  # noqa: PLR0913  these are the command's options
         raise UsageError("--last: not together with --from and --to")
     if out is not None and out.suffix.lower() not in SUFFIXES:
         raise UsageError(f"--out: a table such as tracks.csv or tracks.parquet, not {out}")
-    with Connection(connect, config=config, timeout=2.0) as connection:
+    with service.connection(2.0) as connection:
         if last is not None:
-            state = session_state(connection, stream, prefix=prefix)
+            state = session_state(connection, stream, prefix=service.prefix)
             if state is None or state.stamp_ns is None:
                 raise ServiceUnavailable(f"no session of {stream} is there, so --last says nothing: give --from")
             from_ns = max(0, state.stamp_ns - round(last * SECOND))
-        found = list(kept_tracks(connection, stream, from_ns, to_ns, prefix=prefix))
+        found = list(kept_tracks(connection, stream, from_ns, to_ns, prefix=service.prefix))
     if out is not None:
-        columns = TrackColumns(_Kept(stream, found))
-        for index, one in enumerate(found):
-            columns.add(index, one)
-        write_table(out, columns.columns())
+        write_table(out, track_columns(_Kept(stream), dict(enumerate(found))))
     stamps = [found[0].stamp_ns, found[-1].stamp_ns] if found else []
     if as_json:
         print_json({"command": "tracks", "stream": stream, "frames": len(found), "stamps_ns": stamps, "out": out})

@@ -12,17 +12,10 @@ from optipmb_client.commands.ablate import cells_of
 from optipmb_client.commands.options import (
     AsJson,
     Classes,
-    DatasetName,
-    Detections,
-    Options,
+    LabelledOptions,
     Out,
     Profile,
     Ray,
-    Root,
-    Sequences,
-    Source,
-    Truth,
-    asked_for,
     executor_of,
     open_sequences,
     print_json,
@@ -44,14 +37,8 @@ METRICS = ("combination", "samota", "amota", "mota", "hota", "both")
 
 
 def tune(  # noqa: PLR0913  these are the command's options
-    data: Source = None,
+    data: LabelledOptions,
     *,
-    dataset: DatasetName = None,
-    root: Root = None,
-    detections: Detections = None,
-    sequences: Sequences = None,
-    option: Options = None,
-    truth: Truth = None,
     profile: Profile = None,
     classes: Classes = None,
     out: Out = Path("out/tune"),
@@ -91,8 +78,8 @@ def tune(  # noqa: PLR0913  these are the command's options
         raise UsageError(f"--metric: one of {', '.join(METRICS)}, received {metric!r}")
     if reference is not None and not estimate_only:
         raise UsageError("--reference: with --estimate-only, which writes a profile that --profile then tunes")
-    asked = asked_for(data, dataset, root, detections, option, truth)
-    opened, chosen = open_sequences(asked, sequences)
+    asked = data.asked()
+    opened, chosen = open_sequences(asked, data.sequences)
     parameters = profile_compared(profile or opened.profile, chosen)
     curves: tuning.Curves = {}
     if reference is not None:

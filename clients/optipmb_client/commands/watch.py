@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from optipmb_schemas import (
-    PREFIX,
     Density,
     Detections,
     Keys,
@@ -24,12 +23,10 @@ from optipmb_schemas import (
 )
 
 from optipmb_client.asking import DensityAsker
-from optipmb_client.commands.options import Config, Connect, Prefix, mcap_needed, say
-from optipmb_client.commands.replay import speed_of
+from optipmb_client.commands.options import ServiceOptions, mcap_needed, say, speed_of
 from optipmb_client.errors import UsageError
 from optipmb_client.extras import needed
 from optipmb_client.incoming import Inbox
-from optipmb_client.zenoh import Connection
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -72,10 +69,8 @@ def watch(  # noqa: PLR0913  these are the command's options
     save: Annotated[Path | None, typer.Option("--save", help="Write an .rrd file instead, for Rerun.")] = None,
     speed: Annotated[str, typer.Option(help="Of a recording: 1 as recorded, 10 ten times as fast, max.")] = "max",
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so many seconds.")] = None,
-    connect: Connect = None,
-    config: Config = None,
+    service: ServiceOptions,
     timeout: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a router.")] = 5.0,
-    prefix: Prefix = PREFIX,
 ) -> None:
     """Watch streams from above and in 3D: tracks, their velocity, uncertainty and paths, detections, clouds.
 
@@ -91,7 +86,7 @@ def watch(  # noqa: PLR0913  these are the command's options
     else:
         needed("watching", "watch", "rerun")
     messages = (
-        _live(connect, config, timeout, streams or ["*/*/*"], prefix, points=points, poisson=poisson)
+        _live(service, timeout, streams or ["*/*/*"], points=points, poisson=poisson)
         if file is None
         else _recorded(file, streams, pace, points=points)
     )
@@ -169,25 +164,23 @@ def _open(recording: "RecordingStream", save: Path | None) -> None:
 
 
 def _live(
-    connect: list[str] | None,
-    config: Path | None,
+    service: ServiceOptions,
     timeout: float,
     patterns: list[str],
-    prefix: str,
     *,
     points: bool,
     poisson: bool,
 ) -> Iterator[Message | None]:
     """Yield what comes; None now and then while nothing does."""
-    keys = Keys(prefix)
+    keys = Keys(service.prefix)
     topics = [topic for topic in TOPICS if points or topic != "points"]
     wanted = [keys.matching(pattern, topic) for pattern in patterns for topic in topics]
     inbox = Inbox(WAITING)
     with contextlib.ExitStack() as stack:
-        connection = stack.enter_context(Connection(connect, config=config, timeout=timeout))
+        connection = stack.enter_context(service.connection(timeout))
         for key in wanted:
             connection.subscribe(key, inbox)
-        asker = stack.enter_context(DensityAsker(connection, inbox, prefix)) if poisson else None
+        asker = stack.enter_context(DensityAsker(connection, inbox, service.prefix)) if poisson else None
         while True:
             arrival = inbox.get(TICK_S)
             message = None if arrival is None else _message(arrival.key, arrival.payload, arrival.encoding)

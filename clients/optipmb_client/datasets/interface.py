@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from optipmb_schemas import FieldOfView
 
-from optipmb_client.geometry import Bools, Floats, Ints, Pose, stack_poses, to_sensor
-from optipmb_client.results import ResultWriter
+from optipmb_client.geometry import Bools, Floats, Ints, Pose
+from optipmb_client.results.rows import BoxTable, ResultWriter
 
 Points = NDArray[np.float32]
 
@@ -75,6 +75,15 @@ class DetectionFrame:
     def __len__(self) -> int:
         return len(self.label)
 
+    def take(self, rows: Ints | Bools) -> "DetectionFrame":
+        """Return the frame with the chosen detections."""
+        columns = {name: values for name in DETECTION_COLUMNS if (values := getattr(self, name)) is not None}
+        return replace(self, **{name: values[rows] for name, values in columns.items()})
+
+
+DETECTION_COLUMNS = ("label", "center", "size", "yaw", "score", "velocity", "position_covariance")
+"""Columns of a `DetectionFrame` with a row for each detection; the last two may be None."""
+
 
 @dataclass(frozen=True)
 class Regions:
@@ -87,22 +96,9 @@ class Regions:
 
 
 @dataclass(frozen=True)
-class Truth:
+class Truth(BoxTable):
     """The annotated objects of one sequence, ordered by frame; boxes in the world frame."""
 
-    labels: tuple[str, ...]
-    frame: Ints
-    """(R,)"""
-    id: Ints
-    """(R,)"""
-    label: Ints
-    """(R,) index into `labels`."""
-    center: Floats
-    """(R, 3)"""
-    size: Floats
-    """(R, 3)"""
-    yaw: Floats
-    """(R,)"""
     velocity: Floats
     """(R, 2) world frame; NaN where unknown."""
     occlusion: Ints
@@ -123,30 +119,6 @@ class Truth:
     """(F,) frames that are compared; None: all."""
     notes: tuple[str, ...] = ()
     """Assumptions about it, a line each."""
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    @property
-    def names(self) -> NDArray[np.str_]:
-        """(R,) class names."""
-        return np.asarray(self.labels, dtype=np.str_)[self.label] if self.labels else np.empty(0, dtype=np.str_)
-
-    def take(self, rows: Ints | Bools) -> "Truth":
-        """Return the chosen rows; regions stay."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in _TRUTH_COLUMNS})
-
-    def to_sensor(self, poses: Sequence[Pose]) -> "Truth":
-        """Return the boxes carried to the sensor frame of each row's frame; velocities stay in the world frame."""
-        rotation, translation = stack_poses(poses)
-        center, yaw = to_sensor(rotation[self.frame], translation[self.frame], self.center, self.yaw)
-        return replace(self, center=center, yaw=yaw)
-
-
-_TRUTH_COLUMNS = (
-    *("frame", "id", "label", "center", "size", "yaw", "velocity"),
-    *("occlusion", "truncation", "covered", "points", "box2d", "ignored"),
-)
 
 
 class DataSequence(Protocol):

@@ -11,7 +11,7 @@ from pathlib import Path
 from optipmb_schemas.installation import install_command
 
 from optipmb_client.camera import synthetic_camera
-from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFrame, Points, Truth
+from optipmb_client.datasets.interface import DETECTION_COLUMNS, Cloud, DataSequence, DetectionFrame, Points, Truth
 from optipmb_client.errors import ClientError
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Pose
@@ -104,13 +104,7 @@ class RosbagSequence:
             stamp_ns=planned.stamp_ns,
             pose=planned.pose,
             labels=self.labels,
-            label=label,
-            center=boxes.center,
-            size=boxes.size,
-            yaw=boxes.yaw,
-            score=boxes.score,
-            velocity=boxes.velocity,
-            position_covariance=boxes.position_covariance,
+            **{name: getattr(boxes, name) for name in DETECTION_COLUMNS} | {"label": label},
             cloud=None if cloud is None or pose is None else Cloud(partial(self._points, cloud), *pose),
         )
 

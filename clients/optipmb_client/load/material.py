@@ -15,6 +15,7 @@ import numpy as np
 from optipmb_schemas import Detections, Points, Pose, encode
 
 from optipmb_client.datasets import DataSequence, DetectionFrame
+from optipmb_client.datasets.interface import DETECTION_COLUMNS
 
 __all__ = ["FIRST", "STREAM_BYTES", "Frames", "generated", "head", "recorded"]
 
@@ -117,12 +118,7 @@ def _recorded(frame: DetectionFrame, *, with_cloud: bool) -> bytes:
         frame="sensor",
         pose=Pose(translation=frame.pose.translation, quaternion=frame.pose.quaternion),
         labels=frame.labels,
-        label=frame.label,
-        center=frame.center,
-        size=frame.size,
-        yaw=frame.yaw,
-        velocity=frame.velocity,
-        score=frame.score,
+        **{name: getattr(frame, name) for name in DETECTION_COLUMNS if name != "position_covariance"},
         has_points=with_cloud,
     )
 

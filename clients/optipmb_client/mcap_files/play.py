@@ -9,7 +9,6 @@ import contextlib
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Final, Self
 
 from optipmb_schemas import PREFIX, Keys, Problem, SessionParameters, Tracks
@@ -189,9 +188,7 @@ class _Player:
         self._first_id = max(1, state.next_id) if state else 1
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         close_session(self._connection, self._stream, prefix=self._prefix)
         self._inbox.close()
         for sender in self._senders.values():

@@ -15,15 +15,15 @@ rows with an image box.
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Self
 
 import numpy as np
+from optipmb_schemas import Tracks
 
 from optipmb_client.camera import Camera, alpha_of, kitti_from_sensor, sensor_from_kitti
 from optipmb_client.class_names import class_like
-from optipmb_client.files import AtomicText, DatasetError, numbers, read_rows
+from optipmb_client.files import DatasetError, numbers, read_rows, write_whole
 from optipmb_client.geometry import PoseLike, rotation_of, to_sensor
-from optipmb_client.results.rows import ResultTable, TrackRows
+from optipmb_client.results.rows import ResultTable, ResultWriter
 
 LEAST_SHOWN = 0.5
 """Part of a projected box that must lie in the image for its line to have an image box."""
@@ -35,7 +35,7 @@ _FIELDS = 18
 _TYPE = 2
 
 
-class KittiResultWriter:
+class KittiResultWriter(ResultWriter):
     """Writes the tracks of one sequence; use it as a context manager, or call `close` at the end.
 
     Args:
@@ -45,18 +45,13 @@ class KittiResultWriter:
     """
 
     def __init__(self, path: Path, camera: Camera, least: Mapping[str, float] | None = None) -> None:
+        super().__init__(path)
         self._camera = camera
         self._least = least
         self._lines: list[tuple[int, str, float, bool, str]] = []  # id, class, score, whether the image shows it, text
         self._confirmed: set[int] = set()
-        self._file = AtomicText(path)
 
-    @property
-    def path(self) -> Path:
-        """The finished file."""
-        return self._file.path
-
-    def add(self, index: int, pose: PoseLike, tracks: TrackRows) -> None:
+    def add(self, index: int, pose: PoseLike, tracks: Tracks) -> None:
         """Write the tracks (world frame) of frame `index`, whose sensor stood at `pose`."""
         center, yaw = to_sensor(
             rotation_of(np.asarray(pose.quaternion)), np.asarray(pose.translation), tracks.center, tracks.yaw
@@ -85,24 +80,12 @@ class KittiResultWriter:
             if shown and identity in self._confirmed:
                 scores.setdefault(identity, []).append(score)
         mean = {identity: fmean(values) for identity, values in scores.items()}
-        for identity, name, _, shown, line in self._lines:
-            if self._least is None or (shown and mean.get(identity, -1.0) >= self._least[name]):
-                self._file.write(line)
-        self._lines.clear()
-        self._file.close()
-
-    def discard(self) -> None:
-        """Drop what was written."""
-        self._file.discard()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.discard()
+        lines = (
+            line
+            for identity, name, _, shown, line in self._lines
+            if self._least is None or (shown and mean.get(identity, -1.0) >= self._least[name])
+        )
+        write_whole(self.path, lines)
 
 
 def read_kitti_results(path: Path, labels: Sequence[str] = ()) -> ResultTable:

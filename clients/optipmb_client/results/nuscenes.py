@@ -9,17 +9,19 @@ Each scene is first a file of its own, `scenes/NAME.json`, in the same layout; a
 `tracking_results.json`. A run that is interrupted leaves the scenes that it finished.
 """
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
+from optipmb_schemas import Tracks
 
-from optipmb_client.files import AtomicText, DatasetError, read_text
+from optipmb_client.files import DatasetError, read_text, write_whole
 from optipmb_client.geometry import Ints, PoseLike
 from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES, NUSCENES_META, Submission, read_submission
-from optipmb_client.results.rows import ResultTable, TrackRows
+from optipmb_client.results.rows import ResultTable, ResultWriter, stacked
 
 NUSCENES_FILE = "tracking_results.json"
 NUSCENES_MAX_BOXES = 500
@@ -43,16 +45,9 @@ def join_scenes(out: Path, scenes: Sequence[str], meta: Mapping[str, Any]) -> No
 
     """
     head = _head(meta)
-    whole = AtomicText(out / NUSCENES_FILE)
-    try:
-        whole.write(head)
-        for i, name in enumerate(scenes):
-            text = read_text(scene_file(out, name), "the results of a scene")
-            whole.write((",\n" if i else "") + text[len(head) : -len(_END)])
-        whole.write(_END)
-        whole.close()
-    finally:
-        whole.discard()
+    texts = (read_text(scene_file(out, name), "the results of a scene") for name in scenes)
+    parts = ((",\n" if i else "") + text[len(head) : -len(_END)] for i, text in enumerate(texts))
+    write_whole(out / NUSCENES_FILE, itertools.chain([head], parts, [_END]))
 
 
 def _head(meta: Mapping[str, Any]) -> str:
@@ -60,7 +55,7 @@ def _head(meta: Mapping[str, Any]) -> str:
     return f'{{"meta": {json.dumps(used)}, "results": {{\n'
 
 
-class NuScenesResultWriter:
+class NuScenesResultWriter(ResultWriter):
     """Writes the tracks of one scene; use it as a context manager, or call `close` at the end.
 
     Args:
@@ -71,18 +66,13 @@ class NuScenesResultWriter:
     """
 
     def __init__(self, out: Path, scene: str, samples: Sequence[str], meta: Mapping[str, Any]) -> None:
+        super().__init__(scene_file(out, scene))
         self._scene = scene
         self._samples = samples
         self._head = _head(meta)
         self._lines: dict[int, str] = {}
-        self._file = AtomicText(scene_file(out, scene))
 
-    @property
-    def path(self) -> Path:
-        """The finished file of the scene."""
-        return self._file.path
-
-    def add(self, index: int, pose: PoseLike, tracks: TrackRows) -> None:  # noqa: ARG002  boxes are global
+    def add(self, index: int, pose: PoseLike, tracks: Tracks) -> None:  # noqa: ARG002  boxes are global
         """Write the tracks (world frame) of frame `index`; the benchmark wants no sensor frame, so no pose.
 
         Raises:
@@ -127,21 +117,7 @@ class NuScenesResultWriter:
     def close(self) -> None:
         """Put the file in its place, with an empty list for every sample without tracks."""
         lines = (f"{json.dumps(token)}: {self._lines.get(i, '[]')}" for i, token in enumerate(self._samples))
-        self._file.write(self._head + ",\n".join(lines) + _END)
-        self._file.close()
-
-    def discard(self) -> None:
-        """Drop what was written."""
-        self._file.discard()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.discard()
+        write_whole(self.path, [self._head, ",\n".join(lines), _END])
 
 
 def read_nuscenes_results(path: Path) -> Submission:
@@ -175,18 +151,9 @@ def result_table(results: Submission, scene: str, samples: Sequence[str]) -> Res
         if len(set(boxes.id)) < len(boxes):
             twice = next(name for i, name in enumerate(boxes.id) if name in boxes.id[:i])
             raise DatasetError(results.path, f"a tracking_id once in results.{token}", f"{twice!r} again")
-    count = len(names)
-    return ResultTable(
-        labels=NUSCENES_CLASSES,
-        frame=np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames]),
-        id=_numbers(scene, names),
-        label=np.concatenate([np.empty(0, dtype=np.int64), *(boxes.label for boxes in frames)]),
-        center=np.concatenate([np.empty((0, 3)), *(boxes.center for boxes in frames)]),
-        size=np.concatenate([np.empty((0, 3)), *(boxes.size for boxes in frames)]),
-        yaw=np.concatenate([np.empty(0), *(boxes.yaw for boxes in frames)]),
-        score=np.concatenate([np.empty(0), *(boxes.score for boxes in frames)]),
-        box2d=np.full((count, 4), np.nan),
-    )
+    label, center, size, yaw, score = (stacked(frames, name) for name in ("label", "center", "size", "yaw", "score"))
+    frame, image = np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames]), np.full((len(names), 4), np.nan)
+    return ResultTable(NUSCENES_CLASSES, frame, _numbers(scene, names), label, center, size, yaw, score, image)
 
 
 def _numbers(scene: str, names: Sequence[str]) -> Ints:

@@ -3,84 +3,57 @@
 Conventions: columns with one row per box; metres, radians, z up; `label` indexes `labels`.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Any, Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
+from optipmb_schemas import Tracks
 
 from optipmb_client.geometry import Bools, Floats, Ints, PoseLike, stack_poses, to_sensor, to_world
 
-
-class TrackRows(Protocol):
-    """The tracks of one frame, in the world frame; messages and in-process results both are of this shape."""
-
-    @property
-    def id(self) -> Ints:
-        """(N,)."""
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Class names."""
-
-    @property
-    def label(self) -> Ints:
-        """(N,) index into labels."""
-
-    @property
-    def center(self) -> Floats:
-        """(N, 3)."""
-
-    @property
-    def size(self) -> Floats:
-        """(N, 3) length, width, height."""
-
-    @property
-    def yaw(self) -> Floats:
-        """(N,)."""
-
-    @property
-    def velocity(self) -> Floats:
-        """(N, 2)."""
-
-    @property
-    def score(self) -> Floats:
-        """(N,)."""
-
-    @property
-    def existence(self) -> Floats:
-        """(N,) probability."""
-
-    @property
-    def confirmed(self) -> Bools | Ints | None:
-        """(N,) flags; None where unknown."""
+__all__ = ["BoxTable", "ResultTable", "ResultWriter", "column_shape", "empty_table", "stacked"]
 
 
-class ResultWriter(Protocol):
-    """Takes the tracks of one sequence frame by frame; the file appears complete at `close`, or not at all."""
+class ResultWriter(ABC):
+    """Takes the tracks of one sequence frame by frame; the file appears complete at `close`, or not at all.
 
-    @property
-    def path(self) -> Path:
-        """The finished file."""
+    As a context manager it is closed at the end, and after an error discarded.
 
-    def add(self, index: int, pose: PoseLike, tracks: TrackRows) -> None:
+    Attributes:
+        path: The finished file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @abstractmethod
+    def add(self, index: int, pose: PoseLike, tracks: Tracks) -> None:
         """Write the tracks (world frame) of frame `index`, whose sensor stood at `pose`."""
 
+    @abstractmethod
     def close(self) -> None:
         """Put the file in its place."""
 
-    def discard(self) -> None:
+    def discard(self) -> None:  # noqa: B027  most have written nothing before they are closed
         """Drop what was written."""
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(self, kind: object, error: object, trace: object) -> None: ...
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.discard()
 
 
 @dataclass(frozen=True)
-class ResultTable:
-    """All boxes of all tracks of one sequence, ordered by frame, in one frame of reference that the maker names."""
+class BoxTable:
+    """Boxes of one sequence, ordered by frame, in one frame of reference that the maker names."""
 
     labels: tuple[str, ...]
     frame: Ints
@@ -88,46 +61,58 @@ class ResultTable:
     id: Ints
     """(R,)"""
     label: Ints
-    """(R,)"""
+    """(R,) index into `labels`."""
     center: Floats
     """(R, 3)"""
     size: Floats
-    """(R, 3)"""
+    """(R, 3) length, width, height."""
     yaw: Floats
     """(R,)"""
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def names(self) -> NDArray[np.str_]:
+        """(R,) class names."""
+        return np.asarray(self.labels, dtype=np.str_)[self.label] if self.labels else np.empty(0, dtype=np.str_)
+
+    def take(self, rows: Ints | Bools) -> Self:
+        """Return the chosen rows."""
+        columns = [field.name for field in fields(self) if field.name not in _NOT_OF_ROWS]
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+
+    def of_class(self, name: str) -> Self:
+        """Return the rows of one class."""
+        return self.take(np.isin(self.label, [i for i, label in enumerate(self.labels) if label == name]))
+
+    def to_world(self, poses: Sequence[PoseLike]) -> Self:
+        """Return the boxes carried from the sensor frame of each row's frame to the world."""
+        rotation, translation = stack_poses(poses)
+        center, yaw = to_world(rotation[self.frame], translation[self.frame], self.center, self.yaw)
+        return replace(self, center=center, yaw=yaw)
+
+    def to_sensor(self, poses: Sequence[PoseLike]) -> Self:
+        """Return the boxes carried from the world to the sensor frame of each row's frame; velocities stay."""
+        rotation, translation = stack_poses(poses)
+        center, yaw = to_sensor(rotation[self.frame], translation[self.frame], self.center, self.yaw)
+        return replace(self, center=center, yaw=yaw)
+
+
+_NOT_OF_ROWS: Final = {"labels", "notes", "regions", "labelled"}
+"""Fields of tables of boxes that have no value for each row."""
+
+
+@dataclass(frozen=True)
+class ResultTable(BoxTable):
+    """All boxes of all tracks of one sequence."""
+
     score: Floats
     """(R,)"""
     box2d: Floats
     """(R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image."""
     notes: tuple[str, ...] = ()
     """Assumptions about them, a line each."""
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def take(self, rows: Ints | Bools) -> "ResultTable":
-        """Return the chosen rows."""
-        columns = {name: getattr(self, name)[rows] for name in _COLUMNS}
-        return replace(self, **columns)
-
-    def of_class(self, name: str) -> "ResultTable":
-        """Return the rows of one class."""
-        return self.take(np.isin(self.label, [i for i, label in enumerate(self.labels) if label == name]))
-
-    def to_world(self, poses: Sequence[PoseLike]) -> "ResultTable":
-        """Return the table carried from the sensor frame of each row's frame to the world."""
-        rotation, translation = stack_poses(poses)
-        center, yaw = to_world(rotation[self.frame], translation[self.frame], self.center, self.yaw)
-        return replace(self, center=center, yaw=yaw)
-
-    def to_sensor(self, poses: Sequence[PoseLike]) -> "ResultTable":
-        """Return the table carried from the world to the sensor frame of each row's frame."""
-        rotation, translation = stack_poses(poses)
-        center, yaw = to_sensor(rotation[self.frame], translation[self.frame], self.center, self.yaw)
-        return replace(self, center=center, yaw=yaw)
-
-
-_COLUMNS = ("frame", "id", "label", "center", "size", "yaw", "score", "box2d")
 
 
 def empty_table(labels: tuple[str, ...] = ()) -> ResultTable:
@@ -138,27 +123,12 @@ def empty_table(labels: tuple[str, ...] = ()) -> ResultTable:
     )
 
 
-def collect(frames: Sequence[tuple[int, TrackRows]]) -> ResultTable:
-    """Return the tracks of many frames (index, tracks) as one table in the world frame, without image boxes.
+def column_shape(name: str) -> tuple[int, ...]:
+    """Return the shape of one row of a column of tracks."""
+    return tuple(length for length in Tracks.arrays[name].shape if isinstance(length, int))
 
-    Raises:
-        ValueError: the frames do not share one tuple of labels.
 
-    """
-    if not frames:
-        return empty_table()
-    labels = frames[0][1].labels
-    if any(tracks.labels != labels for _, tracks in frames):
-        raise ValueError("the frames of one table share one tuple of labels")
-    count = sum(len(tracks.id) for _, tracks in frames)
-    return ResultTable(
-        labels=labels,
-        frame=np.concatenate([np.full(len(tracks.id), index, dtype=np.int64) for index, tracks in frames]),
-        id=np.concatenate([tracks.id for _, tracks in frames]),
-        label=np.concatenate([tracks.label for _, tracks in frames]),
-        center=np.concatenate([tracks.center for _, tracks in frames]),
-        size=np.concatenate([tracks.size for _, tracks in frames]),
-        yaw=np.concatenate([tracks.yaw for _, tracks in frames]),
-        score=np.concatenate([tracks.score for _, tracks in frames]),
-        box2d=np.full((count, 4), np.nan),
-    )
+def stacked(parts: Sequence[Any], name: str) -> NDArray[Any]:
+    """Return a column of the tracks of many frames, one frame below the other."""
+    empty = np.empty((0, *column_shape(name)), Tracks.arrays[name].dtype)
+    return np.concatenate([empty, *(getattr(part, name) for part in parts)])

@@ -9,105 +9,70 @@ request the upper triangle of the covariance of (x, y, v, phi, omega, a) follows
 Metres, seconds, radians. The same tracks always give the same bytes.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, Self, cast
+from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from optipmb_schemas import Tracks
 
 from optipmb_client.geometry import Ints, PoseLike
-from optipmb_client.results.rows import TrackRows
+from optipmb_client.results.rows import ResultWriter, stacked
 from optipmb_client.table_files import Columns, write_table
 
-if TYPE_CHECKING:
-    from optipmb_client.results.full import FullRows
-
-__all__ = ["COVARIANCE", "TableResultWriter", "TrackColumns", "join"]
+__all__ = ["COVARIANCE", "TableResultWriter", "join", "track_columns"]
 
 _STATE: Final = ("x", "y", "v", "phi", "omega", "a")
 COVARIANCE: Final = {f"cov_{_STATE[i]}_{_STATE[j]}": (i, j) for i in range(6) for j in range(i, 6)}
 """Column -> place in the covariance (6, 6)."""
 
 
-class _Stamped(Protocol):
+class Named(Protocol):
+    """What was tracked; the sequence of a table of detections says more of its columns and rows."""
+
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Value of the column `sequence`."""
 
-    def frames(self) -> Iterator[Any]: ...
+
+def track_columns(sequence: Named, tracks: Mapping[int, Tracks], *, full: bool = False) -> Columns:
+    """Return the tracks (world frame) of a sequence by frame index as columns, with `full` also the covariance."""
+    order = sorted(tracks)
+    parts = [tracks[index] for index in order]
+    frame = np.repeat(np.array(order, dtype=np.int64), [len(one.id) for one in parts])
+    names = [name for one in parts for name in np.asarray(one.labels, np.str_)[one.label]]
+    numbers, rows = getattr(sequence, "numbers", None), getattr(sequence, "rows", None)
+    columns = _place(sequence, frame, parts)
+    columns |= {"frame": frame if numbers is None else numbers[frame]}
+    columns |= {"id": stacked(parts, "id"), "class": np.array(names, dtype=np.str_)}
+    age, unseen, velocity = (stacked(parts, name) for name in ("age", "time_since_detection", "velocity"))
+    unknown = (age == unseen) & (velocity == 0.0).all(axis=1)  # detected once, by a detector that gives none
+    columns |= dict(zip("xyz", stacked(parts, "center").T, strict=True))
+    columns |= dict(zip("lwh", stacked(parts, "size").T, strict=True))
+    columns["yaw"] = stacked(parts, "yaw")
+    columns |= dict(zip(("vx", "vy"), np.where(unknown[:, None], np.nan, velocity).T, strict=True))
+    columns |= {name: stacked(parts, name) for name in ("yaw_rate", "acceleration", "score", "existence")}
+    columns |= {"age": age, "time_since_detection": unseen}
+    detection = [
+        (rows(index)[one] if rows is not None else one) if one >= 0 else np.nan
+        for index, part in zip(order, parts, strict=True)
+        for one in part.detection.tolist()
+    ]
+    columns["detection_row"] = np.array(detection, dtype=np.float64)
+    if full:
+        covariance = stacked(parts, "covariance")
+        columns |= {name: covariance[:, i, j] for name, (i, j) in COVARIANCE.items()}
+    return columns
 
 
-class TrackColumns:
-    """Collects the tracks of one sequence as columns.
-
-    Args:
-        sequence: what was tracked; frames may be added in any order.
-        full: whether the covariance is kept.
-    """
-
-    def __init__(self, sequence: _Stamped, *, full: bool = False) -> None:
-        self._sequence = sequence
-        self._full = full
-        self._tracks: dict[int, FullRows] = {}
-
-    def add(self, index: int, tracks: TrackRows) -> None:
-        """Take the tracks (world frame) of frame `index`."""
-        self._tracks[index] = cast("FullRows", tracks)
-
-    def columns(self) -> Columns:
-        """Return all rows."""
-        sequence = self._sequence
-        order = sorted(self._tracks)
-        frame = np.repeat(np.array(order, dtype=np.int64), [len(self._tracks[i].id) for i in order])
-        names = [name for i in order for name in np.asarray(self._tracks[i].labels, np.str_)[self._tracks[i].label]]
-        columns = self._place(frame)
-        numbers = getattr(sequence, "numbers", None)
-        columns |= {"frame": frame if numbers is None else numbers[frame]}
-        columns |= {"id": self._all("id"), "class": np.array(names, dtype=np.str_)}
-        for name, parts in (("center", "xyz"), ("size", "lwh"), ("velocity", ("vx", "vy"))):
-            values = self._all(name, len(parts))
-            if name == "velocity":
-                values = np.where(self._moving(values)[:, None], values, np.nan)
-            columns |= {part: values[:, place] for place, part in enumerate(parts)}
-            if name == "size":
-                columns["yaw"] = self._all("yaw")
-        for name in ("yaw_rate", "acceleration", "score", "existence", "age", "time_since_detection"):
-            columns[name] = self._all(name)
-        rows = getattr(sequence, "rows", None)
-        detection = [
-            (rows(i)[one] if rows is not None else one) if one >= 0 else np.nan
-            for i in order
-            for one in self._tracks[i].detection.tolist()
-        ]
-        columns["detection_row"] = np.array(detection, dtype=np.float64)
-        if self._full:
-            covariance = self._all("covariance", 36).reshape(-1, 6, 6)
-            columns |= {name: covariance[:, i, j] for name, (i, j) in COVARIANCE.items()}
-        return columns
-
-    def _moving(self, velocity: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell of which tracks (N,) a velocity is known: it was detected, or there were two detections."""
-        once = self._all("age") == self._all("time_since_detection")
-        return np.asarray(~(once & (velocity == 0.0).all(axis=1)), dtype=np.bool_)
-
-    def _place(self, frame: Ints) -> Columns:
-        """Return the columns that say where and when."""
-        keys = getattr(self._sequence, "key_columns", None)
-        others: Columns = getattr(self._sequence, "frame_columns", {})
-        if keys is not None:
-            columns = {name: np.full(len(frame), value) for name, value in keys.items()}
-            columns |= {name: values[frame] for name, values in others.items()}
-            return columns | {self._sequence.time_column: self._sequence.times[frame]}  # type: ignore[attr-defined]  # a table
-        stamps = np.array([one.stamp_ns for one in self._sequence.frames()], dtype=np.int64)
-        columns = {"sequence": np.full(len(frame), self._sequence.name)}
-        return columns | {name: values[frame] for name, values in others.items()} | {"stamp_ns": stamps[frame]}
-
-    def _all(self, name: str, width: int = 0) -> NDArray[Any]:
-        order = sorted(self._tracks)
-        parts = [np.asarray(getattr(self._tracks[i], name)) for i in order]
-        empty = np.empty(0, dtype=np.int64 if name == "id" else np.float64)
-        flat = np.concatenate([empty, *(part.reshape(-1) for part in parts)])
-        return flat.reshape(-1, width) if width else flat
+def _place(sequence: Any, frame: Ints, parts: Sequence[Tracks]) -> Columns:
+    """Return the columns that say where and when."""
+    others: Columns = {name: values[frame] for name, values in getattr(sequence, "frame_columns", {}).items()}
+    if (keys := getattr(sequence, "key_columns", None)) is not None:
+        columns = {name: np.full(len(frame), value) for name, value in keys.items()}
+        return columns | others | {sequence.time_column: sequence.times[frame]}
+    stamps = np.repeat(np.array([one.stamp_ns for one in parts], dtype=np.int64), [len(one.id) for one in parts])
+    return {"sequence": np.full(len(frame), sequence.name)} | others | {"stamp_ns": stamps}
 
 
 def join(parts: Sequence[Columns]) -> Columns:
@@ -115,32 +80,18 @@ def join(parts: Sequence[Columns]) -> Columns:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
 
 
-class TableResultWriter:
-    """Writes the tracks of one sequence as a table of its own; use it as a context manager, or call `close`."""
+class TableResultWriter(ResultWriter):
+    """Writes the tracks of one sequence as a table of its own."""
 
-    def __init__(self, path: Path, sequence: _Stamped) -> None:
-        self._path = path
-        self._collected = TrackColumns(sequence)
+    def __init__(self, path: Path, sequence: Named) -> None:
+        super().__init__(path)
+        self._sequence = sequence
+        self._tracks: dict[int, Tracks] = {}
 
-    @property
-    def path(self) -> Path:
-        """The finished file."""
-        return self._path
-
-    def add(self, index: int, pose: PoseLike, tracks: TrackRows) -> None:  # noqa: ARG002  the table is in the world
+    def add(self, index: int, pose: PoseLike, tracks: Tracks) -> None:  # noqa: ARG002  the table is in the world
         """Take the tracks (world frame) of frame `index`."""
-        self._collected.add(index, tracks)
+        self._tracks[index] = tracks
 
     def close(self) -> None:
         """Write the file."""
-        write_table(self._path, self._collected.columns())
-
-    def discard(self) -> None:
-        """Drop what was taken."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if kind is None:
-            self.close()
+        write_table(self.path, track_columns(self._sequence, self._tracks))

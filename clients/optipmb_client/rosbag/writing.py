@@ -7,8 +7,9 @@ received, as far as the bag is concerned, when its detections were. The file app
 import shutil
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Self, cast
+from typing import TYPE_CHECKING
 
+from optipmb_schemas import Tracks
 from optipmb_schemas.ros2.tracks import TOPICS, messages
 from optipmb_schemas.ros2.types import own_types
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat
@@ -16,19 +17,17 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import PoseLike
-from optipmb_client.results.rows import TrackRows
+from optipmb_client.results import ResultWriter
 from optipmb_client.rosbag.plan import Plan
 from optipmb_client.rosbag.reading import Bag, Raw
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from optipmb_schemas import Tracks
-
 __all__ = ["BagResultWriter"]
 
 
-class BagResultWriter:
+class BagResultWriter(ResultWriter):
     """Writes the tracks of one sequence of a bag; use it as a context manager.
 
     Args:
@@ -42,7 +41,7 @@ class BagResultWriter:
     """
 
     def __init__(self, path: Path, bag: Bag, plan: Plan, *, keep_input: bool) -> None:
-        self.path = path
+        super().__init__(path)
         self._plan = plan
         self._types = own_types()
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -72,14 +71,13 @@ class BagResultWriter:
             self.discard()
             raise
 
-    def add(self, index: int, pose: PoseLike, tracks: TrackRows) -> None:
+    def add(self, index: int, pose: PoseLike, tracks: Tracks) -> None:
         """Write the tracks (world frame) of frame `index`; `pose` is not needed, tf tells it."""
         del pose
-        full = cast("Tracks", tracks)  # what tracks and what replays gives all columns
         frame = self._plan.frames[index]
         self._copy_until(frame.received_ns)
         world, types, stamp_ns = self._plan.world, self._types, frame.stamp_ns
-        for end, message in messages(types, full, stamp_ns, world, self._plan.topic):
+        for end, message in messages(types, tracks, stamp_ns, world, self._plan.topic):
             self._writer.write(self._topics[end], frame.received_ns, types.write(message))
 
     def close(self) -> None:
@@ -99,15 +97,6 @@ class BagResultWriter:
             self._closed = True
             self._writer.abort()
             shutil.rmtree(self._folder, ignore_errors=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.discard()
 
     def _copy_topic(self, bag: Bag, one: Connection) -> Connection:
         defined = one.msgdef.format != MessageDefinitionFormat.NONE

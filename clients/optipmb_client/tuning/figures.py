@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from optipmb_client.evaluation import Case, Rules, clear, combine
-from optipmb_client.evaluation.ab3dmot import evaluate_ab3dmot
+from optipmb_client.evaluation import Case, ClearResult, Rules, clear, combine
+from optipmb_client.evaluation.ab3dmot import Ab3dmotResult, Counts, evaluate_ab3dmot
 from optipmb_client.evaluation.hota import HotaResult, evaluate_hota
 
 __all__ = ["Figures", "ab3dmot_figures", "distance_figures"]
@@ -80,25 +80,7 @@ def ab3dmot_figures(cases: Sequence[Case], near: Sequence[Case], rules: Rules, n
 
     """
     found = evaluate_ab3dmot(cases, rules.limit)
-    best = found.best
-    alike = _hota(near, near_rules, found.threshold)
-    return Figures(
-        samota=found.samota,
-        amota=found.amota,
-        amotp=found.amotp,
-        mota=best.mota,
-        motp=best.motp,
-        hota=alike.hota,
-        deta=alike.deta,
-        assa=alike.assa,
-        ids=best.switches,
-        frag=best.fragments,
-        fp=best.false,
-        fn=best.missed,
-        gt=best.truth,
-        threshold=found.threshold,
-        hota_all=_hota(near, near_rules, -math.inf).hota,
-    )
+    return _figures(found, found.best, found.best.switches, near, near_rules)
 
 
 def distance_figures(near: Sequence[Case], rules: Rules) -> Figures:
@@ -110,17 +92,24 @@ def distance_figures(near: Sequence[Case], rules: Rules) -> Figures:
     similar = [replace(case, similarity=1.0 - case.cost / rules.limit) for case in near]
     found = evaluate_ab3dmot(similar, 0.0)
     best = combine(clear(case, rules) for case in _from_score(near, found.threshold))
+    figures = _figures(found, best, len(best.switches), near, rules)
+    return replace(figures, amotp=rules.limit * (1.0 - found.amotp))
+
+
+def _figures(
+    found: Ab3dmotResult, best: Counts | ClearResult, switches: int, near: Sequence[Case], rules: Rules
+) -> Figures:
     alike = _hota(near, rules, found.threshold)
     return Figures(
         samota=found.samota,
         amota=found.amota,
-        amotp=rules.limit * (1.0 - found.amotp),
+        amotp=found.amotp,
         mota=best.mota,
         motp=best.motp,
         hota=alike.hota,
         deta=alike.deta,
         assa=alike.assa,
-        ids=len(best.switches),
+        ids=switches,
         frag=best.fragments,
         fp=best.false,
         fn=best.missed,

@@ -6,22 +6,21 @@ the sensor frame of each row's frame, where KITTI compares, and in the world fra
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from optipmb import FieldOfView, Frame, Modules, OptipmbError, Parameters, PointCloud, Pose, Tracker, Tracks, make_frame
+from optipmb import Frame, Modules, Parameters, Tracker, Tracks
 from optipmb_client.camera import Camera
-from optipmb_client.datasets import DataSequence, DatasetError, DetectionFrame, Truth
-from optipmb_client.errors import UsageError
+from optipmb_client.datasets import DataSequence, DatasetError, Truth
 from optipmb_client.evaluation import Rules
 from optipmb_client.geometry import Floats, Ints, stack_poses, to_sensor
+from optipmb_client.offline import tracker_frame
 from optipmb_client.results import ResultTable
-from optipmb_client.results.full import FullTable
+from optipmb_client.results.full import COLUMNS, FullTable
 from optipmb_client.results.kitti import LEAST_SHOWN
-from optipmb_client.results.rows import empty_table
+from optipmb_client.results.rows import stacked
 
-__all__ = ["Clip", "load", "of_class", "prepare_frames", "track_clip", "track_fully"]
+__all__ = ["Clip", "load", "of_class", "track_clip", "track_fully"]
 
 
 @dataclass(frozen=True)
@@ -73,45 +72,13 @@ def load(sequence: DataSequence, parameters: Parameters, rules: Rules) -> Clip:
     return Clip(
         name=sequence.name,
         labels=parameters.labels,
-        frames=prepare_frames(sequence.name, frames, parameters),
+        frames=tuple(tracker_frame(parameters, sequence.name, frame) for frame in frames),
         rotation=rotation,
         translation=translation,
         camera=getattr(sequence, "camera", None),
         truth=kept.to_sensor(sequence.poses),
         world=kept,
     )
-
-
-def prepare_frames(name: str, given: Sequence[DetectionFrame], parameters: Parameters) -> tuple[Frame, ...]:
-    """Return the frames of a sequence for the tracker.
-
-    Raises:
-        UsageError: a frame has values that the tracker refuses.
-
-    """
-    frames = []
-    for frame in given:
-        cloud = frame.cloud
-        try:
-            made, _ = make_frame(
-                parameters,
-                stamp_ns=frame.stamp_ns,
-                labels=frame.labels,
-                label=frame.label,
-                center=frame.center,
-                size=frame.size,
-                yaw=frame.yaw,
-                score=frame.score,
-                velocity=frame.velocity,
-                pose=Pose(frame.pose.translation, frame.pose.quaternion),
-                cloud=None if cloud is None else PointCloud(cloud.xyz, Pose(cloud.translation, cloud.quaternion)),
-                field_of_view=FieldOfView.of(frame.field_of_view, None),
-                position_covariance=frame.position_covariance,
-            )
-        except OptipmbError as error:
-            raise UsageError(f"sequence {name}, frame {frame.index}: {error}") from error
-        frames.append(made)
-    return tuple(frames)
 
 
 def of_class(clip: Clip, name: str, rules: Rules) -> Clip:
@@ -148,14 +115,8 @@ def track_clip(
 def track_fully(clip: Clip, parameters: Parameters) -> tuple[ResultTable, FullTable]:
     """Return the tracks of a clip as `track_clip` does, and everything known of them."""
     found = list(_steps(clip, parameters, None, every_frame=False))
-    table = _table(clip, parameters, found)
-    columns: dict[str, Any] = {
-        key: np.concatenate([np.empty((0, *_SHAPES.get(key, ()))), *(getattr(tracks, key) for _, tracks in found)])
-        for key in _KNOWN
-    }
-    columns["detection"] = np.concatenate([np.empty(0, dtype=np.int64), *(tracks.detection for _, tracks in found)])
-    columns |= {key: getattr(table, key) for key in _SHARED}
-    return table, FullTable(**columns)
+    table, parts = _table(clip, parameters, found), [tracks for _, tracks in found]
+    return table, FullTable(table.labels, table.frame, *(stacked(parts, name) for name in COLUMNS))
 
 
 def _steps(
@@ -177,29 +138,14 @@ def _steps(
 
 
 def _table(clip: Clip, parameters: Parameters, found: Sequence[tuple[int, Tracks]]) -> ResultTable:
-    if not found:
-        return empty_table(parameters.labels)
-    when: Ints = np.repeat([index for index, _ in found], [len(tracks.id) for _, tracks in found]).astype(np.int64)
-    center, size, yaw = (np.concatenate([getattr(tracks, key) for _, tracks in found]) for key in _BOX)
-    if clip.camera is None:
+    parts = [tracks for _, tracks in found]
+    when: Ints = np.repeat([index for index, _ in found], [len(tracks) for tracks in parts]).astype(np.int64)
+    identity, label, center, size, yaw, score = (
+        stacked(parts, name) for name in ("id", "label", "center", "size", "yaw", "score")
+    )
+    if clip.camera is None or not parts:
         image = np.full((len(when), 4), np.nan)
     else:
         local, turned = to_sensor(clip.rotation[when], clip.translation[when], center, yaw)
         image = clip.camera.boxes(local, size, turned, LEAST_SHOWN)[0]  # as the result files have it
-    return ResultTable(
-        labels=parameters.labels,
-        frame=when,
-        id=np.concatenate([tracks.id for _, tracks in found]),
-        label=np.concatenate([tracks.label for _, tracks in found]),
-        center=center,
-        size=size,
-        yaw=yaw,
-        score=np.concatenate([tracks.score for _, tracks in found]),
-        box2d=image,
-    )
-
-
-_BOX = ("center", "size", "yaw")
-_SHARED = ("labels", "frame", "id", "label", "center", "size", "yaw", "score")
-_KNOWN = ("velocity", "yaw_rate", "acceleration", "existence", "covariance", "age", "time_since_detection")
-_SHAPES: dict[str, tuple[int, ...]] = {"velocity": (2,), "covariance": (6, 6)}
+    return ResultTable(parameters.labels, when, identity, label, center, size, yaw, score, image)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from optipmb_client.colours import colour_of
-from optipmb_client.files import AtomicText
+from optipmb_client.files import write_whole
 
 __all__ = ["write_sweep"]
 
@@ -37,9 +37,7 @@ def write_sweep(folder: Path, result: Mapping[str, Any], *, picture: bool) -> No
     table.writeheader()
     table.writerows(rows)
     for name, text in (("sweep.json", json.dumps(result, indent=1) + "\n"), ("sweep.csv", lines.getvalue())):
-        file = AtomicText(folder / name)
-        file.write(text)
-        file.close()
+        write_whole(folder / name, [text])
     if picture:
         _draw(folder / "sweep.png", result["sweeps"])
 

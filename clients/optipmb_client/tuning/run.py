@@ -17,7 +17,7 @@ from optipmb import Parameters, ScoreCalibration
 from optipmb_client.bulk import Executor
 from optipmb_client.datasets import DataSequence, DatasetArguments
 from optipmb_client.errors import UsageError
-from optipmb_client.files import AtomicText
+from optipmb_client.files import write_whole
 from optipmb_client.tuning.estimate import Estimate, estimate, pair_all
 from optipmb_client.tuning.material import Clip, load, of_class
 from optipmb_client.tuning.score_curves import score_curve
@@ -231,6 +231,4 @@ def _by(step: str) -> str:
 
 
 def _write_json(path: Path, content: Any) -> None:
-    file = AtomicText(path)
-    file.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
-    file.close()
+    write_whole(path, [json.dumps(content, indent=1, allow_nan=False) + "\n"])

@@ -10,7 +10,7 @@ from typing import Any
 
 from optipmb import Calibration, HeadingSign, OptipmbError, Parameters, ScoreCalibration, parse_parameters
 from optipmb_client.errors import UsageError
-from optipmb_client.files import AtomicText
+from optipmb_client.files import write_whole
 
 __all__ = [
     "DIGITS",
@@ -121,9 +121,7 @@ def profile_text(parameters: Parameters) -> str:
 
 def write_profile(path: Path, parameters: Parameters) -> None:
     """Write a profile; the file appears complete or not at all."""
-    file = AtomicText(path)
-    file.write(profile_text(parameters))
-    file.close()
+    write_whole(path, [profile_text(parameters)])
 
 
 _ESCAPES = {"\\": "\\\\", '"': '\\"', "\t": "\\t", "\r": "\\r", "\n": "\\n"}
