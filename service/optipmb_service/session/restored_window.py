@@ -10,7 +10,7 @@ from optipmb_service.session.timeline import Timeline
 
 if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
-    from optipmb_service.session.timeline import JumpLimits
+    from optipmb_service.session.values import JumpLimits
 
 
 def window_of(checkpoint: Checkpoint, limits: JumpLimits) -> tuple[Timeline | FusedTimeline, list[Entry]]:

@@ -31,7 +31,7 @@ from optipmb_service.session.seen_numbers import (
     reinstated,
     remembered,
 )
-from optipmb_service.session.values import Count, Epoch, SensorName, Whole  # noqa: TC001 - pydantic reads them
+from optipmb_service.session.values import Count, Epoch, JumpLimits, SensorName, Whole  # noqa: TC001 - pydantic reads them
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -90,18 +90,6 @@ class FrameId(NamedTuple):
     seq: Whole
     stamp_ns: Whole
     sensor: SensorName = ""
-
-
-class JumpLimits(NamedTuple):
-    """Steps of the stamps, in the order of a publisher, beyond which they jumped.
-
-    Attributes:
-        back_ns: largest step back: what a late frame is put in its place for.
-        ahead_ns: largest step ahead.
-    """
-
-    back_ns: int
-    ahead_ns: int
 
 
 Order = tuple[int, int, str, int, int]

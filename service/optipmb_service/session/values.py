@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Protocol
 
 import optipmb_schemas as schemas
 from pydantic import AfterValidator, Field
 
 from optipmb.records import record
-from optipmb_service.session.timeline import JumpLimits
 
 if TYPE_CHECKING:
     import optipmb
@@ -35,6 +34,19 @@ def _check_sensor(name: str) -> str:
 
 SensorName = Annotated[str, Field(strict=True), AfterValidator(_check_sensor)]
 """Stream of a sensor; empty for the only one of a stream's own session."""
+
+
+class JumpLimits(NamedTuple):
+    """Steps of the stamps, in the order of a publisher, beyond which they jumped.
+
+    Attributes:
+        back_ns: largest step back: what a late frame is put in its place for.
+        ahead_ns: largest step ahead.
+    """
+
+    back_ns: int
+    ahead_ns: int
+
 
 MAX_CLOUD_WAIT_NS: Final = 60 * SECOND
 """The longest wait for a cloud that can be asked for."""

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.session.seen_numbers import WINDOW
 from optipmb_service.session.state import FilterState, SensorState
-from optipmb_service.session.timeline import Cursor, Decision, FrameId, JumpLimits, Timeline, Verdict, hold_until
+from optipmb_service.session.timeline import Cursor, Decision, FrameId, Timeline, Verdict, hold_until
+from optipmb_service.session.values import JumpLimits
 
 import optipmb
 
