@@ -2,7 +2,7 @@
 
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar
 
 import grpc
@@ -26,7 +26,7 @@ QUEUE: Final = 1024
 class _ProtoArrival(Arrival):
     """A message that came in protobuf."""
 
-    proto: Any
+    proto: Any = field(kw_only=True)
 
     def read(self, kind: type[T]) -> T:
         """Return the message, checked.
@@ -115,4 +115,4 @@ class GrpcSubscription:
         tracks = response.WhichOneof("response") == "tracks"
         proto = response.tracks if tracks else response.problem
         key = self._keys.tracks(proto.stream) if tracks else self._keys.problems(proto.stream)
-        self._inbox.put(_ProtoArrival(key, b"", "application/protobuf", time.monotonic_ns(), proto))
+        self._inbox.put(_ProtoArrival(key, b"", "application/protobuf", time.monotonic_ns(), proto=proto))
