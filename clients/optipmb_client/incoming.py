@@ -5,7 +5,7 @@ Payloads are bytes, keys are text, times are `time.monotonic_ns()`.
 
 import collections
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from optipmb_schemas import Message, decode
@@ -26,7 +26,7 @@ class Arrival:
     payload: bytes
     encoding: str
     monotonic_ns: int
-    after_loss: bool = False
+    after_loss: bool = field(default=False, kw_only=True)
 
     def read(self, kind: type[_Message]) -> _Message:
         """Return the message, checked.

@@ -21,6 +21,7 @@ from log_process import LogProcess
 from nats_process import NatsProcess
 from optipmb_schemas import ServiceStatus, decode
 from optipmb_service.cluster.leases import PARTITIONS
+from optipmb_service.cluster.nats_connection import NatsConnection, token
 from proxy import Proxy
 from router import Node, Sensor, until
 from routers import free_endpoint
@@ -404,6 +405,49 @@ def test_a_cut_between_two_routers(tmp_path: Path) -> None:
         between.mend()
         send_plain(40, 50)
         cluster.check(50, "here", "away")
+
+
+def purge(nats: NatsProcess) -> None:
+    """Have the server forget all leases and checkpoints."""
+    connection = NatsConnection([nats.url], lambda: None)
+    until(lambda: not connection.failure, "it is connected")
+    assert connection.call(connection.ask(f"STREAM.PURGE.OPTIPMB_{token(KEYS.prefix)}", {}))["purged"] > 0
+    connection.close(10.0)
+
+
+@pytest.mark.parametrize("cluster", ["nats"], indirect=True)
+def test_all_leases_and_checkpoints_are_purged(cluster: Cluster) -> None:
+    """Members write again what they hold, and their sessions go on, to the byte, also after a kill."""
+    assert cluster.nats is not None
+    first, second = members = [cluster.member(name) for name in "ab"]
+    for member in members:
+        holds(member, PARTITIONS // 2)
+    send(cluster.node, 0, 10, sensors=SENSORS)
+    sessions = {stream: state.session for stream, state in cluster.check(10, "a", "b").items()}
+    purge(cluster.nats)
+    for member in members:
+        member.wait_log("leases_gone")
+    send(cluster.node, 10, 40, sensors=SENSORS)
+    cluster.check(40, "a", "b")
+    assert not any("lease_lost" in member.errors for member in members)
+    time.sleep(1.5)  # three times `checkpoint_s`
+    second.process.kill()
+    send(cluster.node, 40, 60, 0.1, sensors=SENSORS)
+    states = cluster.check(60, "a")
+    assert {stream: state.session for stream, state in states.items()} == sessions
+    assert first.end()[0] == 0
+
+
+@pytest.mark.parametrize("cluster", ["nats"], indirect=True)
+def test_a_member_that_dies_before_a_purge(cluster: Cluster) -> None:
+    """Its record is gone, and its partitions are taken within the lease all the same."""
+    assert cluster.nats is not None
+    first, second = members = [cluster.member(name) for name in "ab"]
+    for member in members:
+        holds(member, PARTITIONS // 2)
+    second.process.kill()
+    purge(cluster.nats)
+    holds(first, PARTITIONS)
 
 
 def test_a_member_drains(cluster: Cluster, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

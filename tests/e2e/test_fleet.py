@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import resource
+import shutil
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -79,6 +81,33 @@ def test_all_that_a_cache_holds_is_tracked_after_an_outage(tmp_path: Path) -> No
         fleet.router.start()
         state = check(node, frames, owner="a", sensor=busy)
     assert (state.shed, state.gaps) == (0, 0)
+
+
+def test_a_store_that_is_deleted_while_in_use(tmp_path: Path) -> None:
+    """The folder is made again with all that it held: its members go on, and so does one that starts after a kill."""
+    store = tmp_path / "store"
+    with Fleet(store, checkpoint_s=0.1) as fleet, Node(fleet.endpoint) as node:
+        services = [fleet.service(name) for name in "ab"]
+        send(node, 0, 10)
+        node.tracks(SENSOR.stream, 10)
+        for last in (20, 30):
+            shutil.rmtree(store)
+            send(node, last - 10, last)
+            files = [store / "sessions.db", store / "leases.db"]
+            until(lambda: all(file.exists() for file in files), "both files are there again")  # noqa: B023 - called here
+        for service in services:
+            service.wait_log("store_deleted")
+        (owner,) = {KEYS.instance_of(key) for key in node.alive(KEYS.all_owners())}
+        session = check(node, 30, owner=owner).session
+        assert not any("lease_lost" in service.errors for service in services)
+        time.sleep(0.5)  # several times `checkpoint_s`
+        for service in services:
+            service.process.kill()
+            service.process.wait()
+        fleet.service("c")
+        send(node, 30, 40)
+        state = check(node, 40, owner="c")
+    assert (state.session, state.gaps) == (session, 0)
 
 
 def test_killed_before_its_first_checkpoint(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ class Subscription:
         payload, key = sample.payload.to_bytes(), str(sample.key_expr)
         after_loss = key in self._after_loss
         self._after_loss.discard(key)
-        self._inbox.put(Arrival(key, payload, str(sample.encoding), arrived, after_loss))
+        self._inbox.put(Arrival(key, payload, str(sample.encoding), arrived, after_loss=after_loss))
 
     def _ask(self, selector: str, reply: Callable[[zenoh.Sample], None], end: Callable[[bool], None]) -> None:
         errors = []

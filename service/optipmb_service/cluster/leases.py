@@ -92,6 +92,8 @@ class Change(StrEnum):
     HELD = "held"
     RECALLED = "recalled"
     """Another member is to have it as soon as the states of its streams are kept."""
+    RENEWED = "renewed"
+    """It is held under another fence: the store had lost its record, and nobody else has taken it."""
     LOST = "lost"
     """Another member may continue its streams already: the states here are not the newest, and are not to be kept."""
 
@@ -331,6 +333,15 @@ class LeaseTable:
             self._members[name] = _Watched(revision, ENDED, 0)
         else:
             self._set(int(name), revision, write.value)
+
+    def gone(self, key: str) -> None:
+        """Take in that the store has lost a record: the next write of it replaces none."""
+        kind, _, name = key.partition("/")
+        self._done_when = None
+        if kind == "partition":
+            self._partitions[int(name)] = 0, self._partitions.get(int(name), (0, NOBODY))[1]
+        elif name in self._members:
+            self._members[name].revision = 0
 
     def _share(self) -> int:
         """Return how many of all partitions are an equal share of this member; where none takes any, all have one."""

@@ -23,6 +23,7 @@ from optipmb_service.cluster.leases import (
     WriteLease,
     instance_of,
     member_key,
+    partition_key,
     partition_of,
     wish_key,
 )
@@ -100,6 +101,10 @@ class Member:
         self._shown: tuple[list[str], int] = ([], 0)
         self._reported: dict[int, int] = {}
         self._recalled: set[int] = set()
+        self._gone: set[int] = set()
+        """Partitions that are held, and whose records the store has lost."""
+        self._renewed: set[int] = set()
+        """Those whose records were written again, as long as nobody was told."""
         self._came = threading.Condition()
         self._changed: Callable[[int, Change], None] = lambda *_: None
         self._resumed: Callable[[], None] = lambda: None
@@ -254,13 +259,17 @@ class Member:
         self._table.state = self._state()
         if not self._keep():
             return
+        self._write_again()
         records, now_ns = self._store.follow(self._table.position), self._clock()
         self._table.take_in(records, now_ns)
         # At the same time: after a pause of the machine in between all the others would look frozen.
         for write in self._table.due(now_ns, self._occupied, self._store.gone):
             if not self._keep():
                 return
-            self._table.written(write, self._store.put(write))
+            revision = self._store.put(write)
+            self._table.written(write, revision)
+            if revision is None and write.over and self._store.get(write.key) is None:
+                self._table.gone(write.key)
             if write.value == ENDED:
                 self._wake.set()  # its partitions can be taken at once
 
@@ -284,14 +293,17 @@ class Member:
         revision = self._put_alive(key, value)
         if revision is None:
             found = self._store.get(key)
-            if found is None or found.value == ENDED:
+            if found is not None and found.value == ENDED:
                 self._lose()
                 return False
-            # A renewal of its own, whose answer did not arrive.
+            # A renewal of its own, whose answer did not arrive; or the store has lost its records.
             sent_ns = self._clock()
-            revision = self._store.put(Write(key, value, found.revision))
+            revision = self._store.put(Write(key, value, 0 if found is None else found.revision))
             if revision is None:
                 return False
+            if found is None:
+                log.error("leases_gone", member=self._table.member, partitions=len(self._table.held))
+                self._gone = set(self._table.held)
         was = self._write_lease.valid(self._clock())
         if not self._unwritable:
             self._said = value
@@ -304,6 +316,19 @@ class Member:
         if not was:
             self._resumed()
         return not self._unwritable
+
+    def _write_again(self) -> None:
+        """Write records of partitions that the store has lost; one that another member has taken meanwhile is lost."""
+        while self._gone:
+            partition = next(iter(self._gone))
+            write = Write(partition_key(partition), self._table.member, 0)
+            revision = self._store.put(write)
+            if revision is not None:
+                self._table.written(write, revision)
+                self._renewed.add(partition)
+            elif (found := self._store.get(write.key)) is not None:
+                self._table.take_in([found], self._clock())
+            self._gone.discard(partition)
 
     def _time_renewal(self, sent_ns: int) -> None:
         """See whether a renewal that has just been answered was in time."""
@@ -340,6 +365,7 @@ class Member:
         self._error = "another member has taken over its partitions"
         state, self._table = self._table.state, self._joining()
         self._table.state = state
+        self._gone = set()
         self._revision = 0
 
     def _joining(self) -> LeaseTable:
@@ -356,11 +382,12 @@ class Member:
         reported, self._reported = self._reported, held
         if held != reported:
             lost = {partition for partition, fence in reported.items() if held.get(partition) != fence}
+            renewed, self._renewed = self._renewed & lost & held.keys(), set()
             for partition in lost:
                 self._recalled.discard(partition)
-                self._changed(partition, Change.LOST)
+                self._changed(partition, Change.RENEWED if partition in renewed else Change.LOST)
             for partition in held:
-                if partition not in reported or partition in lost:
+                if partition not in reported or partition in lost - renewed:
                     self._changed(partition, Change.HELD)
         for partition in leaving - self._recalled:
             self._recalled.add(partition)

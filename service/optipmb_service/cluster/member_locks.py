@@ -57,6 +57,22 @@ class MemberLocks:
         self.close()
         self._member, self._file = member, file
 
+    def restore(self) -> None:
+        """Take the lock of this process again: its file was deleted.
+
+        Raises:
+            StoreError: the file cannot be made.
+        """
+        if self._folder is not None and self._member:
+            try:
+                self._folder.mkdir(exist_ok=True)
+                member, self._member = self._member, ""
+                if not _lock_of(self._folder, member).exists():
+                    self.take(member)
+                self._member = member
+            except OSError as error:
+                raise StoreError(f"{self._folder}: {error}") from error
+
     def leave(self, member: str) -> None:
         """Remove the lock of a member that has ended."""
         if self._folder is not None:

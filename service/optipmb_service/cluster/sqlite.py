@@ -95,7 +95,9 @@ class SqliteStore:
         self._clock = clock
         self._checkpoints = Database(path, _CHECKPOINTS, "NORMAL", PAGE_BYTES)
         try:
-            self._leases = Database(None, _RECORDS, "OFF") if path is None else _leases_beside(path)
+            self._leases = (
+                Database(None, _RECORDS, "OFF") if path is None else _leases_beside(path, self._locks.restore)
+            )
         except StoreError:
             self._checkpoints.close()
             raise
@@ -227,7 +229,7 @@ def _some(left: Iterator[tuple[str, Fenced]]) -> list[tuple[str, Fenced]]:
     return some
 
 
-def _leases_beside(path: Path) -> Database:
+def _leases_beside(path: Path, restored: Callable[[], None]) -> Database:
     """Open the file of the records; one that is damaged is made anew when no member uses it.
 
     Raises:
@@ -245,7 +247,7 @@ def _leases_beside(path: Path) -> Database:
             log.warning("leases_damaged", file=str(file))
             for one in (file, *(file.with_name(f"{LEASES}{end}") for end in ("-wal", "-shm"))):
                 one.unlink(missing_ok=True)
-        return Database(file, _RECORDS, "OFF")
+        return Database(file, _RECORDS, "OFF", restored=restored)
     except OSError as error:
         raise StoreError(f"{file}: {error}") from error
     finally:

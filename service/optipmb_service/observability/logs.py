@@ -42,6 +42,8 @@ EVENTS: Final = {
     "unknown_environment": "Variables `OPTIPMB_…` that are not settings, usually misspelt.",
     "peer_connected": "A node, router or service has connected.",
     "tracker_message": "A `text` of the tracker: it compiles, for up to a minute.",
+    "leases_gone": "The store has lost its records, as by a purge in NATS; the member writes its own again.",
+    "store_deleted": "A `file` of the store was deleted while in use, and was made again with all that it held.",
     "peer_lost": "A connection is lost. A client reconnects and recovers what the caches hold.",
     "session_opened": "A stream's first valid message came, or parameters were set for it.",
     "session_restored": "A session continues from its checkpoint; missed frames are requested from publishers.",

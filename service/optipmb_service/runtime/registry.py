@@ -280,9 +280,11 @@ class Registry:
         """Have actors run what a change of their partition asks for; those that came here are to be taken up."""
         if change is Change.HELD:
             return
-        command = StreamActor.on_recalled if change is Change.RECALLED else StreamActor.on_lost
+        commands = {Change.RECALLED: StreamActor.on_recalled, Change.RENEWED: StreamActor.on_renewed}
+        command = commands.get(change, StreamActor.on_lost)
         for actor in [actor for actor in self._actors.every() if partition_of(actor.stream) == partition]:
-            if actor.session is not None:  # before it ends: what comes from then on is kept for who asks
+            if actor.session is not None and change is not Change.RENEWED:
+                # Before it ends: what comes from then on is kept for who asks.
                 self.untracked.leave(actor.stream, asked_for=change is Change.RECALLED)
             actor.tell(command)
 

@@ -266,6 +266,12 @@ class StreamActor:
             self._out.report("superseded", "", "an instance that is neither frozen nor cut off", "another one goes on")
         self._drop_session("superseded")
 
+    def on_renewed(self) -> None:
+        """Go on under another fence: the store has lost the lease, and all checkpoints with it."""
+        self._fence = self._context.member.fence(self.stream)
+        self._out.tracks.renew(self._fence)
+        self._tracking.changed = True
+
     def on_recalled(self) -> None:
         """Another instance is to have the stream: leave it as soon as its state is kept.
 

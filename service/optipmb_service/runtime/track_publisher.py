@@ -82,6 +82,10 @@ class TrackPublisher:
         except TransportError as error:
             log.warning("publisher_failed", stream=self._stream, error=str(error))
 
+    def renew(self, fence: int | None) -> None:
+        """Go on under another fence."""
+        self._fence = fence
+
     def close(self) -> None:
         """Withdraw the publisher; what waits is dropped: another owner publishes it."""
         self.waiting.clear()
