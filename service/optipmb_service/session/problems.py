@@ -63,7 +63,7 @@ CODES: Final = {
         "Nothing. If it happens often, raise `lease_s`, or look for what stops the process.",
     ),
     "contested": (
-        "Two instances without the same `store` track the stream.",
+        "Two instances without the same `store` track the stream; reported until one is left.",
         "Give them one `store` or `cluster`, or routers of their own.",
     ),
     "cut": (
