@@ -10,7 +10,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -19,7 +19,7 @@ from commands import run_here
 from fleet import Fleet, RouterProcess, freeze, thaw
 from log_process import LogProcess
 from nats_process import NatsProcess
-from optipmb_schemas import ServiceStatus, decode
+from optipmb_schemas import Problem, ServiceStatus, decode
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.cluster.nats_connection import NatsConnection, token
 from proxy import Proxy
@@ -448,6 +448,44 @@ def test_a_member_that_dies_before_a_purge(cluster: Cluster) -> None:
     second.process.kill()
     purge(cluster.nats)
     holds(first, PARTITIONS)
+
+
+def test_a_member_that_was_cut_off_contests_nothing(tmp_path: Path) -> None:
+    """The member that looks at who tracks what is cut off for longer than links last: when all is whole, no problem."""
+    (tmp_path / "nats").mkdir()
+    names = ("a", "b", "c")
+    with (
+        NatsProcess(tmp_path / "nats") as nats,
+        Fleet(tmp_path) as fleet,
+        ExitStack() as proxies,
+        Node(fleet.endpoint) as node,
+    ):
+        cluster = Cluster(tmp_path, nats, fleet, fleet.endpoint, node)
+        ways = {name: [proxies.enter_context(Proxy(to)) for to in (nats.address, fleet.endpoint)] for name in names}
+        members = {
+            name: cluster.member(name, to_router.endpoint, cluster=f"nats://{to_server.address}")
+            for name, (to_server, to_router) in ways.items()
+        }
+        for member in members.values():
+            until(lambda member=member: _held(member) in {21, 22}, "each holds a third of the partitions")
+        send(node, 0, 20, sensors=SENSORS)
+        cluster.check(20, *names)
+        looks = next(
+            one.member.partition("/")[0]
+            for one in node.ask(KEYS.status("a"), ServiceStatus).members
+            if 0 in one.partitions
+        )
+        for proxy in ways[looks]:
+            proxy.cut()
+        send(node, 20, 170, 0.1, sensors=SENSORS)
+        cluster.check(170, *set(names) - {looks})
+        for proxy in ways[looks]:
+            proxy.mend()
+        members[looks].wait_log("lease_lost")
+        send(node, 170, 320, 0.1, sensors=SENSORS)
+        cluster.check(320, *names)
+        problems = [decode(payload, Problem) for _, payload, _ in node.problems_seen.items]
+    assert not [one.received for one in problems if one.code == "contested"]
 
 
 def test_a_member_drains(cluster: Cluster, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

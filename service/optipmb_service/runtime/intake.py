@@ -337,7 +337,7 @@ class Intake:
             self._handover.take(coming)
 
     def _watch_owners(self, *, discovering: bool) -> None:
-        if discovering is not self._watching:
+        if discovering is not self._watching or (discovering and self._registry.doubts_owners):
             self._inputs.watch_owners(self._registry.on_owner() if discovering else None)
             self._watching = discovering
 

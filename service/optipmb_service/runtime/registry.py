@@ -102,7 +102,7 @@ class Registry:
         """Returns the stream of a key and its session, or raises MessageError where it is none."""
         self._metrics = metrics
         self._admission = Admission(settings, self._used, self._evict_for_another)
-        self._rivals = Rivals(round(RIVAL_LEASES * settings.lease_s * SECOND))
+        self._rivals = Rivals(settings.instance, round(RIVAL_LEASES * settings.lease_s * SECOND))
         standby = ByteBudget(settings.standby_mb * MEGABYTE)
 
         def buffer(keep_ns: int = ANY_AGE_NS) -> TakeoverBuffer:
@@ -250,8 +250,14 @@ class Registry:
 
     def on_owner(self) -> Callable[[str, str, bool], None]:
         """Forget who tracks what; return what takes in, from now on, that an instance does so, or no longer."""
-        self._rivals = Rivals(round(RIVAL_LEASES * self._settings.lease_s * SECOND))
+        patience_ns = round(RIVAL_LEASES * self._settings.lease_s * SECOND)
+        self._rivals = Rivals(self.instance, patience_ns, self._rivals.doubted)
         return self._rivals.on_owner
+
+    @property
+    def doubts_owners(self) -> bool:
+        """Whether who tracks what is to be asked for again."""
+        return bool(self._rivals.doubted)
 
     def elsewhere(self, stream: str) -> bool:
         """Whether another instance tracks a stream, and answers for it."""

@@ -94,7 +94,7 @@ class Sweep:
                 self._command(actor.stream, StreamActor.look_in_log, urgent=False)
             if now_ns - actor.meter.active_ns > self._idle_ns and actor.mailbox.idle:
                 self._command(actor.stream, self._close_idle, urgent=False)
-        for stream, owners in rivals.contested(now_ns):
+        for stream, owners in rivals.contested(now_ns, [actor.stream for actor in actors]):
             tracked = f"it is tracked by {' and '.join(owners)}"
             self._report("contested", stream, "one `store`, or `cluster`, for all instances", tracked)
         self._evict(actors)

@@ -67,7 +67,7 @@ CODES: Final = {
         "Renew it; see `security.md`. A process that listens with it needs a restart.",
     ),
     "contested": (
-        "Two instances without the same `store` track the stream.",
+        "Two instances without the same `store` track the stream; reported until one is left.",
         "Give them one `store` or `cluster`, or routers of their own.",
     ),
     "duplicate_name": (
