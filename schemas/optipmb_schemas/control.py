@@ -179,6 +179,10 @@ class SessionSummary(Message):
         default=(), max_length=256, description="Streams that share the session; none: it is that of one stream."
     )
     silent: tuple[Stream, ...] = Field(default=(), max_length=256, description="Those of them without a frame lately.")
+    configured: Name | None = Field(
+        default=None,
+        description="Profile that the settings name, where the session runs with another one, or with other values.",
+    )
 
 
 class MemberSummary(Message):

@@ -20,7 +20,7 @@ ALLOWED = {
 }  # fmt: skip
 EXCEPTIONS = {
     "boxing": {"llvmlite"},  # to emit the code of a conversion
-    "compiled": {"logging"},  # to say why a first frame takes a minute
+    "compiled": {"logging", "os", "stat", "tempfile"},  # to say why a first frame takes a minute; a folder for kernels
     "warm": {"gc"},  # to collect less often while a compiler fills the memory
     "online": {"pandas", "pyarrow"},  # to give tracks in the tables that users ask for
 }
