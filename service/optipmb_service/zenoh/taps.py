@@ -55,7 +55,7 @@ class Taps:
         self._lock = threading.Lock()
         self._taps: dict[tuple[str, str], _Tap] = {}
         self._timed = False
-        self._left, self._at = float(BURST), time.monotonic()
+        self._turns = key_numbers.Turns(BURST, PERIOD_S)
 
     def join(self, names: tuple[str, str], receive: Receive) -> Callable[[], None]:
         """Hand over the newest tracks and detections of streams, until the result is called, which may be twice.
@@ -70,7 +70,7 @@ class Taps:
         with self._lock:
             tap = self._taps.get(names)
             if tap is None:
-                self._take_turn()
+                self._turns.take()
                 tap = self._taps[names] = _Tap(self._session, self._prefix, *names)
             listener = object()
             tap.listeners = tap.listeners | {listener: receive}
@@ -107,14 +107,6 @@ class Taps:
             timer.start()
         for _, tap in ended:
             tap.close()
-
-    def _take_turn(self) -> None:
-        now = time.monotonic()
-        self._left, self._at = min(float(BURST), self._left + (now - self._at) / PERIOD_S), now
-        if self._left < 1:
-            wait_s = (1 - self._left) * PERIOD_S
-            raise TransportError(f"too many streams were looked at; the next one can be in {wait_s:.0f} s")
-        self._left -= 1
 
 
 class _Tap:
