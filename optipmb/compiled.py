@@ -87,11 +87,12 @@ def _compiled(function: F, *, nogil: bool) -> F:
         folder = _private_folder()
         if folder is None:
             return cast("F", jit()(function))
-        usual, config.CACHE_DIR = config.CACHE_DIR, folder
+        options: Any = config  # it has names that are set at run time
+        usual, options.CACHE_DIR = options.CACHE_DIR, folder
         try:
             compiled = jit(cache=True)(function)
         finally:
-            config.CACHE_DIR = usual
+            options.CACHE_DIR = usual
     compiled._cache._cache_file._source_stamp = _SOURCES  # noqa: SLF001 - numba has no public name for it
     return cast("F", compiled)
 

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from optipmb_client.columns import without
-from optipmb_client.status import duration
+from optipmb_client.status import duration, profile_of
 
 __all__ = ["Board"]
 
@@ -159,7 +159,7 @@ class Board:
             table.add_row(
                 session.stream,
                 *([instance] if several else []),
-                session.profile,
+                profile_of(session),
                 _state(session.state),
                 f"{session.rate_hz:.1f}",
                 f"{session.latency_p50_ms:.1f}",

@@ -27,6 +27,7 @@ from optipmb_client.commands.plot import plot
 from optipmb_client.commands.profiles import profiles
 from optipmb_client.commands.record import record
 from optipmb_client.commands.replay import replay
+from optipmb_client.commands.set import set_profile
 from optipmb_client.commands.status import status
 from optipmb_client.commands.sweep import sweep
 from optipmb_client.commands.track import track
@@ -90,12 +91,14 @@ for command in (
     tracks,
     profiles,
     load,
+    set_profile,
     move,
     drain,
     warm_up,
 ):
     paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
-    app.command(cls=_Command, help="\n\n".join(" ".join(part.split()) for part in paragraphs))(grouped(command))
+    name = "set" if command is set_profile else None  # a function of that name would hide Python's own
+    app.command(name, cls=_Command, help="\n\n".join(" ".join(part.split()) for part in paragraphs))(grouped(command))
 
 
 def _version(value: bool) -> None:  # noqa: FBT001  the parser calls it so

@@ -8,7 +8,7 @@ from rich.console import Group, JustifyMethod, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-__all__ = ["duration", "members_of", "render"]
+__all__ = ["duration", "members_of", "profile_of", "render"]
 
 COLUMNS = ("stream", "profile", "state", "frames/s", "p50 ms", "p99 ms", "frames", "tracks", "queue")
 COUNTED = ("refused", "shed", "late", "gaps", "duplicates", "last frame")
@@ -69,7 +69,7 @@ def _streams(sessions: Sequence[SessionSummary]) -> Table:
     for session in sessions:
         table.add_row(
             session.stream,
-            session.profile,
+            profile_of(session),
             session.state,
             f"{session.rate_hz:.1f}",
             f"{session.latency_p50_ms:.1f}",
@@ -87,6 +87,11 @@ def _streams(sessions: Sequence[SessionSummary]) -> Table:
         for sensor in session.sensors:
             table.add_row(f"  {sensor}", "", "silent" if sensor in session.silent else "feeds it")
     return table
+
+
+def profile_of(session: SessionSummary) -> str:
+    """Return the profile of a session, and that of the settings where it is another one."""
+    return session.profile if session.configured is None else f"{session.profile} (settings: {session.configured})"
 
 
 def _problem(problem: Problem) -> Text:

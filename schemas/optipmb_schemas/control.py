@@ -181,6 +181,10 @@ class SessionSummary(Message):
     silent: tuple[Stream, ...] = Field(default=(), max_length=256, description="Those of them without a frame lately.")
     late: Count = Field(default=0, description="Frames that came too late.")
     duplicates: Count = Field(default=0, description="Frames that had been tracked before.")
+    configured: Name | None = Field(
+        default=None,
+        description="Profile that the settings name, where the session runs with another one, or with other values.",
+    )
 
 
 class MemberSummary(Message):

@@ -77,6 +77,33 @@ def test_metrics_count_calls_and_messages_by_method(metered: tuple[GatewayProces
     assert sum(value for key, value in told.items() if key.startswith("grpc_refused_total")) == 1
 
 
+def test_calls_that_come_again_use_up_no_keys(metered: tuple[GatewayProcess, str], stream: str) -> None:
+    """Whatever is called again and again for one stream declares no keys but those of the first call."""
+    gateway, address = metered
+    stub: Any = gateway.stub()
+
+    def declared() -> float:
+        with urllib.request.urlopen(address, timeout=10) as answer:  # noqa: S310 - the gateway's own address
+            return float(re.findall(r"^optipmb_declared_keys_total (\S+)$", answer.read().decode(), re.MULTILINE)[0])
+
+    def round_of_calls(number: int) -> None:
+        responses = list(stub.Track((detections(frame(seq + 5 * number, stream)) for seq in range(5)), timeout=60))
+        assert len(responses) == 5
+        list(stub.Publish(iter([detections(frame(5 * number, f"{stream}-2"), pb.PublishRequest)]), timeout=60))
+        watching = stub.Subscribe(pb.SubscribeRequest(pattern="*/*/*", problems=True), timeout=60)
+        watching.initial_metadata()
+        watching.cancel()
+        wait_for(lambda: not any(value for key, value in counts(address).items() if "open_calls" in key), "open calls")
+
+    before = declared()
+    round_of_calls(0)
+    first = declared()
+    assert first > before
+    for number in range(1, 10):
+        round_of_calls(number)
+    assert declared() == first
+
+
 def test_calls_that_are_cancelled_or_late_leave_nothing(metered: tuple[GatewayProcess, str], stream: str) -> None:
     """Their subscriptions and publishers are withdrawn, so that threads and open calls are as before."""
     gateway, address = metered

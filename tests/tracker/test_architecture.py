@@ -19,7 +19,7 @@ ALLOWED = {
     "tomllib", "types", "typing",
 }  # fmt: skip
 EXCEPTIONS = {
-    "compiled": {"logging"},  # to say why a first frame takes a minute
+    "compiled": {"logging", "os", "stat", "tempfile"},  # to say why a first frame takes a minute; a folder for kernels
     "warm": {"gc"},  # to collect less often while a compiler fills the memory
     "online": {"pandas", "pyarrow"},  # to give tracks in the tables that users ask for
 }

@@ -53,7 +53,8 @@ class GrpcConnection:
     ) -> None:
         self.where = ", ".join(addresses)
         if not timeout >= 0:  # NaN is not
-            raise ConnectionFailed(f"timeout: expected seconds, 0 or more, received {timeout!r}", endpoints=addresses)
+            text = f"timeout: expected seconds, 0 or more, received {timeout!r}"
+            raise ConnectionFailed(text, endpoints=tuple(addresses))
         self._timeout = min(timeout, threading.TIMEOUT_MAX)
         self._channels = Channels(addresses, config, metadata, self._timeout)
 

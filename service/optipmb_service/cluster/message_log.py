@@ -10,6 +10,7 @@ that neither the clocks of machines nor those of sensors are compared with each 
 
 from __future__ import annotations
 
+import asyncio
 import math
 import time
 from dataclasses import dataclass
@@ -46,6 +47,13 @@ MISSING_S: Final = 0.1
 
 NO_LOG: Final = 10059
 TOO_LARGE: Final = 10054
+WRITTEN_NOW: Final = 10158
+"""Another bridge writes the same message, and several servers have not agreed on it yet."""
+
+AGAIN_S: Final = 0.05
+TRIES: Final = 40
+"""It is asked about so often before that is a failure."""
+
 ID: Final = "Nats-Msg-Id"
 FRAME: Final = "Optipmb-Frame"
 ENCODING: Final = "Optipmb-Encoding"
@@ -180,7 +188,11 @@ class MessageLog:
         )
         if size > (most := self.connection.client().max_payload):
             raise NotKeptError(f"{size} bytes with its headers, and the servers take {most} at once")
-        answer = await self.connection.request(subject, message.payload, headers)
+        for _ in range(TRIES):
+            answer = await self.connection.request(subject, message.payload, headers)
+            if answer.get("error", {}).get("err_code") != WRITTEN_NOW:
+                break
+            await asyncio.sleep(AGAIN_S)
         if "error" in answer:
             refused = RefusedError(answer["error"])
             raise NotKeptError(str(refused)) if refused.code == TOO_LARGE else refused

@@ -6,6 +6,7 @@ import asyncio
 import collections
 import contextlib
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
 import optipmb_schemas as schemas
@@ -14,6 +15,7 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.transcode import EncodedTracks, transcode
 
+from optipmb_service.grpc.kept import Kept
 from optipmb_service.grpc.outbox import varint
 from optipmb_service.grpc.selection import Selection
 
@@ -22,6 +24,9 @@ if TYPE_CHECKING:
 
     from optipmb_service.zenoh.client import Client, Message
     from optipmb_service.zenoh.subscription import Subscription
+
+KEPT: Final = 256
+"""Subscriptions that are kept when no call has them any more."""
 
 HISTORY_S: Final = 2.0
 """Longest wait for the caches of the services."""
@@ -85,6 +90,7 @@ class Feeds:
         self._feeds: dict[str, _Feed] = {}
         self._handed: collections.deque[tuple[Listener, Item]] = collections.deque()
         self._waking = False
+        self._kept = Kept(loop, KEPT)
 
     @contextlib.asynccontextmanager
     async def joined(self, key: str, listener: Listener) -> AsyncIterator[None]:
@@ -93,6 +99,7 @@ class Feeds:
         Raises:
             TransportError: the network cannot be used.
         """
+        self._kept.take(key)
         feed = self._feeds.setdefault(key, _Feed())
         feed.listeners = (*feed.listeners, listener)
         try:
@@ -101,10 +108,20 @@ class Feeds:
             yield
         finally:
             feed.listeners = tuple(one for one in feed.listeners if one is not listener)
-            if not feed.listeners:
+            if not feed.listeners and feed.subscription is None:
                 del self._feeds[key]
-                if feed.subscription is not None:
-                    await asyncio.shield(asyncio.to_thread(feed.subscription.close))
+            elif not feed.listeners:
+                self._kept.keep(key, partial(self._end, key, feed))
+
+    def close(self) -> None:
+        """End the subscriptions that no call has any more."""
+        self._kept.close()
+
+    def _end(self, key: str, feed: _Feed) -> None:
+        if self._feeds.get(key) is feed:
+            del self._feeds[key]
+        if feed.subscription is not None:
+            self._loop.run_in_executor(None, feed.subscription.close)
 
     async def recent(self, key: str) -> list[EncodedTracks]:
         """Return the tracks that the services keep under a key expression, each stream's as they were published.
@@ -120,7 +137,8 @@ class Feeds:
 
     def _receive(self, feed: _Feed, message: Message) -> None:
         """Take a message on the thread of its subscription."""
-        listeners = feed.listeners
+        if not (listeners := feed.listeners):
+            return
         handed: list[tuple[Listener, Item]] = []
         if message.key.endswith("/problems"):
             problem = self._problem(message)

@@ -103,14 +103,10 @@ class Incoming:
                 loop.call_soon_threadsafe(matched)
 
         options = self._options
-        outgoing = self._call.gateway.client.publish(
-            self.stream, options.cache or CACHE, options.cache_clouds, matching
-        )
-        self._outgoing = outgoing
-        try:
+        key = self.stream, options.cache or CACHE, options.cache_clouds
+        async with self._call.gateway.outlets.opened(key, matching) as outgoing:
+            self._outgoing = outgoing
             yield outgoing
-        finally:
-            await asyncio.shield(asyncio.to_thread(outgoing.close))
 
     async def send(self, message: schemas.Detections | schemas.Points) -> None:
         """Hand a message to the network; a cloud only if somebody takes it.

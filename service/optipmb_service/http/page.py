@@ -1,8 +1,8 @@
 """The page for people: streams, health and the live tracks of one stream, seen from above.
 
-Nothing here costs anything until somebody looks. Whoever looks at a stream has a tap on its keys for as long as the
-connection lasts, and gets the newest frame at most ten times a second; what a slow viewer cannot take is never made.
-Files and data come from here alone, and a header has the browser accept nothing else.
+Nothing here costs anything until somebody looks. Those who look at a stream share a tap on its keys, which ends a
+minute after the last of them. Each gets the newest frame at most ten times a second; what a slow viewer cannot take is
+never made. Files and data come from here alone, and a header has the browser accept nothing else.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 from starlette.routing import Route
 
 from optipmb_service.http.live import Newest, live_frame
+from optipmb_service.runtime.ports import TransportError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -30,6 +31,9 @@ PERIOD_S: Final = 0.1
 
 KEEP_ALIVE_S: Final = 5.0
 """A silent stream gets a sign of life, so that nobody in between takes the connection for dead."""
+
+RETRY_MS: Final = 15_000
+"""A viewer whose stream cannot be subscribed to comes back after so long."""
 
 VIEWERS: Final = 16
 """Those who look at the same time; more are asked to come back."""
@@ -62,6 +66,9 @@ class Watched(Protocol):
         """Hand over topic, payload and encoding of a stream's detections and tracks until the result is called.
 
         None while the service starts. `receive` is called by other threads and must return at once.
+
+        Raises:
+            TransportError: the network cannot be used, or too many streams were looked at.
         """
 
 
@@ -135,6 +142,9 @@ class _Viewers:
         tapped = loop.run_in_executor(None, self._watched.tap, stream, newest.put)
         try:
             release = await asyncio.shield(tapped)
+        except TransportError as error:
+            yield f"retry: {RETRY_MS}\n: {error}\n\n"
+            return
         except asyncio.CancelledError:
             tapped.add_done_callback(_undo)  # the viewer has gone; the thread makes the tap all the same
             raise

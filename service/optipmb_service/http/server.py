@@ -111,8 +111,8 @@ class _Connection(H11Protocol):
         return self.cycle is not None and not self.cycle.response_complete
 
     def _end_without_request(self) -> None:
-        if self.cycle is None:
-            self.transport.abort()
+        if self.headers is None:  # its type says that it never is
+            self.transport.abort()  # type: ignore[unreachable]
 
 
 class _Bounded:

@@ -47,6 +47,8 @@ EVENTS: Final = {
     "peer_lost": "A connection is lost. A client reconnects and recovers what the caches hold.",
     "session_opened": "A stream's first valid message came, or parameters were set for it.",
     "session_restored": "A session continues from its checkpoint; missed frames are requested from publishers.",
+    "profile_differs": "A session continues with the `profile` of its checkpoint, and the settings name `configured`,"
+    " or have other values for it. `optipmb set STREAM --profile NAME --restart` changes it.",
     "session_begun": "A density began: `first` frame, `publisher` restarted with a jump, a `jump` of stamps, `reset`, "
     "`parameters`, an implausible `pose`, too much `effort`, the end of a `quarantine`. Repeated jumps: check"
     " the sensor's clock.",

@@ -119,6 +119,9 @@ class SessionOpening:
             context.metrics.restored()
             frames = restored.counters.frames
             log.info("session_restored", stream=self._stream, session=restored.session, frames=frames)
+            if configured := self.configured(restored):
+                in_force = restored.parameters.name
+                log.warning("profile_differs", stream=self._stream, profile=in_force, configured=configured)
             return restored
         session = Session(
             self._stream,
@@ -131,6 +134,13 @@ class SessionOpening:
         )
         log.info("session_opened", stream=self._stream, profile=session.parameters.name)
         return session
+
+    def configured(self, session: Session) -> str | None:
+        """Return the profile that the settings name where the session tracks with another one, or with other values."""
+        wanted = self._context.parameters_of(self._stream)
+        in_force = session.parameters
+        same = in_force is wanted or in_force.model_copy(update={"horizons": wanted.horizons}) == wanted
+        return None if same else wanted.name
 
     def pass_on(self, session: Session) -> None:
         """Keep what waits in a session for the instance that goes on with it: clouds of held frames come there."""

@@ -432,4 +432,6 @@ class StreamActor:
         if session is None:
             return None
         degraded = self._tracking.limit.is_exceeded(now_ns)
-        return self.sensors.summary(self._accounts.state(session), now_ns, degraded=degraded)
+        summary = self.sensors.summary(self._accounts.state(session), now_ns, degraded=degraded)
+        configured = self._opening.configured(session)
+        return summary if configured is None else summary.model_copy(update={"configured": configured})

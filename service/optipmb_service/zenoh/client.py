@@ -7,7 +7,7 @@ two apart. Everything here may be called by any thread; `ask` and `recent` wait 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, Final, Self, cast
 
 import optipmb_schemas as schemas
 import zenoh
@@ -25,6 +25,13 @@ if TYPE_CHECKING:
     from optipmb_service.settings.model import Settings
     from optipmb_service.zenoh.handles import Putting
     from optipmb_service.zenoh.key_numbers import KeyCount
+
+
+NEW_STREAMS: Final = 4000
+"""Publishers and subscriptions that edges have declared at once."""
+
+NEW_STREAM_S: Final = 0.5
+"""Time after which there is a further one, in the long run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +69,7 @@ class Outgoing:
         wanted: Callable[[], None],
     ) -> None:
         self._matching: Any = None
+        self.wanted = wanted
         taken = key_numbers.take(session, key_numbers.CACHED)
         cached = cached_publisher(session, keys.detections(stream), schemas.Detections, cache)
         self._detections = Publisher(cached, (taken,))
@@ -82,7 +90,7 @@ class Outgoing:
                 priority=zenoh.Priority.DATA_LOW,
             )
             self._points, self._matching = Publisher(cast("Putting", plain), (taken,)), cast("Any", plain)
-            plain.declare_matching_listener(lambda _status: wanted())
+            plain.declare_matching_listener(lambda _status: self.wanted())
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
 
@@ -128,6 +136,7 @@ class Client:
         self.keys = schemas.Keys(prefix)
         self._session = session
         self._router = router
+        self._turns = key_numbers.Turns(NEW_STREAMS, NEW_STREAM_S)
 
     @classmethod
     def opened(cls, settings: Settings) -> Self:
@@ -157,7 +166,12 @@ class Client:
         return key_numbers.used(self._session)
 
     def publish(self, stream: str, cache: int, cache_clouds: int, wanted: Callable[[], None]) -> Outgoing:
-        """Open the publishers of a stream; arguments and errors are those of `Outgoing`."""
+        """Open the publishers of a stream; arguments and errors are those of `Outgoing`.
+
+        Raises:
+            TransportError: also where too many were opened.
+        """
+        self._turns.take()
         return Outgoing(self._session, self.keys, stream, cache, cache_clouds, wanted)
 
     def publish_problem(self, problem: schemas.Problem) -> None:
@@ -165,7 +179,12 @@ class Client:
         publish_problem(self._session, self.keys, problem)
 
     def subscribe(self, key: str, receive: Callable[[Message], None]) -> Subscription:
-        """Hand over what is published under a key expression, and what caches hold, on a thread of its own."""
+        """Hand over what is published under a key expression, and what caches hold, on a thread of its own.
+
+        Raises:
+            TransportError: the session is closed, or too many were opened.
+        """
+        self._turns.take()
         return Subscription(self._session, key, lambda sample: receive(_message(sample)))
 
     def recent(self, key: str, timeout: float) -> list[Message]:

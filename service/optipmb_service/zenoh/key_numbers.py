@@ -9,6 +9,7 @@ nobody is told. So whoever declares takes the numbers here first. Long before th
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -76,6 +77,36 @@ def forget(session: zenoh.Session) -> None:
     """Forget a session that is closed."""
     with _lock:
         _used.pop(str(session.zid()), None)
+
+
+class Turns:
+    """Bound on how often strangers have keys declared: a burst, then one in each period. May be used by any threads.
+
+    Args:
+        burst: declared at once.
+        period_s: time until there is a further one.
+    """
+
+    def __init__(self, burst: int, period_s: float) -> None:
+        self._burst = burst
+        self._period_s = period_s
+        self._lock = threading.Lock()
+        self._left, self._at = float(burst), time.monotonic()
+
+    def take(self) -> None:
+        """Take a turn.
+
+        Raises:
+            TransportError: there is none now.
+        """
+        with self._lock:
+            now = time.monotonic()
+            self._left = min(float(self._burst), self._left + (now - self._at) / self._period_s)
+            self._at = now
+            if self._left < 1:
+                wait_s = (1 - self._left) * self._period_s
+                raise TransportError(f"too many new streams were asked for; the next one can be in {wait_s:.0f} s")
+            self._left -= 1
 
 
 class DeclaredKey:

@@ -7,7 +7,7 @@ import secrets
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
 import zenoh
@@ -30,6 +30,7 @@ from optipmb_service.zenoh.handles import (
 from optipmb_service.zenoh.inputs import ReturnedPublishers, Topic
 from optipmb_service.zenoh.queries import OpenQueries
 from optipmb_service.zenoh.subscription import ask_cache
+from optipmb_service.zenoh.taps import Taps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -83,6 +84,7 @@ class Transport:
         self._publishers: set[Publisher] = set()
         self._lock = threading.Lock()
         self._alive: Undeclared | None = None
+        self._taps = Taps(self._session, self._prefix)
 
     # Receiving
 
@@ -289,36 +291,13 @@ class Transport:
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None], detections: str = "") -> Callable[[], None]:
         """Hand over topic, payload and encoding of the newest detections and tracks of a stream to a viewer.
 
-        Each topic has a thread of its own, until the result is called. Detections of a session of several streams are
-        those of `detections`, a pattern of streams.
+        Viewers of a stream share its subscriptions, until the last of them has called the result. Detections of a
+        session of several streams are those of `detections`, a pattern of streams.
 
         Raises:
-            TransportError: the session is closed.
+            TransportError: the session is closed, or too many other streams were looked at.
         """
-        taps: list[Undeclared] = [key_numbers.take(self._session, 2 * key_numbers.PLAIN)]
-
-        def follow(topic: Literal["tracks", "detections"]) -> None:
-            def hand_over(samples: Iterable[zenoh.Sample]) -> None:
-                with contextlib.suppress(zenoh.ZError):  # how a channel says that it is closed and empty
-                    for sample in samples:
-                        receive(topic, sample.payload.to_bytes(), str(sample.encoding))
-
-            key = f"{self._prefix}/{(topic == 'detections' and detections) or stream}/{topic}"
-            subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
-            taps.append(subscriber)
-            threading.Thread(target=hand_over, args=(subscriber.handler,), name=f"viewer-{topic}", daemon=True).start()
-
-        def release() -> None:
-            for one in taps:
-                undeclare(one)
-
-        try:
-            follow("tracks")
-            follow("detections")
-        except zenoh.ZError as error:
-            release()
-            raise TransportError(line(error)) from error
-        return release
+        return self._taps.join((stream, detections or stream), receive)
 
     def recent_tracks(self, stream: str) -> list[tuple[bytes, str]]:
         """Return what those who track a stream keep of its tracks for subscribers, each message with its encoding.

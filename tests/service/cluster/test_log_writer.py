@@ -6,7 +6,8 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
-from nats_process import NatsProcess, started
+import structlog
+from nats_process import NatsProcess, NatsTrio, started
 from optipmb_service.app.nats import program
 from optipmb_service.cluster.log_writer import OVERHEAD, TRIES, LogWriter
 from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
@@ -178,6 +179,29 @@ def test_servers_that_are_away_cost_no_message(tmp_path: Path, monkeypatch: pyte
         finally:
             writer.close()
             log.connection.close(10.0)
+
+
+def test_two_writers_on_three_servers_write_each_message_once(tmp_path: Path) -> None:
+    """Both are told of what the other one is just writing, which is no failure: neither is ever degraded."""
+    count = 1000
+    with NatsTrio(tmp_path) as servers:
+        logs = [MessageLog(servers.urls, "optipmb/v1") for _ in range(2)]
+        writers = [LogWriter(log, KEEP, lambda *_: None) for log in logs]
+        try:
+            until(lambda: not any(writer.failure for writer in writers), "both can write")
+            with structlog.testing.capture_logs() as lines:
+                for seq in range(count):
+                    for writer in writers:
+                        writer.put(message(seq, 1000))
+                until(lambda: all(writer.idle() for writer in writers), "all are written")
+            assert [line["event"] for line in lines] == []
+            assert [writer.written + writer.repeated for writer in writers] == [count, count]
+            assert sum(writer.written for writer in writers) == count
+        finally:
+            for writer in writers:
+                writer.close()
+            for log in logs:
+                log.connection.close(10.0)
 
 
 def test_a_log_that_somebody_has_removed_is_made_again(log: MessageLog) -> None:

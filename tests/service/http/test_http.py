@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import itertools
 import json
 import re
 import signal
@@ -23,6 +24,7 @@ from optipmb_service.http import KnownHosts, Server, application
 from optipmb_service.http.server import CONNECTIONS, REQUESTS
 from optipmb_service.observability.metrics import NAMESPACE, SERVICE_METRICS
 from optipmb_service.runtime.ports import HttpError
+from optipmb_service.zenoh.taps import BURST
 from prometheus_client.parser import text_string_to_metric_families
 from router import Node, Sensor, until
 from routers import free_endpoint, open_router
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 KEYS = Keys()
 SENSOR = Sensor()
 END_S = 30.0
+NUMBERS = itertools.count()
 NOT_MADE = {http.client.NOT_FOUND, http.client.SERVICE_UNAVAILABLE}
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
@@ -304,6 +307,32 @@ def test_metrics_count_what_happened(tmp_path: Path) -> None:
         same = samples(asked.decode())
         assert {name for name in figures if name not in same} == set()
         assert same[f"{NAMESPACE}frames_total", ()] == 6
+
+
+def test_viewers_use_up_no_keys() -> None:
+    """Who looks at a stream again and again takes two keys; who asks for ever new streams is told to wait."""
+    with ServiceProcess("--http", "127.0.0.1:0", "--log-format", "json") as service:
+        address = address_of(service)
+        service.wait_ready()
+        host, _, port = address.rpartition(":")
+
+        def declared() -> float:
+            return samples(get(address, "/metrics")[1])[f"{NAMESPACE}declared_keys_total", ()]
+
+        def look(stream: str) -> bytes:
+            with contextlib.closing(http.client.HTTPConnection(host, int(port), timeout=60)) as connection:
+                connection.request("GET", f"/live?stream={stream}")
+                with connection.getresponse() as response:
+                    return response.readline()
+
+        before = declared()
+        for _ in range(100):
+            until(lambda: look("a/b/c") == b": hello\n", "a viewer is let in")
+        assert declared() == before + 2
+        until(lambda: look(f"a/b/stream-{next(NUMBERS)}") == b"retry: 15000\n", "no more streams are subscribed to")
+        assert declared() <= before + 2 * (BURST + 10)
+        assert look("a/b/c") in {b": hello\n", b"retry: 15000\n"}
+        assert get(address, "/healthz")[0] == 200
 
 
 def test_series_of_streams_are_bounded_and_figures_outlive_sessions() -> None:
