@@ -3,11 +3,10 @@
 from typing import Annotated
 
 import typer
-from optipmb_schemas import PREFIX, SessionParameters
+from optipmb_schemas import SessionParameters
 
-from optipmb_client.commands.options import AsJson, Config, Connect, Prefix, print_json, say
+from optipmb_client.commands.options import AsJson, ServiceOptions, print_json, say
 from optipmb_client.sessions import set_parameters
-from optipmb_client.zenoh import Connection
 
 
 def set_profile(
@@ -16,16 +15,14 @@ def set_profile(
     restart: Annotated[  # noqa: FBT002  the parser passes it by its name
         bool, typer.Option("--restart", help="Restart a session that has tracked frames: its tracks end, ids continue.")
     ] = False,
-    connect: Connect = None,
-    config: Config = None,
-    prefix: Prefix = PREFIX,
     *,
+    service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
     """Track a stream with another profile, in place of the one in its checkpoint or in the settings."""
     wanted = SessionParameters(profile=profile, restart=restart)
-    with Connection(connect, config=config, timeout=2.0) as connection:
-        in_force = set_parameters(connection, stream, wanted, prefix=prefix)
+    with service.connection(2.0) as connection:
+        in_force = set_parameters(connection, stream, wanted, prefix=service.prefix)
     if as_json:
         print_json({"command": "set", "stream": stream, "profile": in_force.profile, "session": in_force.session})
     else:
