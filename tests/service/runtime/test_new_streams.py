@@ -119,6 +119,7 @@ def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
     """Return the intake of a member that holds some partitions and tracks nothing yet."""
     registry = SimpleNamespace(
         on_owner=lambda: None,
+        doubts_owners=False,
         instance="m",
         keys=KEYS,
         fusion=Fusion(),
