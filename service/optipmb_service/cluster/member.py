@@ -96,7 +96,8 @@ class Member:
         self._unwritable = False
         self._drains = False
         self._linked: Callable[[], bool] = lambda: True
-        self._linked_ns = clock()
+        self._unlinked_ns: int | None = None
+        """Since when no look has found a router."""
         self._said = ALIVE
         self._shown: tuple[list[str], int] = ([], 0)
         self._reported: dict[int, int] = {}
@@ -277,10 +278,13 @@ class Member:
         """Return what the record of this member is to say."""
         now_ns = self._clock()
         if self._linked():
-            self._linked_ns = now_ns
+            self._unlinked_ns = None
+        elif self._unlinked_ns is None:
+            self._unlinked_ns = now_ns  # not since the last look: who was frozen looks for a router first
         if self._drains:
             return DRAINING
-        return UNLINKED if now_ns - self._linked_ns > self._lease_ns // UNLINKED_PER_LEASE else ALIVE
+        since_ns = now_ns if self._unlinked_ns is None else self._unlinked_ns
+        return UNLINKED if now_ns - since_ns > self._lease_ns // UNLINKED_PER_LEASE else ALIVE
 
     def _keep(self) -> bool:
         """Renew this member's record if it is time to; False: nothing else can be done now."""
