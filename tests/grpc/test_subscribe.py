@@ -142,13 +142,13 @@ def test_the_rate_is_bounded_in_sensor_time(stub: Any, stream: str) -> None:
 
 
 def test_query_by_time(stub: Any, stream: str) -> None:
-    """Frames of a range of stamps, both ends included, in their order; 50 of a stream are kept."""
-    tracked(stub, stream, range(80))
+    """Frames of a range of stamps, both ends included, in their order; 100 of a stream are kept."""
+    tracked(stub, stream, range(130))
     first, last = (frame(seq, stream).stamp_ns for seq in (50, 60))
     ranged = stub.QueryTracks(pb.QueryTracksRequest(pattern=stream, from_ns=first, to_ns=last))
     assert [one.tracks.seq for one in ranged] == list(range(50, 61))
     everything = stub.QueryTracks(pb.QueryTracksRequest(pattern=stream))
-    assert [one.tracks.seq for one in everything] == list(range(30, 80))
+    assert [one.tracks.seq for one in everything] == list(range(30, 130))
 
 
 def test_a_range_that_cannot_be_answered_ends_the_call(stub: Any, stream: str) -> None:
