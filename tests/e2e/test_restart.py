@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import signal
+import sqlite3
 from typing import TYPE_CHECKING
 
 import pytest
 from alone import tracked_alone
-from optipmb_schemas import Keys, ResetRequest
+from optipmb_schemas import Keys, ResetRequest, Tracks
+from optipmb_service.session.checkpoint_codec import DIGEST, HEAD, MAGIC, VERSION
 from router import Node, Sensor, plain
 from service_process import ServiceProcess
 
@@ -63,3 +67,43 @@ def test_streams_that_come_and_go_without_end_have_a_process_restart(
         assert service.end(signal.SIGTERM, deadline_s=END_S)[0] == 0
         assert options or service.errors.count(" keys_used_up ") == 1
         assert service.output == []
+
+
+def test_a_release_that_cannot_read_a_checkpoint_gives_no_id_again(tmp_path: Path) -> None:
+    """After a checkpoint of another version the session is a new one, and its track ids go on."""
+    sensor = Sensor(stream="yard/back/lidar")
+    seen = []
+    for begin in (0, FRAMES):
+        with ServiceProcess("--instance", "one", environment={"OPTIPMB_STORE": str(tmp_path)}) as service:
+            service.wait_ready()
+            with Node(service.endpoint) as node:
+                node.send(*(sensor.detections(seq) for seq in range(begin, begin + FRAMES)))
+                seen.append([one for one in node.tracks(sensor.stream, FRAMES) if len(one.id)])
+            assert service.end(signal.SIGTERM, deadline_s=END_S)[0] == 0
+            assert ("checkpoint_torn" in service.errors) == (begin > 0)
+        for file in tmp_path.glob("*.db"):
+            _make_newer(file)
+    ids, sessions = ([{one for message in tracks for one in of(message)} for tracks in seen] for of in (_ids, _session))
+    assert ids[0]
+    assert min(ids[1]) > max(ids[0])
+    assert not sessions[0] & sessions[1]
+
+
+def _ids(message: Tracks) -> list[int]:
+    return [int(one) for one in message.id]
+
+
+def _session(message: Tracks) -> list[str]:
+    return [message.session]
+
+
+def _make_newer(file: Path) -> None:
+    """Give the checkpoints of a store the version of the next release, whole as it would write them."""
+    with contextlib.closing(sqlite3.connect(file)) as store, store:
+        if not store.execute("SELECT 1 FROM sqlite_master WHERE name = 'checkpoints'").fetchall():
+            return
+        for stream, number, data in store.execute("SELECT stream, number, data FROM checkpoints").fetchall():
+            start = data[: len(MAGIC)] + (VERSION + 1).to_bytes(2, "big") + data[len(MAGIC) + 2 : HEAD - DIGEST]
+            digest = hashlib.sha256(start + data[HEAD:]).digest()[:DIGEST]
+            changed = (start + digest + data[HEAD:], stream, number)
+            store.execute("UPDATE checkpoints SET data = ? WHERE stream = ? AND number = ?", changed)

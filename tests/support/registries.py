@@ -56,7 +56,9 @@ class Around(NoPersistence):
         if then is not None:
             then()
 
-    def recall(self, stream: str, restore: Callable[[Checkpoint], Any], then: Callable[[Any], None]) -> None:
+    def recall(
+        self, stream: str, restore: Callable[[Checkpoint], Any], then: Callable[[Any], None], _: object = None
+    ) -> None:
         """Restore what was kept."""
         then(restore(self.kept[stream]) if stream in self.kept else None)
 

@@ -88,10 +88,11 @@ class LeaseStore(Protocol):
 
 
 _T = TypeVar("_T")
+_Torn = TypeVar("_Torn", bound=Exception)
 
 
 def load_newest(
-    store: LeaseStore, stream: str, read: Callable[[bytes], _T], torn: type[Exception], on_torn: Callable[[str], None]
+    store: LeaseStore, stream: str, read: Callable[[bytes], _T], torn: type[_Torn], on_torn: Callable[[_Torn], None]
 ) -> _T | None:
     """Return the newest checkpoint of a stream that can be read; what cannot is set aside.
 
@@ -100,7 +101,7 @@ def load_newest(
         stream: whose.
         read: makes the checkpoint of the bytes.
         torn: what `read` raises.
-        on_torn: called with the reason, each time.
+        on_torn: called with the error, each time.
 
     Raises:
         StoreError: the store cannot be read.
@@ -109,6 +110,6 @@ def load_newest(
         try:
             return read(data)
         except torn as error:
-            on_torn(str(error))
+            on_torn(error)
             store.set_aside(stream, str(error))
     return None

@@ -86,10 +86,17 @@ class Persistence(Protocol):
     def put(self, checkpoint: Checkpoint, fence: int | None, then: Callable[[], None] | None = None) -> None:
         """Have a checkpoint written under a fence, and `then` called when that was tried."""
 
-    def recall(self, stream: str, restore: Callable[[Checkpoint], _T], then: Callable[[_T | None], None]) -> None:
+    def recall(
+        self,
+        stream: str,
+        restore: Callable[[Checkpoint], _T],
+        then: Callable[[_T | None], None],
+        refused: Callable[[CheckpointError], None] = lambda _: None,
+    ) -> None:
         """Call `then` with what `restore` makes of the newest checkpoint of a stream, None without one.
 
-        Both are called on another thread, soon: whoever tracks does not wait for the store.
+        `refused` is called before with the error of each that cannot be read. All are called on another thread, soon:
+        whoever tracks does not wait for the store.
         """
 
     def forget(self, stream: str) -> None:
@@ -122,9 +129,15 @@ class NoPersistence:
         if then is not None:
             then()
 
-    def recall(self, stream: str, restore: Callable[[Checkpoint], _T], then: Callable[[_T | None], None]) -> None:
+    def recall(
+        self,
+        stream: str,
+        restore: Callable[[Checkpoint], _T],
+        then: Callable[[_T | None], None],
+        refused: Callable[[CheckpointError], None] = lambda _: None,
+    ) -> None:
         """Remember nothing."""
-        del stream, restore
+        del stream, restore, refused
         then(None)
 
     def forget(self, stream: str) -> None:
@@ -217,13 +230,19 @@ class CheckpointWriter:
         if then is not None:
             self._hurry.set()
 
-    def recall(self, stream: str, restore: Callable[[Checkpoint], _T], then: Callable[[_T | None], None]) -> None:
+    def recall(
+        self,
+        stream: str,
+        restore: Callable[[Checkpoint], _T],
+        then: Callable[[_T | None], None],
+        refused: Callable[[CheckpointError], None] = lambda _: None,
+    ) -> None:
         """Read the newest checkpoint of a stream on a thread that does so, and go on there with `then`."""
 
         def read() -> None:
             restored = None
             try:
-                restored = self._recalled(stream, restore)
+                restored = self._recalled(stream, restore, refused)
             except Exception:
                 log.exception("internal_error", stream=stream)  # the stream begins anew
             try:
@@ -239,12 +258,19 @@ class CheckpointWriter:
         with self._lock:
             self._pending.pop(stream, None)
 
-    def _recalled(self, stream: str, restore: Callable[[Checkpoint], _T]) -> _T | None:
+    def _recalled(
+        self, stream: str, restore: Callable[[Checkpoint], _T], refused: Callable[[CheckpointError], None]
+    ) -> _T | None:
         """Return what `restore` makes of the newest whole checkpoint of a stream; None when there is none.
 
         None also when the store fails: then the stream begins anew. A store that cannot be reached is waited for while
         the stream is to be tracked here: to begin anew would use track ids a second time.
         """
+
+        def torn(error: CheckpointError) -> None:
+            log.warning("checkpoint_torn", stream=stream, reason=str(error))
+            refused(error)
+
         with self._lock:
             pending, fence = self._pending.get(stream) or self._writing.get(stream) or (None, None)
         if pending is not None and fence == self._leases.fence(stream):
@@ -256,7 +282,7 @@ class CheckpointWriter:
                     stream,
                     lambda data: restore(decode_checkpoint(data)),
                     CheckpointError,
-                    lambda reason: log.warning("checkpoint_torn", stream=stream, reason=reason),
+                    torn,
                 )
             except StoreError as error:
                 self._failed(error)

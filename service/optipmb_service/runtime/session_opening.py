@@ -7,7 +7,6 @@ takes a while, in which the stream may be lost, and be taken again.
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import optipmb_schemas as schemas
@@ -17,14 +16,13 @@ from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.track_publisher import Arrival
 from optipmb_service.session.checkpoint import CheckpointError
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import total
+from optipmb_service.session.values import Lineage, total
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.runtime.context import ActorContext
     from optipmb_service.session.checkpoint import Checkpoint
-    from optipmb_service.session.values import Lineage
 
     Packets = list[tuple[Packet, bool]]
 
@@ -47,6 +45,8 @@ class SessionOpening:
         self._restore_only = False
         self.lineage: Lineage | None = None
         """What an earlier session of the stream left behind, while one is being opened; else None."""
+        self._unread = Lineage()
+        """The same of sessions whose checkpoints are of another version."""
 
     def start(self, *, restore_only: bool) -> bool:
         """Begin to open a session, which is to be loaded then; False when there is no room.
@@ -80,11 +80,15 @@ class SessionOpening:
                 checkpoint, now_ns, context.policy, fence=fence or 1, instance=context.instance, tracker=context.tracker
             )
 
+        def refused(error: CheckpointError) -> None:
+            if error.lineage is not None:
+                self._unread = error.lineage
+
         def load(restored: Session | None) -> None:
             checkpoint = taken[-1] if restored and taken else None
             context.missed.fetch(self._stream, checkpoint, lambda packets: loaded(restored, fence, packets), missed)
 
-        context.persistence.recall(self._stream, restore, load)
+        context.persistence.recall(self._stream, restore, load, refused)
 
     def is_outdated(self, fence: int | None) -> bool:
         """Whether the stream was lost and taken again: another instance may have gone on since it was loaded."""
@@ -129,7 +133,11 @@ class SessionOpening:
             context.policy,
             fused=self._fused,
             instance=context.instance,
-            life=replace(lineage, run=total(lineage.run, fence or 0)),
+            life=Lineage(
+                max(lineage.starts, self._unread.starts),
+                max(lineage.next_id, self._unread.next_id),
+                total(lineage.run, fence or 0),
+            ),
             tracker=context.tracker,
         )
         log.info("session_opened", stream=self._stream, profile=session.parameters.name)

@@ -7,7 +7,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Final
 
 from optipmb_service.session.state import FrameCounts
-from optipmb_service.session.values import Deliveries
+from optipmb_service.session.values import Deliveries, Lineage
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -20,7 +20,14 @@ _SOFTWARE: Final = version("optipmb")
 
 
 class CheckpointError(ValueError):
-    """The bytes are no checkpoint that this service can read; the text says why."""
+    """The bytes are no checkpoint that this service can read; the text says why.
+
+    `lineage` has the ids that the session used, where the checkpoint is whole and of another version; else None.
+    """
+
+    def __init__(self, text: str, lineage: Lineage | None = None) -> None:
+        super().__init__(text)
+        self.lineage = lineage
 
 
 @dataclass(frozen=True, slots=True)

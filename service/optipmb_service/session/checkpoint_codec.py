@@ -1,9 +1,9 @@
 """The state of a session as bytes and back: whole or not at all.
 
-The bytes are a head (magic, version, the first 16 bytes of the SHA-256 digest of version and body) and a body, one
-msgpack map. Equal checkpoints give equal bytes. Reading is total and bounded: it returns a checkpoint or raises
-`CheckpointError`, and the digest is compared before anything else is looked at. There is one version; others are
-refused by number. `checkpoint_reading` reads the body.
+The bytes are a head (magic, version, next ids, the first 16 bytes of the SHA-256 digest of these and the body) and a
+body, one msgpack map. Equal checkpoints give equal bytes. Reading is total and bounded: it returns a checkpoint or
+raises `CheckpointError`, and the digest is compared before anything else is looked at. There is one version; others are
+refused by number, with the next ids. `checkpoint_reading` reads the body.
 
 What depends on how messages were delivered (duplicates, the revisions of corrected tracks, crashes) is kept, but is no
 state: `state_bytes` leaves it out, so that two sessions that took the same frames can be compared.
@@ -12,6 +12,7 @@ state: `state_bytes` leaves it out, so that two sessions that took the same fram
 from __future__ import annotations
 
 import hashlib
+import struct
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,7 +22,7 @@ import optipmb_schemas as schemas
 import optipmb
 from optipmb_service.session.checkpoint import CheckpointError
 from optipmb_service.session.checkpoint_reading import read_body
-from optipmb_service.session.values import Deliveries
+from optipmb_service.session.values import MAX_COUNT, Deliveries, Lineage
 
 if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
@@ -32,7 +33,10 @@ VERSION: Final = 1
 MAGIC: Final = b"OPTIPMB\0"
 DIGEST: Final = 16
 _START: Final = MAGIC + VERSION.to_bytes(2, "big")
-HEAD: Final = len(_START) + DIGEST
+_IDS: Final = struct.Struct(">QQ")
+"""Lives of the stream and next track id. All versions have them here: a release that cannot read a checkpoint must not
+give out the ids of its session again."""
+HEAD: Final = len(_START) + _IDS.size + DIGEST
 MAX_BYTES: Final = 2**28
 MAX_PROFILES: Final = 64
 """Profiles whose form in checkpoints is remembered."""
@@ -44,7 +48,8 @@ _profiles: dict[int, tuple[optipmb.Parameters, bytes]] = {}
 
 def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
     """Return the bytes of a checkpoint; equal ones give equal bytes."""
-    return seal(_msgpack.packb(_body(checkpoint)))
+    head = checkpoint.head
+    return seal(_msgpack.packb(_body(checkpoint)), Lineage(head.starts, head.density.next_id))
 
 
 def state_bytes(checkpoint: Checkpoint) -> bytes:
@@ -71,9 +76,10 @@ def decode_checkpoint(data: bytes) -> Checkpoint:
         raise CheckpointError(str(error)) from error
 
 
-def seal(body: bytes) -> bytes:
-    """Return a body with the head that names its version and guards it."""
-    return b"".join((_START, _digest(body), body))
+def seal(body: bytes, lineage: Lineage) -> bytes:
+    """Return a body with the head that names its version, holds the next ids and guards it."""
+    start = _START + _IDS.pack(lineage.starts, lineage.next_id)
+    return b"".join((start, _digest(start, body), body))
 
 
 def _open(data: bytes) -> bytes:
@@ -81,20 +87,21 @@ def _open(data: bytes) -> bytes:
         raise CheckpointError("no checkpoint: its first bytes are others")
     if len(data) > MAX_BYTES:
         raise CheckpointError(f"{len(data)} bytes: more than a checkpoint has")
-    version = int.from_bytes(data[len(MAGIC) : len(_START)], "big")
+    start, body = data[: HEAD - DIGEST], data[HEAD:]
+    if data[HEAD - DIGEST : HEAD] != _digest(start, body):
+        raise CheckpointError("torn or changed: the digest is that of other bytes")
+    version = int.from_bytes(start[len(MAGIC) : len(_START)], "big")
     if version != VERSION:
         raise CheckpointError(
-            f"version {version}: expected {VERSION}, the only one of this release; start the release that wrote it"
+            f"version {version}: expected {VERSION}, the only one of this release; start the release that wrote it",
+            Lineage(*(min(one, MAX_COUNT) for one in _IDS.unpack_from(start, len(_START)))),
         )
-    body = data[HEAD:]
-    if data[len(_START) : HEAD] != _digest(body):
-        raise CheckpointError("torn or changed: the digest is that of other bytes")
     return body
 
 
-def _digest(body: bytes) -> bytes:
+def _digest(start: bytes, body: bytes) -> bytes:
     # Processors have instructions for SHA-256: it takes a third of the time that BLAKE2b takes.
-    digest = hashlib.sha256(_START)
+    digest = hashlib.sha256(start)
     digest.update(body)
     return digest.digest()[:DIGEST]
 

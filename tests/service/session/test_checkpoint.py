@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_service.session.checkpoint import Checkpoint, CheckpointError
 from optipmb_service.session.checkpoint_codec import (
+    DIGEST,
     HEAD,
     MAGIC,
     VERSION,
@@ -24,7 +26,7 @@ from optipmb_service.session.checkpoint_codec import (
     state_bytes,
 )
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Policy
+from optipmb_service.session.values import Lineage, Policy
 from router import SECOND, Sensor
 from sessions import Merged, chained, feed, problems, tracks
 
@@ -223,19 +225,22 @@ def test_any_changed_byte_is_noticed() -> None:
 
 @pytest.mark.parametrize("version", [0, VERSION + 1, 2**16 - 1])
 def test_another_version_is_refused_by_number(version: int) -> None:
-    """What another release wrote is not guessed at: the error names both versions and what to do."""
-    data = encode_checkpoint(example().snapshot())
-    other = MAGIC + version.to_bytes(2, "big") + data[len(MAGIC) + 2 :]
+    """What another release wrote is not guessed at: the error names both versions, what to do, and the next ids."""
+    checkpoint = example().snapshot()
+    data = encode_checkpoint(checkpoint)
+    start = MAGIC + version.to_bytes(2, "big") + data[len(MAGIC) + 2 : HEAD - DIGEST]
+    other = start + hashlib.sha256(start + data[HEAD:]).digest()[:DIGEST] + data[HEAD:]
     expected = f"version {version}: expected {VERSION}, the only one of this release; start the release that wrote it"
-    with pytest.raises(CheckpointError, match=expected):
+    with pytest.raises(CheckpointError, match=expected) as refused:
         decode_checkpoint(other)
+    assert refused.value.lineage == Lineage(checkpoint.head.starts, checkpoint.head.density.next_id)
 
 
 def altered(change: Any) -> Checkpoint:
     """Read a checkpoint whose body was changed and sealed again."""
     body = msgpack.unpackb(encode_checkpoint(example().snapshot())[HEAD:])
     change(body)
-    return decode_checkpoint(seal(msgpack.packb(body)))
+    return decode_checkpoint(seal(msgpack.packb(body), Lineage()))
 
 
 def _set_profile(body: Any, **changes: Any) -> None:
@@ -313,7 +318,7 @@ def test_more_may_be_added() -> None:
 def test_any_body_is_read_or_refused(body: bytes) -> None:
     """Whatever the bytes under a good seal, nothing but `CheckpointError` is raised."""
     with pytest.raises(CheckpointError):
-        decode_checkpoint(seal(body))
+        decode_checkpoint(seal(body, Lineage()))
 
 
 # The bytes of the version
