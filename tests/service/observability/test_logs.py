@@ -17,11 +17,12 @@ import structlog
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_service.observability.logs import BURST, LINES_PER_SECOND, QUEUE_BYTES, Limiter, LineWriter, configure
-from router import Node, Sensor
+from router import Node, Sensor, until
 from routers import free_endpoint
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 END_S = 60.0
 
@@ -63,11 +64,15 @@ def test_a_stderr_that_nobody_reads_stops_nothing(full_pipe: tuple[int, int, int
             process.kill()
 
 
-def test_lines_beyond_the_queue_are_counted(full_pipe: tuple[int, int, int], capfd: pytest.CaptureFixture[str]) -> None:
+def test_lines_beyond_the_queue_are_counted(
+    full_pipe: tuple[int, int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Lines that nobody reads in time are dropped; the others come in order, then a line with how many are missing."""
     reader, writer, size = full_pipe
-    configure("json", "info")
-    with os.fdopen(os.dup(writer), "w") as file:
+    told = tmp_path / "stderr"
+    with told.open("w") as stderr, os.fdopen(os.dup(writer), "w") as file:
+        monkeypatch.setattr(sys, "stderr", stderr)
+        configure("json", "info")
         lines = LineWriter(file)
         count = 2 * QUEUE_BYTES // 1000
         for number in range(count):
@@ -77,12 +82,9 @@ def test_lines_beyond_the_queue_are_counted(full_pipe: tuple[int, int, int], cap
         while left:
             left -= len(os.read(reader, min(left, 2**20)))
         lines.finish(END_S)
-    structlog.get_logger().info("later")
-    structlog.reset_defaults()
-    told = capfd.readouterr().err
-    while "later" not in told:
-        told += capfd.readouterr().err
-    assert re.search(r'"count": (\d+)', told)[1] == str(lines.dropped)  # type: ignore[index]  # it is there
+        until(lambda: told.read_text().endswith("}\n"), "a line says how many are missing")
+        structlog.reset_defaults()
+    assert re.search(r'"count": (\d+)', told.read_text())[1] == str(lines.dropped)  # type: ignore[index]  # it is there
 
 
 @given(st.lists(st.tuples(st.sampled_from(["problem", "peer_lost"]), st.floats(0, 0.5)), max_size=300))
