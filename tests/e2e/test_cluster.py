@@ -460,7 +460,7 @@ def test_a_member_that_was_cut_off_contests_nothing(tmp_path: Path) -> None:
         ExitStack() as proxies,
         Node(fleet.endpoint) as node,
     ):
-        cluster = Cluster(tmp_path, nats, fleet, fleet.endpoint, node)
+        cluster = Cluster(tmp_path, nats, fleet, fleet.router, node)
         ways = {name: [proxies.enter_context(Proxy(to)) for to in (nats.address, fleet.endpoint)] for name in names}
         members = {
             name: cluster.member(name, to_router.endpoint, cluster=f"nats://{to_server.address}")

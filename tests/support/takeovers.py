@@ -88,5 +88,6 @@ def longest_silence_s(node: Node, sensor: Sensor = SENSOR, since_ns: int = 0) ->
     """Seconds between two tracks messages of a stream, at most, since a time."""
     key = KEYS.tracks(sensor.stream)
     seen = tuple(zip(node.tracks_seen.times_ns, node.tracks_seen.items, strict=False))  # more may come meanwhile
-    times = [at for at, (where, _, _) in seen if where == key and at > since_ns]
-    return max(later - earlier for earlier, later in itertools.pairwise(times)) / 1e9
+    times = [at for at, (where, _, _) in seen if where == key]
+    pauses = (later - earlier for earlier, later in itertools.pairwise(times) if later > since_ns)
+    return max(pauses, default=0) / 1e9
