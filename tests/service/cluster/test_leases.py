@@ -191,7 +191,7 @@ def test_a_checkpoint_is_waited_for() -> None:
     with ThreadPoolExecutor(1) as thread:
         for ends in (False, True):
             failed.clear()
-            loading = thread.submit(writer._recalled, STREAM, lambda _: "restored")
+            loading = thread.submit(writer._recalled, STREAM, lambda _: "restored", lambda _: None)
             assert failed.wait(60.0)
             assert not loading.done()
             if ends:
