@@ -115,15 +115,12 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, C
     known = [_normalised(name) for name in names]
     taken: dict[str, Column] = {}
     used = set(chosen.values())
-    for role, aliases in ALIASES.items():
+    for role in ALIASES:
+        aliases = _names_of(role)
         if role in chosen:
             unit = next((one.unit for one in known if one.name == chosen[role]), None)
             taken[role] = Column(chosen[role], unit, "")
             continue
-        if role in _LISTED:
-            place = _LISTED.index(role)
-            first, last = ([f"{name}_{place}" for name in lists] for lists in (BOX_LISTS, ("bbox", "box")))
-            aliases = (*first, *aliases, *last)  # noqa: PLW2901
         fitting = [one for one in known if one.base in aliases and one.name not in used]
         if role == "nanosec":
             bases = {
@@ -136,6 +133,15 @@ def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, C
             taken[role] = best
             used.add(best.name)
     return taken
+
+
+def _names_of(role: str) -> tuple[str, ...]:
+    """Return the names of a meaning, the most telling first; those in lists of boxes come before flat columns."""
+    if role not in _LISTED:
+        return ALIASES[role]
+    place = _LISTED.index(role)
+    first, last = ([f"{name}_{place}" for name in lists] for lists in (BOX_LISTS, ("bbox", "box")))
+    return (*first, *ALIASES[role], *last)
 
 
 def _is_second_half(column: Column) -> bool:

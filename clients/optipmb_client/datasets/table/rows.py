@@ -154,7 +154,8 @@ def _joined(tables: Sequence[Columns]) -> Columns:
         parts = [one[name] for one in filled]
         kinds = {part.dtype.kind for part in parts}
         if len(kinds) > 1 and kinds != {"i", "f"}:
-            parts = [np.where(part != part, "", part.astype(np.str_)) for part in parts]  # noqa: PLR0124  NaN
+            texts = [part.astype(np.str_) for part in parts]
+            parts = [np.where(np.isin(part, ("nan", "NaT")), "", part) for part in texts]
         joined[name] = np.concatenate(parts)
     return joined
 
