@@ -87,7 +87,10 @@ def outage_s(node: Node, since_ns: int, sensor: Sensor = SENSOR) -> float:
 def longest_silence_s(node: Node, sensor: Sensor = SENSOR, since_ns: int = 0) -> float:
     """Seconds between two tracks messages of a stream, at most, since a time."""
     key = KEYS.tracks(sensor.stream)
-    seen = tuple(zip(node.tracks_seen.times_ns, node.tracks_seen.items, strict=False))  # more may come meanwhile
-    times = [at for at, (where, _, _) in seen if where == key]
-    pauses = (later - earlier for earlier, later in itertools.pairwise(times) if later > since_ns)
-    return max(pauses, default=0) / 1e9
+
+    def times() -> list[int]:
+        seen = tuple(zip(node.tracks_seen.times_ns, node.tracks_seen.items, strict=False))  # more may come meanwhile
+        return [at for at, (where, _, _) in seen if where == key]
+
+    until(lambda: max(times(), default=0) > since_ns, "the stream has tracks again")
+    return max(later - earlier for earlier, later in itertools.pairwise(times()) if later > since_ns) / 1e9
