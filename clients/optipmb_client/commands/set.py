@@ -12,10 +12,10 @@ from optipmb_client.sessions import set_parameters
 def set_profile(
     stream: Annotated[str, typer.Argument(help="Name of the stream, site/node/sensor.")],
     profile: Annotated[str, typer.Option("--profile", metavar="NAME", help="Profile of the service.")],
-    restart: Annotated[  # noqa: FBT002  the parser passes it by its name
+    *,
+    restart: Annotated[
         bool, typer.Option("--restart", help="Restart a session that has tracked frames: its tracks end, ids continue.")
     ] = False,
-    *,
     service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
