@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from alone import tracked_alone
-from optipmb_schemas import Keys, ResetRequest, Tracks
+from optipmb_schemas import Keys, ResetRequest
 from optipmb_service.session.checkpoint_codec import DIGEST, HEAD, MAGIC, VERSION
 from router import Node, Sensor, plain
 from service_process import ServiceProcess
@@ -69,40 +69,41 @@ def test_streams_that_come_and_go_without_end_have_a_process_restart(
         assert service.output == []
 
 
-def test_a_release_that_cannot_read_a_checkpoint_gives_no_id_again(tmp_path: Path) -> None:
-    """After a checkpoint of another version the session is a new one, and its track ids go on."""
+@pytest.mark.parametrize("kept", [0, 1])
+def test_a_release_that_cannot_read_a_checkpoint_gives_no_id_again(tmp_path: Path, kept: int) -> None:
+    """After a checkpoint of another version the session is a new one, and its track ids go on.
+
+    So they do where older checkpoints could be read.
+    """
     sensor = Sensor(stream="yard/back/lidar")
-    seen = []
-    for begin in (0, FRAMES):
+    ids: list[set[int]] = []
+    sessions: list[set[str]] = []
+    for run in range(3):
         with ServiceProcess("--instance", "one", environment={"OPTIPMB_STORE": str(tmp_path)}) as service:
             service.wait_ready()
             with Node(service.endpoint) as node:
-                node.send(*(sensor.detections(seq) for seq in range(begin, begin + FRAMES)))
-                seen.append([one for one in node.tracks(sensor.stream, FRAMES) if len(one.id)])
+                node.send(*(sensor.detections(seq) for seq in range(run * FRAMES, (run + 1) * FRAMES)))
+                tracks = node.tracks(sensor.stream, FRAMES)
             assert service.end(signal.SIGTERM, deadline_s=END_S)[0] == 0
-            assert ("checkpoint_torn" in service.errors) == (begin > 0)
-        for file in tmp_path.glob("*.db"):
-            _make_newer(file)
-    ids, sessions = ([{one for message in tracks for one in of(message)} for tracks in seen] for of in (_ids, _session))
+            assert ("checkpoint_torn" in service.errors) == (run == 2)
+        ids.append({int(one) for message in tracks for one in message.id})
+        sessions.append({message.session for message in tracks})
+        if run == 1:
+            for file in tmp_path.glob("*.db"):
+                _make_newer(file, kept)
     assert ids[0]
-    assert min(ids[1]) > max(ids[0])
-    assert not sessions[0] & sessions[1]
+    assert min(ids[2]) > max(ids[0] | ids[1])
+    assert sessions[0] == sessions[1] != sessions[2]
 
 
-def _ids(message: Tracks) -> list[int]:
-    return [int(one) for one in message.id]
-
-
-def _session(message: Tracks) -> list[str]:
-    return [message.session]
-
-
-def _make_newer(file: Path) -> None:
-    """Give the checkpoints of a store the version of the next release, whole as it would write them."""
+def _make_newer(file: Path, kept: int) -> None:
+    """Give the checkpoints of a store, but for the oldest, the version of the next release, as it would write them."""
     with contextlib.closing(sqlite3.connect(file)) as store, store:
         if not store.execute("SELECT 1 FROM sqlite_master WHERE name = 'checkpoints'").fetchall():
             return
-        for stream, number, data in store.execute("SELECT stream, number, data FROM checkpoints").fetchall():
+        rows = store.execute("SELECT stream, number, data FROM checkpoints ORDER BY number").fetchall()
+        assert len(rows) > kept
+        for stream, number, data in rows[kept:]:
             start = data[: len(MAGIC)] + (VERSION + 1).to_bytes(2, "big") + data[len(MAGIC) + 2 : HEAD - DIGEST]
             digest = hashlib.sha256(start + data[HEAD:]).digest()[:DIGEST]
             changed = (start + digest + data[HEAD:], stream, number)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 MOST_PAUSES: Final = 8
-"""Times the silence after which the log is read first: the longest pause between two looks that find nothing."""
+"""Longest pause between two reads that find nothing, in times of the silence before the first one."""
 
 
 class MissedFrames(Protocol):
@@ -154,42 +154,39 @@ def positions_of(checkpoint: Checkpoint) -> dict[str, Position]:
 
 
 class LogCheck:
-    """The looks of one session into the log.
+    """Schedule of the reads of the log for one session whose frames do not arrive.
 
-    The control loop asks when one is due; the tracking thread and the log's reader say what became of it.
+    The control loop begins a read; the tracking thread, or the thread of the log, ends it.
 
     Args:
-        silent_ns: silence after which the log is read.
+        silent_ns: silence after which the log is read; pauses double up to `MOST_PAUSES` times as long.
     """
 
     def __init__(self, silent_ns: int) -> None:
         self._silent_ns = self._pause_ns = silent_ns
-        self._due_ns = 0
-        self._behind = False
-        self._under_way = False
+        self._next_ns = 0
+        self.under_way = False
 
-    def due(self, age_ns: int, now_ns: int) -> bool:
-        """Whether to look now: a sensor is silent for too long, or the last look found frames.
+    def due_ns(self, age_ns: int, now_ns: int) -> int | None:
+        """Return since when the log is to be read; None: it is not now.
 
         Args:
             age_ns: time since the last frame of the sensor that is silent for longest.
             now_ns: monotonic time.
         """
-        if self._under_way:
-            return False
-        if self._behind:
-            self._under_way = True
-            return True
         if age_ns < self._silent_ns:
-            self._pause_ns, self._due_ns = self._silent_ns, 0
-            return False
-        if now_ns < self._due_ns:
-            return False
-        self._due_ns = now_ns + self._pause_ns
+            self._pause_ns, self._next_ns = self._silent_ns, 0
+        waits = self.under_way or now_ns < self._next_ns or age_ns < self._silent_ns
+        return None if waits else self._next_ns
+
+    def begin(self, now_ns: int) -> None:
+        """Begin a read."""
+        self.under_way = True
+        self._next_ns = now_ns + self._pause_ns
         self._pause_ns = min(2 * self._pause_ns, MOST_PAUSES * self._silent_ns)
-        self._under_way = True
-        return True
 
     def end(self, *, found: bool) -> None:
-        """End a look; called by any thread."""
-        self._behind, self._under_way = found, False
+        """End a read; where it found frames, the next one is due at once."""
+        if found:
+            self._pause_ns, self._next_ns = self._silent_ns, 0
+        self.under_way = False

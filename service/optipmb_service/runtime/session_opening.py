@@ -46,7 +46,7 @@ class SessionOpening:
         self.lineage: Lineage | None = None
         """What an earlier session of the stream left behind, while one is being opened; else None."""
         self._unread = Lineage()
-        """The same of sessions whose checkpoints are of another version."""
+        """The highest ids of sessions whose checkpoints are of another version."""
 
     def start(self, *, restore_only: bool) -> bool:
         """Begin to open a session, which is to be loaded then; False when there is no room.
@@ -73,6 +73,8 @@ class SessionOpening:
 
         def restore(checkpoint: Checkpoint) -> Session:
             now_ns = time.monotonic_ns()
+            if self._unread != Lineage():
+                raise CheckpointError("older than one of another version, whose ids would be given out again")
             taken[:] = [checkpoint]
             if checkpoint.fused is not self._fused:
                 raise CheckpointError(f"of {'several streams' if checkpoint.fused else 'one stream'}, by `fuse` then")
@@ -81,8 +83,9 @@ class SessionOpening:
             )
 
         def refused(error: CheckpointError) -> None:
-            if error.lineage is not None:
-                self._unread = error.lineage
+            if (unread := error.lineage) is not None:
+                starts, next_id = max(self._unread.starts, unread.starts), max(self._unread.next_id, unread.next_id)
+                self._unread = Lineage(starts, next_id)
 
         def load(restored: Session | None) -> None:
             checkpoint = taken[-1] if restored and taken else None

@@ -26,6 +26,9 @@ SWEEP_REST: Final = 200
 MOST_REST_NS: Final = 5 * SECOND
 
 
+LOG_READS: Final = 32
+"""Sessions that read the log at once: thousands that are silent are no load on its servers."""
+
 LITTLE: Final = 0.1
 """Part of an equal share of the memory: a session that keeps less is not closed for it.
 
@@ -90,15 +93,25 @@ class Sweep:
             if actor.fused and session is not None and session.awaits_caches and actor.mailbox.idle:
                 self._command(actor.stream, StreamActor.on_caches_answered, urgent=False)  # or a publisher may be gone
             actor.sensors.look_for_silent(now_ns, self._stale_s)
-            if self._has_log and actor.log_check.due(actor.sensors.silent_ns(now_ns), now_ns):
-                self._command(actor.stream, StreamActor.look_in_log, urgent=False)
             if now_ns - actor.meter.active_ns > self._idle_ns and actor.mailbox.idle:
                 self._command(actor.stream, self._close_idle, urgent=False)
+        if self._has_log:
+            self._read_log(actors, now_ns)
         for stream, owners in rivals.contested(now_ns, [actor.stream for actor in actors]):
             tracked = f"it is tracked by {' and '.join(owners)}"
             self._report("contested", stream, "one `store`, or `cluster`, for all instances", tracked)
         self._evict(actors)
         self._untracked.trim(now_ns, round(self._idle_ns))
+
+    def _read_log(self, actors: list[StreamActor], now_ns: int) -> None:
+        """Have the log read for silent sessions, those first that wait longest; a few at a time."""
+        silent = ((actor.log_check.due_ns(actor.sensors.silent_ns(now_ns), now_ns), actor) for actor in actors)
+        due = [(since_ns, actor) for since_ns, actor in silent if since_ns is not None]
+        free = LOG_READS - sum(actor.log_check.under_way for actor in actors)
+        for _, actor in sorted(due, key=lambda one: one[0])[: max(0, free)]:
+            actor.log_check.begin(now_ns)
+            if not self._command(actor.stream, StreamActor.look_in_log, urgent=False):
+                actor.log_check.end(found=False)
 
     def _evict(self, actors: list[StreamActor]) -> None:
         """Close sessions, the least recently used first, while all together keep more than the process may."""
