@@ -87,7 +87,7 @@ class Around(NoPersistence):
         """Tracks go nowhere."""
 
 
-def registry_of(around: Around, **settings: Any) -> Registry:
+def registry_of(around: Around, missed: NoLog | None = None, **settings: Any) -> Registry:
     """Return the streams of a process with these around it."""
     parts: Any = around  # in the place of several
     return Registry(
@@ -98,7 +98,7 @@ def registry_of(around: Around, **settings: Any) -> Registry:
         scheduler=parts,
         member=parts,
         persistence=parts,
-        missed=NoLog(),
+        missed=missed or NoLog(),
         arm=lambda *_: None,
         metrics=Metrics(),
         tracker=chained,
