@@ -55,7 +55,7 @@ JOIN_S: Final = 0.3
 SAVE_S: Final = 0.5
 """The last checkpoints have so long even where messages took all the time."""
 
-NAMESAKE_NS: Final = 10_000_000_000
+NAME_CHECK_NS: Final = 10_000_000_000
 """How often another process of the same name is looked for."""
 
 LEASES_S: Final = 1.0
@@ -90,7 +90,7 @@ class Service:
         self._settings = settings
         self._started_ns = time.time_ns()
         self._began_ns = time.monotonic_ns()
-        self._namesake_ns = 0
+        self._name_checked_ns = 0
         self._state = "starting"
         self._metrics = metrics or Metrics()
         store, keeps_nothing = open_store(settings, private)
@@ -160,9 +160,9 @@ class Service:
         now_ns = time.monotonic_ns()
         self._registry.sweep(now_ns)
         self._transport.look_for_returned(self._report_returned)
-        if now_ns >= self._namesake_ns:
-            self._namesake_ns = now_ns + NAMESAKE_NS
-            self._transport.look_for_namesake(self._report_namesake)
+        if now_ns >= self._name_checked_ns:
+            self._name_checked_ns = now_ns + NAME_CHECK_NS
+            self._transport.find_duplicate_name(self._report_duplicate_name)
         self._reporter.flush(now_ns)
 
     def stop(self, seconds: float = math.inf) -> bool:
@@ -291,7 +291,7 @@ class Service:
         )
         self._reporter.report(problem, time.monotonic_ns())
 
-    def _report_namesake(self) -> None:
+    def _report_duplicate_name(self) -> None:
         name = self._settings.instance
         problem = problem_of(
             "duplicate_name",

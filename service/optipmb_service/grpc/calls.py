@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from optipmb_service.grpc.feeds import Feeds
     from optipmb_service.grpc.metrics import CallMetrics
     from optipmb_service.grpc.outbox import Outbox
-    from optipmb_service.grpc.outlets import Outlets
+    from optipmb_service.grpc.publishers import Publishers
     from optipmb_service.zenoh.client import Client
 
 
@@ -59,7 +59,7 @@ class Gateway:
 
     client: Client
     feeds: Feeds
-    outlets: Outlets
+    publishers: Publishers
     instance: str
     limits: schemas.Limits
     refused: Callable[[schemas.Problem], None]

@@ -15,7 +15,7 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.transcode import EncodedTracks, transcode
 
-from optipmb_service.grpc.kept import Kept
+from optipmb_service.grpc.idle_pool import IdlePool
 from optipmb_service.grpc.outbox import varint
 from optipmb_service.grpc.selection import Selection
 
@@ -90,7 +90,7 @@ class Feeds:
         self._feeds: dict[str, _Feed] = {}
         self._handed: collections.deque[tuple[Listener, Item]] = collections.deque()
         self._waking = False
-        self._kept = Kept(loop, KEPT)
+        self._kept = IdlePool(loop, KEPT)
 
     @contextlib.asynccontextmanager
     async def joined(self, key: str, listener: Listener) -> AsyncIterator[None]:

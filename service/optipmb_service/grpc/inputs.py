@@ -104,7 +104,7 @@ class Incoming:
 
         options = self._options
         key = self.stream, options.cache or CACHE, options.cache_clouds
-        async with self._call.gateway.outlets.opened(key, matching) as outgoing:
+        async with self._call.gateway.publishers.opened(key, matching) as outgoing:
             self._outgoing = outgoing
             yield outgoing
 

@@ -20,7 +20,7 @@ from optipmb_service.grpc.access import Access
 from optipmb_service.grpc.calls import Call, CallerGoneError, Gateway, ending_with_caller
 from optipmb_service.grpc.feeds import Feeds
 from optipmb_service.grpc.metrics import CallMetrics
-from optipmb_service.grpc.outlets import Outlets
+from optipmb_service.grpc.publishers import Publishers
 from optipmb_service.grpc.status import EndCall, refused
 from optipmb_service.grpc.tls import credentials
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
@@ -103,7 +103,7 @@ class Server:
         self._gateway = Gateway(
             client,
             Feeds(client, asyncio.get_running_loop(), self._invalid),
-            Outlets(client, asyncio.get_running_loop()),
+            Publishers(client, asyncio.get_running_loop()),
             settings.instance,
             settings.limits.limits(),
             self._refused,
@@ -136,7 +136,7 @@ class Server:
             call.end()
         await self._server.stop(GRACE_S)
         self._gateway.feeds.close()
-        self._gateway.outlets.close()
+        self._gateway.publishers.close()
 
     def _register(self) -> None:
         # On the wire a call with one request is a stream of one: all methods have one kind of handler.

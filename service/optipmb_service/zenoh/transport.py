@@ -233,8 +233,8 @@ class Transport:
         except zenoh.ZError as error:
             raise TransportError(line(error)) from error
 
-    def look_for_namesake(self, found: Callable[[], None]) -> None:
-        """Have `found` called, on a thread of the network, for each other process that answers by the same name."""
+    def find_duplicate_name(self, found: Callable[[], None]) -> None:
+        """Call `found`, on a thread of the network, for each other process with the name of this one."""
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is not None:

@@ -1,4 +1,4 @@
-"""What calls leave behind for those that come soon after them: each key that Zenoh is given takes a number for ever."""
+"""Subscriptions and publishers without a call, kept for the next one: Zenoh never gives back the number of a key."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable
 
 KEPT_S: Final = 60.0
-"""How long it is kept."""
+"""Time after which one that nobody has taken is closed."""
 
 
-class Kept:
-    """What nobody uses now, by its key; all methods belong to the loop.
+class IdlePool:
+    """Idle objects by key, each closed after `KEPT_S`; all methods belong to the loop.
 
     Args:
         loop: of the gateway.
-        most: so much is kept; of more, the oldest ends.
+        most: idle objects at most; beyond it the oldest is closed.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, most: int) -> None:
@@ -29,20 +29,20 @@ class Kept:
         )
 
     def keep(self, key: Hashable, end: Callable[[], None]) -> None:
-        """Keep something under a key that nothing is kept under; `end` is called unless it is taken in time."""
+        """Add an object under a free key; `end` closes it unless it is taken in time."""
         self._kept[key] = self._loop.call_later(KEPT_S, self._end, key), end
         while len(self._kept) > self._most:
             self._end(next(iter(self._kept)))
 
     def take(self, key: Hashable) -> bool:
-        """Take what is kept under a key; False when there is nothing."""
+        """Remove the object of a key without closing it; False when there is none."""
         if (found := self._kept.pop(key, None)) is None:
             return False
         found[0].cancel()
         return True
 
     def close(self) -> None:
-        """End everything."""
+        """Close all objects."""
         for key in list(self._kept):
             self._end(key)
 

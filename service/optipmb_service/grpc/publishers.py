@@ -1,4 +1,4 @@
-"""The publishers of streams, for one call after the other."""
+"""Publishers of streams, reused by calls that follow each other."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import contextlib
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from optipmb_service.grpc.kept import Kept
+from optipmb_service.grpc.idle_pool import IdlePool
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -21,7 +21,7 @@ Key = tuple[str, int, int]
 """Stream, cached detections, cached clouds."""
 
 
-class Outlets:
+class Publishers:
     """The publishers of a gateway; all methods belong to its loop.
 
     Args:
@@ -32,7 +32,7 @@ class Outlets:
     def __init__(self, client: Client, loop: asyncio.AbstractEventLoop) -> None:
         self._client = client
         self._loop = loop
-        self._kept = Kept(loop, KEPT)
+        self._kept = IdlePool(loop, KEPT)
         self._left: dict[Key, Outgoing] = {}
 
     @contextlib.asynccontextmanager
