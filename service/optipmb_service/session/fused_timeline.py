@@ -31,7 +31,9 @@ from optipmb_service.session.values import MAX_SENSORS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from optipmb_service.session.checkpoint import Checkpoint
     from optipmb_service.session.state import FilterState
+    from optipmb_service.session.values import JumpLimits
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +56,7 @@ class FusedTimeline:
     """What is remembered of the frames of several sensors.
 
     Attributes:
-        gap_limit_ns: a frame further from the session's clock has another clock.
+        limits: a frame further ahead of the session's clock has another clock.
         seen: what came of each epoch, by sensor, in the order of their appearance.
         base: the course of each sensor up to the window.
         floor: the last frame before the window in the order of processing; nothing goes before it.
@@ -64,7 +66,7 @@ class FusedTimeline:
         jumped: frames with another clock, by sensor.
     """
 
-    gap_limit_ns: int
+    limits: JumpLimits
     seen: Mapping[str, tuple[SeenNumbers, ...]] = field(default_factory=dict)
     base: Mapping[str, Cursor] = field(default_factory=dict)
     floor: FrameId | None = None
@@ -81,7 +83,7 @@ class FusedTimeline:
             return self._refuse(frame_id, Verdict.DUPLICATE)
         if number >= 0 and epochs[number].highest - frame_id.seq >= WINDOW:
             return self._refuse(frame_id, Verdict.LATE)
-        if self.clock and abs(self._jump_ns(frame_id)) > self.gap_limit_ns:
+        if self.clock and abs(self._jump_ns(frame_id)) > self.limits.ahead_ns:
             return self._other_clock(frame_id)
         refusal = self._no_place(frame_id, number if number >= 0 else len(epochs))
         if refusal is None:
@@ -96,24 +98,20 @@ class FusedTimeline:
         return {frame_id: _placed(frame_id, self.generation) for frame_id in self.frame_ids}
 
     @classmethod
-    def resume(
-        cls,
-        gap_limit_ns: int,
-        seen: Mapping[str, tuple[SeenNumbers, ...]],
-        base: Mapping[str, Cursor],
-        floor: FrameId | None,
-        frame_ids: tuple[FrameId, ...],
-        generation: int,
-    ) -> FusedTimeline:
-        """Return the timeline that had these parts."""
+    def resume(cls, limits: JumpLimits, checkpoint: Checkpoint) -> FusedTimeline:
+        """Return the timeline of a session that is restored."""
+        base, head = checkpoint.base, checkpoint.head
+        # A frame that was refused for its effort may have begun a generation that no frame was tracked in yet.
+        generation = max([head.generation, *(one.generation for one in head.cursors.values())])
         clock = {
             name: cursor.newest_ns
-            for name, cursor in base.items()
+            for name, cursor in base.cursors.items()
             if cursor.epoch is not None and cursor.generation == generation
         }
+        frame_ids = tuple(sorted([one.frame_id for one in checkpoint.window], key=_order))
         for one in frame_ids:
             clock[one.sensor] = max(one.stamp_ns, clock.get(one.sensor, one.stamp_ns))
-        return cls(gap_limit_ns, seen, base, floor, tuple(sorted(frame_ids, key=_order)), generation, clock)
+        return cls(limits, checkpoint.seen, base.cursors, base.last, frame_ids, generation, clock)
 
     def knows(self, frame_id: FrameId) -> bool:
         """Whether frames of its sensor came in an epoch."""
@@ -139,7 +137,7 @@ class FusedTimeline:
     def live(self) -> dict[str, int]:
         """Return the sensors that fed the session lately, each with its newest stamp."""
         newest_ns = max(self.clock.values(), default=0)
-        return {name: stamp for name, stamp in self.clock.items() if newest_ns - stamp <= self.gap_limit_ns}
+        return {name: stamp for name, stamp in self.clock.items() if newest_ns - stamp <= self.limits.ahead_ns}
 
     # How
 
@@ -197,11 +195,13 @@ class FusedTimeline:
         sensor, stamp_ns = frame_id.sensor, frame_id.stamp_ns
         before = self.jumped.get(sensor)
         one = JumpedFrames(1, stamp_ns, stamp_ns)
-        if before is not None and 0 < stamp_ns - before.newest_ns <= self.gap_limit_ns:
+        if before is not None and 0 < stamp_ns - before.newest_ns <= self.limits.ahead_ns:
             one = JumpedFrames(before.count + 1, before.since_ns, stamp_ns)
         jumped = {**_latest(self.jumped, MAX_SENSORS - 1), sensor: one}
-        agreed = all(_agrees(jumped.get(name), stamp_ns, self.gap_limit_ns) for name in self.live() if name != sensor)
-        alone = stamp_ns - one.since_ns > self.gap_limit_ns
+        agreed = all(
+            _agrees(jumped.get(name), stamp_ns, self.limits.ahead_ns) for name in self.live() if name != sensor
+        )
+        alone = stamp_ns - one.since_ns > self.limits.ahead_ns
         if one.count < JUMP_FRAMES or not (agreed or alone):
             return self._refuse(frame_id, refusal)[0], replace(self, jumped=jumped)
         begun = replace(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
-from array import array
 from typing import TYPE_CHECKING, Final
 
 from optipmb.records import record
@@ -46,47 +44,6 @@ class SeenNumbers:
         # A sequence number may leap by 2^60: never shift further than the window is wide.
         shifted = self.mask << ahead if ahead < WINDOW else 0
         return SeenNumbers(self.epoch, seq, (shifted | 1) & ((1 << WINDOW) - 1))
-
-
-class Checksums:
-    """Checksums of the newest frames of a publisher, by which a repeated frame is told from another with its number."""
-
-    def __init__(self) -> None:
-        self._epoch = b""
-        self._values = array("I")
-
-    def add(self, epoch: bytes, seq: int, detections: bytes) -> None:
-        """Remember a frame that came, by the bytes of its detections."""
-        if epoch != self._epoch:
-            self._epoch, self._values = epoch, array("I", bytes(array("I").itemsize * WINDOW))
-        self._values[seq % WINDOW] = zlib.crc32(detections)
-
-    def same(self, epoch: bytes, seq: int, detections: bytes) -> bool | None:
-        """Return whether the frame that came with a number had these bytes; None: it is not known any more."""
-        known = self._values[seq % WINDOW] if epoch == self._epoch else 0
-        return known == zlib.crc32(detections) if known else None
-
-
-class Claim:
-    """Frames in a row of a publisher that another one has succeeded, while that one sends nothing."""
-
-    def __init__(self) -> None:
-        self._epoch = b""
-        self._seq = -1
-        self._count = 0
-        self._since_ns = 0
-
-    def clear(self) -> None:
-        """Begin anew: the successor has sent a frame."""
-        self._epoch = b""
-
-    def add(self, frame_id: FrameId, *, frames: int, span_ns: int) -> bool:
-        """Count a frame; return whether they are so many, over so long a time by their stamps."""
-        if frame_id.epoch != self._epoch or frame_id.seq <= self._seq:
-            self._epoch, self._count, self._since_ns = frame_id.epoch, 0, frame_id.stamp_ns
-        self._seq = frame_id.seq
-        self._count += 1
-        return self._count >= frames and frame_id.stamp_ns - self._since_ns >= span_ns
 
 
 def number_of(epochs: Sequence[SeenNumbers], epoch: bytes | None) -> int:

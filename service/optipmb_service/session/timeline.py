@@ -36,6 +36,7 @@ from optipmb_service.session.values import Count, Epoch, JumpLimits, SensorName,
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from optipmb_service.session.checkpoint import Checkpoint
     from optipmb_service.session.state import FilterState
 
 JUMP_FRAMES: Final = 3
@@ -235,18 +236,22 @@ class Timeline:
         return dict(zip(self.frame_ids, self._arrange(self.frame_ids)[0], strict=True))
 
     @classmethod
-    def resume(
-        cls,
-        limits: JumpLimits,
-        epochs: tuple[SeenNumbers, ...],
-        base: Cursor,
-        floor: FrameId | None,
-        frame_ids: frozenset[FrameId],
-    ) -> Timeline:
-        """Return the timeline that had these parts."""
-        timeline = cls(limits, epochs, base, floor)
+    def resume(cls, limits: JumpLimits, checkpoint: Checkpoint) -> Timeline:
+        """Return the timeline of a session that is restored."""
+        base = checkpoint.base
+        timeline = cls(limits, checkpoint.seen.get("", ()), base.sensor("").cursor, base.last)
+        frame_ids = [one.frame_id for one in checkpoint.window]
         ordered = tuple(sorted(frame_ids, key=lambda one: (timeline._number(one.epoch), one.seq)))
         return replace(timeline, frame_ids=ordered, tip=timeline._arrange(ordered)[1])
+
+    @property
+    def clock(self) -> Mapping[str, int]:
+        """Newest stamps of other sensors: there are none."""
+        return {}
+
+    def live(self) -> dict[str, int]:
+        """Return the other sensors that fed the session lately: there are none."""
+        return {}
 
     @property
     def seen(self) -> Mapping[str, tuple[SeenNumbers, ...]]:
@@ -350,27 +355,3 @@ def without(frame_ids: tuple[FrameId, ...], gone: Sequence[FrameId]) -> tuple[Fr
         return frame_ids[number:]
     left = frozenset(gone)
     return tuple([frame_id for frame_id in frame_ids if frame_id not in left])
-
-
-def hold_until(
-    *,
-    has_points: bool | None,
-    stamp_ns: int,
-    arrived_ns: int,
-    newest_cloud_ns: int | None,
-    cloud_wait_ns: int,
-    cloud_memory_ns: int,
-) -> int | None:
-    """Until when (monotonic, ns) a frame without its point cloud waits for it; None: not at all.
-
-    Args:
-        has_points: what the frame says: a cloud comes, none comes, or nothing (None).
-        stamp_ns: the frame's sensor stamp.
-        arrived_ns: monotonic time of the frame's arrival.
-        newest_cloud_ns: stamp of the cloud of the stream that arrived last; None before the first.
-        cloud_wait_ns: the longest wait.
-        cloud_memory_ns: when the frame says nothing, it waits only if its stamp is this close to a cloud's.
-    """
-    if has_points is None:
-        has_points = newest_cloud_ns is not None and abs(stamp_ns - newest_cloud_ns) <= cloud_memory_ns
-    return arrived_ns + cloud_wait_ns if has_points and cloud_wait_ns > 0 else None

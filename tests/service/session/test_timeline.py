@@ -6,10 +6,12 @@ import itertools
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from optipmb_service.session.pending import SensorQueue
 from optipmb_service.session.seen_numbers import WINDOW
 from optipmb_service.session.state import FilterState, SensorState
-from optipmb_service.session.timeline import Cursor, Decision, FrameId, Timeline, Verdict, hold_until
-from optipmb_service.session.values import JumpLimits
+from optipmb_service.session.timeline import Cursor, Decision, FrameId, Timeline, Verdict
+from optipmb_service.session.values import JumpLimits, Policy
+from router import Sensor
 
 import optipmb
 
@@ -270,14 +272,9 @@ def test_a_publisher_s_last_frame_may_be_overtaken_by_its_successor_s_first() ->
 )
 def test_waiting_for_a_cloud(has_points: bool | None, newest: int | None, stamp: int, wait: int) -> None:  # noqa: FBT001 - drawn
     """A frame waits if it says so, or says nothing and a cloud came lately; never longer than allowed."""
-    until = hold_until(
-        has_points=has_points,
-        stamp_ns=stamp,
-        arrived_ns=7,
-        newest_cloud_ns=newest,
-        cloud_wait_ns=wait,
-        cloud_memory_ns=2 * SECOND,
-    )
+    queue = SensorQueue(Policy(cloud_wait_ns=wait, cloud_memory_ns=2 * SECOND), Timeline(LIMITS))
+    queue.clouds.newest_ns = newest
+    until = queue.cloud_deadline_ns(Sensor().detections(0, has_points=has_points, stamp_ns=stamp), 7)
     lately = newest is not None and abs(stamp - newest) <= 2 * SECOND
     waits = wait > 0 and (has_points or (has_points is None and lately))
     assert until == (7 + wait if waits else None)
