@@ -17,9 +17,8 @@ from pydantic import BaseModel, Field, ValidationError
 import optipmb
 from optipmb_service.session import convert
 from optipmb_service.session.checkpoint import Checkpoint
-from optipmb_service.session.seen_numbers import EPOCHS, WINDOW, SeenNumbers
 from optipmb_service.session.state import UNPLACED, FilterState, FrameCounts, ProcessedFrame, SensorState
-from optipmb_service.session.timeline import FrameId
+from optipmb_service.session.timeline import EPOCHS, WINDOW, FrameId, SeenNumbers
 from optipmb_service.session.values import (
     MAX_CLOUD_WAIT_NS,
     MAX_ERROR,

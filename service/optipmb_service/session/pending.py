@@ -14,10 +14,8 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
 
-from optipmb_service.session.fused_timeline import FusedTimeline
-from optipmb_service.session.seen_numbers import WINDOW
 from optipmb_service.session.state import size_of
-from optipmb_service.session.timeline import JUMP_FRAMES, Order, Verdict
+from optipmb_service.session.timeline import JUMP_FRAMES, WINDOW, FusedTimeline, Order, Verdict
 from optipmb_service.session.values import SECOND
 
 if TYPE_CHECKING:
@@ -29,7 +27,7 @@ if TYPE_CHECKING:
     from optipmb_service.session.timeline import Decision, FrameId, Timeline
     from optipmb_service.session.values import Policy
 
-    Judged = tuple[Timeline | FusedTimeline, Decision, Timeline | FusedTimeline]
+    Judged = tuple[Timeline, Decision, Timeline]
 
 MAX_HELD: Final = 1024
 """Frames held at once: more than come from a publisher's cache before its clouds do.
@@ -103,7 +101,7 @@ class SensorQueue:
         timeline: of the past.
     """
 
-    def __init__(self, policy: Policy, timeline: Timeline | FusedTimeline) -> None:
+    def __init__(self, policy: Policy, timeline: Timeline) -> None:
         self.policy = policy
         self._timeline = timeline
         self._behind = False
@@ -120,7 +118,7 @@ class SensorQueue:
         return len(self.held)
 
     @property
-    def timeline(self) -> Timeline | FusedTimeline:
+    def timeline(self) -> Timeline:
         """The timeline of the past with the frames held."""
         if self._behind:
             # Frames of other sensors were processed, of which the timeline with those held knows nothing.
@@ -130,7 +128,7 @@ class SensorQueue:
         return self._timeline
 
     @timeline.setter
-    def timeline(self, timeline: Timeline | FusedTimeline) -> None:
+    def timeline(self, timeline: Timeline) -> None:
         self._timeline, self._behind = timeline, False
 
     def judge(self, frame_id: FrameId) -> Judged:
@@ -176,7 +174,7 @@ class SensorQueue:
         self.held_bytes += frame.size
         insort(self.held, frame, key=_order)
 
-    def follow(self, past: Timeline | FusedTimeline, base: FilterState, gone: Sequence[FrameId]) -> None:
+    def follow(self, past: Timeline, base: FilterState, gone: Sequence[FrameId]) -> None:
         """Follow the session's timeline.
 
         Args:
@@ -187,9 +185,9 @@ class SensorQueue:
         if gone and self.clouds.newest_ns is not None and base.last is not None:
             self.clouds.forget_before(base.last.stamp_ns, self.policy.gap_limit_ns)
         if not self.held:
-            self._timeline, self._behind = past, False
+            self.timeline = past
         elif isinstance(past, FusedTimeline):
-            self._timeline, self._behind = past, True  # judged when it is asked for: many are let go before that
+            self._timeline, self._behind = past, True  # judged when it is asked for: many are processed before that
         elif gone:
             self.timeline = self.timeline.settle(base, gone)
 

@@ -24,11 +24,10 @@ import optipmb_schemas as schemas
 import optipmb
 from optipmb_service.session import convert
 from optipmb_service.session.checkpoint import Checkpoint
-from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.pending import PendingFrame, SensorQueue
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.state import FilterState, ProcessedFrame
-from optipmb_service.session.timeline import JUMP_FRAMES, FrameId, Timeline, Verdict
+from optipmb_service.session.timeline import JUMP_FRAMES, FrameId, FusedTimeline, StreamTimeline, Verdict
 from optipmb_service.session.transition import Transition
 from optipmb_service.session.values import (
     MAX_CLOUD_WAIT_NS,
@@ -52,7 +51,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.session.pending import Judged
     from optipmb_service.session.state import Inputs
-    from optipmb_service.session.timeline import Decision
+    from optipmb_service.session.timeline import Decision, Timeline
     from optipmb_service.session.transition import Outcome
     from optipmb_service.session.values import Reason, Steps
 
@@ -108,7 +107,7 @@ class Session:
         self._policy = policy or Policy()
         self._limit_wait(self._policy.cloud_wait_ns)
         limits, transition = self._policy.jump_limits, self._transition(parameters)
-        self._timeline: Timeline | FusedTimeline = FusedTimeline(limits) if fused else Timeline(limits)
+        self._timeline: Timeline = FusedTimeline(limits) if fused else StreamTimeline(limits, {"": ()})
         start = FilterState(transition.no_objects(life.next_id), transition.name(None, life.starts), life.starts)
         self._window = ReorderWindow(start, transition)
         # Recovery: until when it lasts, the stamp and the arrival of the first frame of a fused session that waits for
@@ -509,10 +508,7 @@ class Session:
 
     def _forget_silent(self) -> None:
         """Make room for a sensor: the one that fed the session longest ago goes, if that is not lately."""
-        live, newest_ns = self._timeline.live(), self._timeline.clock
-        silent = [name for name, one in self._sensors.items() if not one.held and name not in live]
-        if silent:
-            name = min(silent, key=lambda one: (newest_ns.get(one, -1), one))
+        for name in self._timeline.silent([name for name, one in self._sensors.items() if not one.held])[:1]:
             del self._sensors[name]
             self._quarantine.pop(name, None)
 
@@ -684,7 +680,7 @@ class Session:
     def _go(
         self,
         placed: list[ProcessedFrame],
-        timeline: Timeline | FusedTimeline,
+        timeline: Timeline,
         frame_id: FrameId,
         ticket: Any,
         began_ns: int,

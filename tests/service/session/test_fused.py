@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_schemas import Pose
 from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint, state_bytes
-from optipmb_service.session.fused_timeline import FusedTimeline
 from optipmb_service.session.pending import SensorQueue
 from optipmb_service.session.session import Session
+from optipmb_service.session.timeline import FusedTimeline
 from optipmb_service.session.values import MAX_SENSORS, Policy
 from router import SECOND, Sensor
 from sessions import Failing, Merged, begun, chained, delayed, feed, problems, tracks
