@@ -204,6 +204,11 @@ class ClassParameters(_Table):
     birth_score: Probability = Field(
         description="eta_score: unused detections from this score on start a track at once"
     )
+    announce_score: Probability = Field(
+        default=0.0,
+        exclude_if=not_,
+        description="lower scores continue tracks, and neither start nor announce one; the paper: 0",
+    )
     adaptive_birth_rate: Positive = Field(description="mu_ab: Poisson weight of a low-scored detection")
     baseline_birth_rate: Positive = Field(
         default=0.1, exclude_if=(0.1).__eq__, description="Poisson weight of every detection where HABM is off"
@@ -317,6 +322,11 @@ class Parameters(_Table):
         default=False,
         description="true: p_d holds per nominal period, and a miss weighs by its time where frames come faster; "
         "false: per frame (the paper)",
+    )
+    self_calibration: bool = Field(
+        default=False,
+        exclude_if=not_,
+        description="true: scores are calibrated while the tracker runs (`optipmb.self_calibration`); false: they stay",
     )
     horizons: Annotated[tuple[float, ...], AfterValidator(_ascending)] = Field(
         default=(),
