@@ -65,7 +65,7 @@ def fitting(density: Density, classes: int) -> bool:
     if own is not None:
         for name, (shape, kind) in _shapes(classes, len(objects), len(density.poisson)).items():
             column = getattr(own, name)
-            if column.shape != shape or column.dtype != kind:
+            if not isinstance(column, np.ndarray) or column.shape != shape or column.dtype != kind:
                 return False
     return bool(labels_within(objects.words, density.poisson.words, classes))
 

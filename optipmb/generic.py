@@ -31,8 +31,6 @@ REMEMBERED_S: Final = 2.0
 """How long an object is kept without a detection."""
 SHOWN_S: Final = 0.4
 """How long a track is shown without a detection; two frames at least."""
-SCORES: Final = {"score_filter": 0.05, "announce_score": 0.15, "birth_score": 0.5}
-"""Thresholds on scores, which the tracker calibrates itself."""
 EVIDENCE: Final = tuple(round(-3.0 + 0.5 * k, 1) for k in range(13))
 EXISTENCE: Final = tuple(round(1.0 / (1.0 + math.exp(0.56 - 1.82 * e)), 3) for e in EVIDENCE)
 MEMORY: Final = 0.8
@@ -68,7 +66,10 @@ def generic_parameters(labels: Iterable[str], period: float, *, name: str = "aut
 def _of_class(kind: str, period: float) -> dict[str, Any]:
     still, moving = dict(REACH)[kind]
     agile, two_wheeled, sized = kind in AGILE, kind in TWO_WHEELED, kind in SIZED
-    return SCORES | {
+    return {
+        "score_filter": 0.05,
+        "announce_score": 0.15,
+        "birth_score": 0.5,
         "nms_iou": 0.1,
         "survival": 1.0,
         "gate": round(still + moving * period, 3),
