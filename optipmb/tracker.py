@@ -34,7 +34,7 @@ from optipmb.paths import paths_of
 from optipmb.predict import predict
 from optipmb.preprocess import Measurements, preprocess
 from optipmb.prune import Survivors, surviving_objects
-from optipmb.records import record
+from optipmb.records import read_only, record
 from optipmb.self_calibration import calibrate, followed
 from optipmb.table import ClassTable
 from optipmb.undetected import update_undetected, with_measurement_births
@@ -273,7 +273,7 @@ class Tracker:
         own, score = None, frame.score
         if self.parameters.self_calibration:
             own, table = SelfCalibration.of(density), table.copy()
-            score = calibrate(own.classes, score, frame.label, table.classes)
+            score = read_only(calibrate(own.classes, score, frame.label, table.classes))
         measurements, chosen, below_score, suppressed = preprocess(frame, table, self._max_pairs, score)
         check_effort(bernoulli, poisson, measurements, dt, table, self._max_pairs)
         if not modules.habm:
