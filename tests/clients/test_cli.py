@@ -181,7 +181,7 @@ def test_help_does_not_load_the_tracker() -> None:
 
 
 def test_tracking_a_table_loads_nothing_else(tmp_path: Path) -> None:
-    """`optipmb track boxes.csv` imports neither the network nor the other commands, data sets and tuning."""
+    """`optipmb track boxes.csv` imports neither other commands nor other formats."""
     table = tmp_path / "boxes.csv"
     table.write_text(
         "t,x,y,z,length,width,height,yaw,score,class\n0.0,1,2,0,4,2,1,0,0.9,car\n0.1,1,2,0,4,2,1,0,0.9,car\n"
@@ -189,7 +189,7 @@ def test_tracking_a_table_loads_nothing_else(tmp_path: Path) -> None:
     code = (
         "import sys; from optipmb_client.cli import run; "
         f"run(['track', {str(table)!r}, '--out', {str(tmp_path / 'out')!r}]); "
-        "others = ('zenoh', 'optuna', 'optipmb_client.tuning', 'optipmb_client.replay', 'optipmb_client.datasets.scene', "
+        "others = ('optuna', 'optipmb_client.tuning', 'optipmb_client.load', 'optipmb_client.datasets.scene', "
         "'optipmb_client.datasets.kitti', 'optipmb_client.datasets.nuscenes', 'optipmb_client.commands.replay'); "
         "sys.exit(','.join(sorted(set(others) & set(sys.modules))) or 0)"
     )
