@@ -247,11 +247,6 @@ class ClassParameters(_Table):
         default=None,
         description="time constant, s, with which the acceleration decays; none: it stays constant (the paper)",
     )
-    gate_growth: NonNegative = Field(
-        default=0.0,
-        description="by how much of eta_dist the gate widens for every nominal period that a frame comes later than "
-        "one; the paper: 0",
-    )
     gate_deviations: NonNegative = Field(
         default=0.0,
         description="the gate holds the way of so many standard deviations of the speed, or eta_dist where that is "

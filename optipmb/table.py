@@ -60,7 +60,6 @@ class ClassRow(Protocol):
     nms_iou: float
     survival: float
     gate: float
-    gate_growth: float
     gate_deviations: float
     detection: float
     expected_points: float

@@ -214,9 +214,8 @@ class Oracle:
         if z.label not in known:
             return False
         distance, c = math.hypot(*(component.mean[:2] - z.xy)), self.classes[component.label]
-        eta = c.gate * (1 + c.gate_growth * max(0.0, self.dt / self.nominal - 1))
         spread = math.sqrt(component.covariance[2, 2])
-        return distance <= max(eta, c.gate_deviations * spread * self.dt)
+        return distance <= max(c.gate, c.gate_deviations * spread * self.dt)
 
     def _log_likelihood(self, component: Bernoulli | Poisson, z: Measurement) -> float:
         position = self.classes[z.label].measurement_noise.position
