@@ -230,9 +230,6 @@ class ClassParameters(_Table):
     heading_sign: HeadingSign | None = Field(
         default=None, description="how the sign of the heading is found; without it, it stays that of the birth"
     )
-    linearisations: Annotated[int, Field(ge=0, le=10)] = Field(
-        default=0, description="0: the paper's UKF; else linearisations of a velocity, and moments of known speeds"
-    )
     process_noise: ProcessNoise = Field(description="Q")
     measurement_noise: MeasurementNoise = Field(description="R")
     reported_noise: ReportedNoise | None = Field(

@@ -79,7 +79,6 @@ class ClassRow(Protocol):
     confirm_until: float
     max_misses: int
     min_existence: float
-    linearisations: int
     group: int
     group_size: int
     class_memory: float

@@ -266,7 +266,6 @@ def random_parameters(
             "measurement_noise": {
                 "position": rng.uniform(0.05, 0.6), "velocity": rng.uniform(0.2, 2), "heading": rng.uniform(0.05, 0.4),
             },
-            "linearisations": int(rng.integers(0, 4)),
             "reported_noise": {"position": 0.06, "heading": 0.06} if rng.random() < 0.75 else None,
             "birth": {
                 "position": rng.uniform(0.1, 1), "speed": rng.uniform(0.3, 3), "unknown_speed": rng.uniform(2, 8),
