@@ -90,12 +90,6 @@ class MeasurementNoise(_Table):
     position: Positive = Field(description="standard deviation of x and of y, m; its square fills R_xy")
     velocity: Positive = Field(description="of v_x and of v_y, m/s; unused where a detection has no velocity")
     heading: Positive = Field(description="of phi, rad")
-    position_growth: NonNegative = Field(
-        default=0.0,
-        exclude_if=not_,
-        description="by how much the standard deviation of x and of y grows per metre from the sensor, added in "
-        "quadrature; the paper: 0",
-    )
 
 
 class ReportedNoise(_Table):

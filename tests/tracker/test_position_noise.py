@@ -1,4 +1,4 @@
-"""Detections with a covariance of their own, and noise that grows with the distance, against numpy's formulas."""
+"""Detections with a covariance of their own, against numpy's formulas."""
 
 from __future__ import annotations
 
@@ -13,19 +13,10 @@ import optipmb
 from optipmb.birth import birth_states
 from optipmb.gating import gate
 from optipmb.preprocess import Measurements
-from optipmb.table import ClassTable
 from optipmb.update import ukf_updates
 
 CARS, FRAMES, DT_NS = 6, 12, 100_000_000
 HALF = np.pi / 6
-
-
-def parameters_of(profile: str, growth: float = 0.0) -> optipmb.Parameters:
-    """The profile with the growth in every class."""
-    document = optipmb.load_profile(profile).model_dump()
-    for table in document["classes"].values():
-        table["measurement_noise"]["position_growth"] = growth
-    return optipmb.parse_parameters(document)
 
 
 def drive(parameters: optipmb.Parameters, **given: Any) -> list[optipmb.StepResult]:
@@ -69,7 +60,7 @@ def bytes_of(results: list[optipmb.StepResult]) -> list[bytes]:
 @pytest.mark.parametrize("profile", ["kitti", "kitti-paper", "nuscenes", "nuscenes-paper", "generic"])
 def test_the_covariance_of_the_profile_changes_no_byte(profile: str) -> None:
     """Detections whose covariance is R of their class, or unknown, give the density and tracks of those without."""
-    parameters = parameters_of(profile)
+    parameters = optipmb.load_profile(profile)
     sigma = np.array([one.measurement_noise.position for one in parameters.classes.values()])
 
     def same(label: Any) -> Any:
@@ -83,26 +74,6 @@ def test_the_covariance_of_the_profile_changes_no_byte(profile: str) -> None:
         drive(parameters, position_covariance=lambda label: np.full((len(label), 3, 3), 0.3) + 2 * np.eye(3))
     )
     assert far != expected
-
-
-def test_noise_that_grows_is_that_covariance() -> None:
-    """R is (sigma^2 + g^2 d^2) I, d from the sensor; a covariance of the detection takes its place."""
-    parameters, growing = parameters_of("kitti"), parameters_of("kitti", growth=0.02)
-    assert "position_growth" not in optipmb.load_profile("kitti").model_dump()["classes"]["Car"]["measurement_noise"]
-    sensor = np.array([30.0, -10.0, 1.5])
-    pose = optipmb.Pose(sensor, np.array([np.cos(HALF / 2), 0.0, 0.0, np.sin(HALF / 2)]))
-    found, tables = [], [ClassTable.of(one) for one in (parameters, growing)]
-    center = np.array([[40.0, 3.0, 0.0], [5.0, -60.0, 0.0]])
-    sigma = parameters.classes["Car"].measurement_noise.position
-    for k, one in enumerate((parameters, growing)):
-        own = (sigma**2 + 0.02**2 * (center[:, :2] ** 2).sum(axis=1))[:, None, None] * np.eye(3)
-        boxes: Any = {"center": center, "size": np.ones((2, 3)), "yaw": [0.0, 1.0], "score": [0.9, 0.8]}
-        frame, _ = optipmb.make_frame(
-            one, stamp_ns=0, labels=("Car",), label=[0, 0], pose=pose, position_covariance=None if k else own, **boxes
-        )
-        found.append(optipmb.tracker.preprocess(frame, tables[k])[0].position)
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-12, atol=1e-12)
-    assert found[1][0, 2] > 1.5
 
 
 def pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -208,7 +179,7 @@ def test_a_detection_outside_the_gate_keeps_its_id_where_its_covariance_allows(
     deviation: float | None, *, same: bool
 ) -> None:
     """Half a metre beyond the gate is a new track, unless the covariance of the detection is large enough."""
-    parameters = parameters_of("kitti-paper")
+    parameters = optipmb.load_profile("kitti-paper")
     tracker, ids = optipmb.OnlineTracker(parameters), []
     for k in range(6):
         away = parameters.classes["Car"].gate + 0.5 if k == 5 else 0.0
@@ -244,7 +215,13 @@ def test_a_covariance_of_the_sensor_is_turned_to_the_world() -> None:
     given = root @ root.transpose(0, 2, 1) + 0.01 * np.eye(3)
     boxes: Any = {"center": np.ones((2, 3)), "size": np.ones((2, 3)), "yaw": [0, 1], "score": [0.0, 0.5]}
     frame, left_out = optipmb.make_frame(
-        parameters_of("kitti"), stamp_ns=0, labels=("Car",), label=[0, 0], pose=pose, position_covariance=given, **boxes
+        optipmb.load_profile("kitti"),
+        stamp_ns=0,
+        labels=("Car",),
+        label=[0, 0],
+        pose=pose,
+        position_covariance=given,
+        **boxes,
     )
     assert left_out == 1
     world = pose.rotation @ given[1] @ pose.rotation.T
