@@ -133,14 +133,14 @@ class ClassTable:
     Attributes:
         classes: (C,) array of `CLASS`, for kernels; `table["gate"]` is a column of it.
         period: nominal period, s.
-        detection_over_time: whether p_d holds per nominal period (`optipmb.detection_probability.over_time`).
+        detection_time: s that p_d holds for, zero per frame (`optipmb.detection_probability.over_time`).
         noise_grows: whether the position noise of any class grows with the distance.
         confusion: (C, C) Lambda of `optipmb.class_posterior`; (0, 0) where no two classes have a group in common.
     """
 
     classes: Sequence[ClassRow]
     period: float
-    detection_over_time: bool
+    detection_time: float
     noise_grows: bool
     confusion: NDArray[np.float64]
 
@@ -160,7 +160,7 @@ class ClassTable:
                 classes[name][c] = value
         grows = any(p.measurement_noise.position_growth > 0.0 for p in rows)
         confusion = _confusion(classes, np.array([p.class_confusion for p in rows]))
-        return cls(classes, parameters.nominal_period, parameters.detection_over_time, grows, confusion)
+        return cls(classes, parameters.nominal_period, parameters.detection_time, grows, confusion)
 
 
 def _confusion(classes: Any, kappa: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -250,3 +250,9 @@ def test_any_document_is_refused_by_name(document: Any) -> None:
     """Nothing but ParameterError comes out, whatever is read."""
     error = refused(document)
     assert str(error).startswith(error.path)
+
+
+def test_generic_is_what_is_made_for_ten_hertz() -> None:
+    """The file and the function do not differ."""
+    generic = optipmb.load_profile("generic")
+    assert generic == optipmb.generic_parameters(generic.labels, 0.1, name="generic")
