@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class Around(NoPersistence):
     """Everything around the streams: it grants them all, keeps their states, and runs their actors when told to."""
 
-    strained = False
+    strained = unlinked = False
 
     def __init__(self) -> None:
         super().__init__()
@@ -87,21 +87,29 @@ class Around(NoPersistence):
         """Tracks go nowhere."""
 
 
-def registry_of(around: Around, missed: NoLog | None = None, **settings: Any) -> Registry:
+def registry_of(
+    around: Around,
+    missed: NoLog | None = None,
+    *,
+    profiles: Profiles | None = None,
+    reporter: Any = None,
+    tracker: Any = chained,
+    **settings: Any,
+) -> Registry:
     """Return the streams of a process with these around it."""
     parts: Any = around  # in the place of several
     return Registry(
         Settings(instance="test", store="none", step_limit_s=60, **settings),  # kernels may have to be compiled
-        Profiles.read("nuscenes", {}),
+        profiles or Profiles.read("nuscenes", {}),
         sink=parts,
-        reporter=ProblemReporter(lambda _: None, lambda *_: None),
+        reporter=reporter or ProblemReporter(lambda _: None, lambda *_: None),
         scheduler=parts,
         member=parts,
         persistence=parts,
         missed=missed or NoLog(),
         arm=lambda *_: None,
         metrics=Metrics(),
-        tracker=chained,
+        tracker=tracker,
     )
 
 

@@ -55,12 +55,16 @@ class Merged:
         outputs = list(outputs)
         assert not dumps(outputs), dumps(outputs)[0].error
         for message in tracks(outputs):
-            key = message.epoch + (message.sensor or "").encode(), message.seq
-            old_run, old = self.newest.get(key, (-1, message))
-            if (old_run, old.revision) == (run, message.revision):
-                assert plain(old) == plain(message), f"another message of revision {message.revision} for {key}"
-            if (run, message.revision) > (old_run, old.revision):
-                self.newest[key] = run, message
+            self.add(message, run)
+
+    def add(self, message: Tracks, run: int) -> None:
+        """Add tracks of a run."""
+        key = message.epoch + (message.sensor or "").encode(), message.seq
+        old_run, old = self.newest.get(key, (-1, message))
+        if (old_run, old.revision) == (run, message.revision):
+            assert plain(old) == plain(message), f"another message of revision {message.revision} for {key}"
+        if (run, message.revision) > (old_run, old.revision):
+            self.newest[key] = run, message
 
     def plain(self) -> dict[tuple[bytes, int], bytes]:
         """The bytes of the tracks but for revision and delivery."""

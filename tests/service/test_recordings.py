@@ -1,0 +1,337 @@
+"""The service gives the bytes that it gave when they were recorded: packets in, bytes out, through public seams.
+
+`recordings.json` has, for each scenario, seam and tracker, how many outputs of each kind there were and the digest of
+their bytes. With the `chained` tracker, which hashes the frames in their order, they depend on the service alone. With
+the `filter` they depend on the tracker too, whose numbers may differ on another kind of processor. After a change that
+is meant to change bytes, `OPTIPMB_TEST_RECORD=1 pytest tests/service/test_recordings.py` writes the file anew.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import optipmb_schemas as schemas
+import pytest
+from fusing import FUSED
+from optipmb_service.cluster.leases import Change, partition_of
+from optipmb_service.runtime.ports import Packet
+from optipmb_service.runtime.profiles import Profiles
+from optipmb_service.runtime.stream_queries import StreamQueries
+from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.session import Session
+from optipmb_service.session.values import Policy, Quarantined, RefusedError, Tracked
+from registries import Around, packet_of, registry_of
+from router import SECOND
+from scenarios import FILE, PROFILE, SCENARIOS, SENSOR, STREAM, Raw, Recorded, Step, delivery
+from sessions import chained
+
+import optipmb
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from optipmb_service.session.values import Output
+
+RECORD: Final = bool(os.environ.get("OPTIPMB_TEST_RECORD"))
+BETWEEN_NS: Final = SECOND // 50
+"""Time between two steps."""
+
+RECORDED: Final = optipmb.load_profile(PROFILE)
+OTHER: Final = RECORDED.model_copy(update={"name": "other", "nominal_period": 0.2})
+PROFILES: Final = Profiles("recorded", (), {one.name: one for one in (RECORDED, OTHER)})
+TRACKERS: Final = {"chained": chained, "filter": optipmb.Tracker}
+KEYS: Final = schemas.Keys()
+
+
+class Failing:
+    """A tracker that raises for seven objects."""
+
+    def __init__(self, tracker: Any) -> None:
+        self._tracker = tracker
+
+    def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
+        """Step, or raise."""
+        if len(frame.score) == 7:
+            raise ZeroDivisionError("seven")
+        result: optipmb.StepResult = self._tracker.step(density, frame)
+        return result
+
+
+class SessionSeam:
+    """The API of sessions: messages in, values out."""
+
+    def __init__(self, stream: str, tracker: Callable[[optipmb.Parameters], Any], out: Recorded) -> None:
+        self._options: dict[str, Any] = {
+            "policy": Policy(late_clouds=True),
+            "instance": "test",
+            "tracker": lambda parameters: Failing(tracker(parameters)),
+        }
+        self._session = Session(stream, RECORDED, fused=stream == FUSED, **self._options)
+        self._out = out
+        self._now_ns = 1000 * SECOND
+        self._saved = self._session.snapshot()
+        self._waiting: list[Step] | None = None
+
+    def run(self, steps: Iterable[Step]) -> None:
+        """Take all steps."""
+        for step in steps:
+            self._now_ns += BETWEEN_NS
+            self._step(step)
+        self._take(self._session.flush())
+        self._out.message(self._session.state())
+        self._out.add("counters", repr(self._session.counters).encode())
+
+    def _step(self, step: Step) -> None:
+        if isinstance(step, tuple):
+            for one in step:
+                self._step(one)
+        elif isinstance(step, float):
+            self._now_ns += round(step * SECOND)
+        elif isinstance(step, str):
+            self._command(step)
+        elif self._waiting is not None:
+            self._waiting.append(step)
+        else:
+            self._message(step)
+        if self._session.deadline_ns is not None and self._session.deadline_ns <= self._now_ns:
+            self._take(self._session.on_tick(self._now_ns))
+
+    def _message(self, step: Step) -> None:
+        session = self._session
+        if isinstance(step, Raw):
+            self._raw(step.payload)
+        elif isinstance(step, schemas.Points):
+            self._take(session.on_points(step, self._now_ns))
+        elif isinstance(step, schemas.Detections):
+            self._take(session.on_detections(step, self._now_ns))
+        elif isinstance(step, schemas.ResetRequest):
+            self._take(session.reset())
+        elif isinstance(step, schemas.SessionParameters):
+            self._configure(step)
+
+    def _raw(self, payload: bytes) -> None:
+        try:
+            message = schemas.decode(payload, schemas.Detections)
+        except schemas.MessageError as error:
+            self._out.add(f"error {error.code}", str(error).encode())
+            self._session.refuse()
+        else:
+            self._take(self._session.on_detections(message, self._now_ns))
+
+    def _configure(self, asked: schemas.SessionParameters) -> None:
+        horizons = None if asked.horizons is None else asked.horizons.tolist()
+        profile = PROFILES.named(asked.profile or "")
+        try:
+            outputs = self._session.configure(profile, asked.cloud_wait_s, horizons, restart=asked.restart)
+        except RefusedError as error:
+            self._out.add("refused", str(error).encode())
+        else:
+            self._take(outputs)
+
+    def _command(self, command: str) -> None:
+        session = self._session
+        if command == "caches":
+            self._take(session.recovered(self._now_ns))
+        elif command == "take":
+            again, self._waiting = self._waiting or [], None
+            self._restore()
+            for step in again:
+                self._step(step)
+        else:
+            if command in {"keep", "leave"}:
+                self._saved = decode_checkpoint(encode_checkpoint(session.snapshot()))
+            if command == "leave":
+                self._waiting = [message for message, _ in session.unprocessed()]
+            if command == "kill":
+                self._restore()
+
+    def _restore(self) -> None:
+        self._session = Session.restore(self._saved, self._now_ns, **self._options)
+
+    def _take(self, outputs: Iterable[Output]) -> None:
+        for output in outputs:
+            if isinstance(output, Tracked):
+                self._out.message(output.tracks.model_copy(update={"delivery": delivery(output.run)}))
+            elif isinstance(output, schemas.Problem):
+                self._out.message(output)
+            elif isinstance(output, Quarantined):
+                self._out.add("quarantined", output.error.encode())
+            else:
+                self._out.add(f"begun {output.reason}", repr(output).encode())
+
+
+class Process(Around):
+    """The surroundings of a process that may hold the partitions, and records what it publishes."""
+
+    def __init__(self, out: Recorded, kept: dict[str, bytes]) -> None:
+        super().__init__()
+        self.holding = True
+        self._out = out
+        self._saved = kept
+
+    def holds(self, _: str) -> bool:
+        """Return whether this process has the streams."""
+        return self.holding
+
+    def fence(self, _: str) -> int | None:  # type: ignore[override]  # without a lease there is none
+        """Return the fence of all streams."""
+        return 1 if self.holding else None
+
+    def put(self, checkpoint: Any, _: int | None, then: Callable[[], None] | None = None) -> None:
+        """Keep the bytes of a state."""
+        self._saved[checkpoint.stream] = encode_checkpoint(checkpoint)
+        if then is not None:
+            then()
+
+    def recall(self, stream: str, restore: Any, then: Any, _: object = None) -> None:
+        """Restore what was kept."""
+        then(restore(decode_checkpoint(self._saved[stream])) if stream in self._saved else None)
+
+    def publish(self, payload: bytes) -> None:
+        """Record tracks."""
+        self._out.message(schemas.decode(payload, schemas.Tracks))
+
+    def report(self, problem: schemas.Problem, _: int) -> None:
+        """Record a problem."""
+        self._out.message(problem)
+
+    def awaited(self, *_: object) -> dict[str, bool]:
+        """Return no streams: no publisher has a cache."""
+        return {}
+
+
+class Question:
+    """A query of the recordings, whose replies are recorded."""
+
+    def __init__(self, key: str, message: schemas.Message | None, out: Recorded) -> None:
+        self.key = key
+        self.payload = None if message is None else schemas.encode(message)
+        self.encoding = "" if message is None else schemas.encoding_of(message)
+        self.finished = threading.Event()
+        self._out = out
+
+    def answer(self, _: str, message: schemas.Message) -> None:
+        """Record a reply."""
+        self._out.message(message)
+
+    def refuse(self, problem: schemas.Problem) -> None:
+        """Record a refusal."""
+        self._out.message(problem)
+
+    def finish(self) -> None:
+        """End."""
+        self.finished.set()
+
+
+class CoreSeam:
+    """The streams of a process without a network: packets in, payloads out. The clock is the test's."""
+
+    def __init__(self, stream: str, tracker: Callable[[optipmb.Parameters], Any], out: Recorded) -> None:
+        self._stream = stream
+        self._out = out
+        self._kept: dict[str, bytes] = {}
+        self._tracker = lambda parameters: Failing(tracker(parameters))
+        self.now_ns = 1000 * SECOND
+
+    def run(self, steps: Iterable[Step]) -> None:
+        """Take all steps."""
+        self._begin()
+        for step in steps:
+            self.now_ns += BETWEEN_NS
+            self._step(step)
+            self._registry.resume()
+            self._process.run()
+        self._registry.finish()
+        self._process.run()
+        self._ask("state", None)
+        self._out.add("totals", repr(self._registry.totals()).encode())
+
+    def _begin(self) -> None:
+        self._process = Process(self._out, self._kept)
+        self._registry = registry_of(
+            self._process,
+            profiles=PROFILES,
+            reporter=self._process,
+            tracker=self._tracker,
+            late_clouds=True,
+            queue_frames=32,
+            fuse=("site/node/*",) if self._stream == FUSED else (),
+        )
+        self._registry.caches = self._process  # type: ignore[assignment]  # asked for nothing else
+        nothing: Any = None
+        self._queries = StreamQueries(self._registry, nothing)
+
+    def _step(self, step: Step) -> None:
+        if isinstance(step, tuple):
+            for one in step:
+                self._step(one)
+        elif isinstance(step, float):
+            self.now_ns += round(step * SECOND)
+        elif isinstance(step, str):
+            self._command(step)
+        elif isinstance(step, Raw):
+            self._registry.frame(self._packet(step.payload))
+        elif isinstance(step, schemas.Points):
+            self._registry.cloud(packet_of(step))
+        elif isinstance(step, schemas.Detections):
+            self._registry.frame(packet_of(step))
+        else:
+            self._ask("reset" if isinstance(step, schemas.ResetRequest) else "parameters", step)
+
+    def _packet(self, payload: bytes) -> Packet:
+        key, encoding = KEYS.detections(SENSOR.stream), schemas.encoding_of(schemas.Detections)
+        return Packet(key, payload, len(payload), encoding, time.time_ns(), time.monotonic_ns())
+
+    def _command(self, command: str) -> None:
+        if command == "caches":
+            self._registry.caches_answered(KEYS.detections(self._stream))
+        elif command == "keep":
+            self._registry.keep()
+        elif command == "leave":
+            self._process.holding = False
+            self._registry.changed(partition_of(self._stream), Change.RECALLED)
+        else:
+            between = self._registry.untracked.recent([self._stream]) if command == "take" else []
+            self._begin()
+            self._registry.untracked.hold(self._stream)
+            clouds = KEYS.points(self._stream)
+            self._registry.take_up(self._stream, [(packet, packet.key != clouds) for packet in between])
+        self._process.run()
+
+    def _ask(self, name: str, message: schemas.Message | None) -> None:
+        question = Question(KEYS.query(self._stream, name), message, self._out)  # type: ignore[arg-type]  # one of them
+        self._queries.answer(question)  # type: ignore[arg-type]  # asked for no more
+        self._process.run()
+        assert question.finished.wait(60.0)
+
+
+SEAMS: Final = {"session": SessionSeam, "core": CoreSeam}
+
+
+def recorded(scenario: str, seam: str, tracker: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """Return the outputs of a scenario."""
+    out, stream = Recorded(), STREAM.get(scenario, SENSOR.stream)
+    one = SEAMS[seam](stream, TRACKERS[tracker], out)
+    if isinstance(one, CoreSeam):
+        monkeypatch.setattr(time, "monotonic_ns", lambda: one.now_ns)
+    one.run(SCENARIOS[scenario]())
+    return out.summary()
+
+
+@pytest.mark.parametrize("tracker", TRACKERS)
+@pytest.mark.parametrize("seam", SEAMS)
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_outputs_are_those_that_were_recorded(
+    scenario: str, seam: str, tracker: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every scenario gives, through every seam, the tracks, problems, replies and counters of the recording."""
+    found, name = recorded(scenario, seam, tracker, monkeypatch), f"{scenario} {seam} {tracker}"
+    recordings = json.loads(FILE.read_text()) if FILE.exists() else {}
+    if RECORD:
+        FILE.write_text(json.dumps(recordings | {name: found}, indent=1, sort_keys=True) + "\n")
+        return
+    assert found == recordings[name]
