@@ -19,16 +19,19 @@ if TYPE_CHECKING:
     from optipmb.parameters import Parameters
 
 OTHER: Final = "other"
-REACH: Final = (  # gate: metres at once, and metres per second of the period
+REACH: Final = (  # the gate, m, and the standard deviation of an unknown speed, m/s, of which it holds GATE_DEVIATIONS
     ("car", (3.0, 12.0)), ("truck", (4.0, 12.0)), ("bus", (4.0, 12.0)), ("trailer", (4.0, 12.0)),
-    ("pedestrian", (1.8, 0.4)), ("bicycle", (2.5, 3.0)), ("motorcycle", (2.5, 8.0)), (OTHER, (2.5, 6.0)),
+    ("pedestrian", (1.8, 2.0)), ("bicycle", (2.5, 5.0)), ("motorcycle", (2.5, 12.0)), (OTHER, (2.5, 10.0)),
 )  # fmt: skip
+GATE_DEVIATIONS: Final = 2.75
 SIZED: Final = frozenset({"truck", "bus", "trailer"})
 AGILE: Final = frozenset({"pedestrian"})
 TWO_WHEELED: Final = frozenset({"bicycle", "motorcycle"})
 
 REMEMBERED_S: Final = 2.0
 """How long an object is kept without a detection."""
+DETECTION_S: Final = 0.5
+"""Time that the detection probability holds for: what hides an object hides it about so long."""
 SHOWN_S: Final = 0.4
 """How long a track is shown without a detection; two frames at least."""
 EVIDENCE: Final = tuple(round(-3.0 + 0.5 * k, 1) for k in range(13))
@@ -55,7 +58,7 @@ def generic_parameters(labels: Iterable[str], period: float, *, name: str = "aut
         {
             "name": name,
             "nominal_period": period,
-            "detection_over_time": True,
+            "detection_time": DETECTION_S,
             "self_calibration": True,
             "provenance": provenance[:10_000],
             "classes": classes,
@@ -64,7 +67,7 @@ def generic_parameters(labels: Iterable[str], period: float, *, name: str = "aut
 
 
 def _of_class(kind: str, period: float) -> dict[str, Any]:
-    still, moving = dict(REACH)[kind]
+    gate, unknown_speed = dict(REACH)[kind]
     agile, two_wheeled, sized = kind in AGILE, kind in TWO_WHEELED, kind in SIZED
     return {
         "score_filter": 0.05,
@@ -72,7 +75,8 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "birth_score": 0.5,
         "nms_iou": 0.1,
         "survival": 1.0,
-        "gate": round(still + moving * period, 3),
+        "gate": gate,
+        "gate_deviations": GATE_DEVIATIONS,
         "detection": 0.8,
         "expected_points": 10.0,
         "detection_floor": 0.6,
@@ -85,7 +89,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "extract_known": 0.8,
         "extract_misses": max(2, round(SHOWN_S / period)),
         "max_misses": max(4, round(REMEMBERED_S / period)),
-        "min_existence": 0.01,
+        "min_existence": 1e-4,  # objects are kept for their time, not for their misses
         "heading_sign": {  # vehicles reverse at up to 4 m/s
             "memory": 0.9,
             "detection": 1.0,
@@ -93,9 +97,8 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
             "speed": 1.0 if agile or two_wheeled else 4.0,
         },
         "birth_heading_speed": 1.0,
-        "birth_over_clutter": True,
+        "birth_over_clutter": True,  # a wide gate holds components that are of other objects
         "birth_overlap": 0.1,
-        "gate_deviations": 3.5,
         "motion": "cv" if agile else "ctra",
         "acceleration_time": None if agile else 1.0 if two_wheeled else 3.0,
         "confirm_from": 0.5,
@@ -113,7 +116,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
             "position": 0.1,
             "speed": 0.8 if agile else 1.0,
             "heading": 0.6 if agile else 0.2 if two_wheeled else 0.08,
-            "turn_rate": 0.4 if agile or two_wheeled else 0.3,
+            "turn_rate": 0.4 if agile or two_wheeled else 0.15,
             "acceleration": 0.5 if agile else 1.5,
         },
         "measurement_noise": {
@@ -124,7 +127,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "birth": {
             "position": 0.5,
             "speed": 1.0 if agile else 3.0,
-            "unknown_speed": 2.0 if agile else 5.0 if two_wheeled else 8.0,
+            "unknown_speed": unknown_speed,
             "heading": 0.8 if agile else 0.4,
             "turn_rate": 0.3,
             "acceleration": 0.5 if agile else 1.0,

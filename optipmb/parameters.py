@@ -294,10 +294,10 @@ class Parameters(_Table):
     nominal_period: Positive = Field(
         description="seconds between frames for which p_s and the counted limits hold; with another dt they are scaled"
     )
-    detection_over_time: bool = Field(
-        default=False,
-        description="true: p_d holds per nominal period, and a miss weighs by its time where frames come faster; "
-        "false: per frame (the paper)",
+    detection_time: NonNegative = Field(
+        default=0.0,
+        description="time, s, that p_d holds for: a miss weighs by its share of it where frames come faster; 0: p_d "
+        "holds per frame (the paper)",
     )
     self_calibration: bool = Field(
         default=False, exclude_if=not_, description="true: scores are calibrated by `optipmb.self_calibration`"

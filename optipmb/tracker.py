@@ -348,7 +348,7 @@ class Tracker:
 
         Without a cloud and a field of view it is that of the class: then of each class.
         """
-        share = dt / self._table.period if self._table.detection_over_time else 1.0
+        share = dt / self._table.detection_time if self._table.detection_time > 0.0 else 1.0
         if cloud is None and looks is None:
             return over_time(self._detection, share)
         p_d = detection_probability(
