@@ -16,7 +16,7 @@ from optipmb.effort import UNLIMITED
 from optipmb.errors import EffortError
 from optipmb.geometry import iou_exceeds
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
-from optipmb.position_noise import PLAIN, relative_noise
+from optipmb.position_noise import PLAIN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,36 +54,40 @@ class Measurements(NamedTuple):
     source: Index
 
 
-def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[Measurements, int, int]:
+def preprocess(
+    frame: Frame, table: ClassTable, most: int = UNLIMITED, score: Array | None = None
+) -> tuple[Measurements, Index, int, int]:
     """Remove detections scored below eta_sf, then those that overlap a better one by more than eta_iou.
 
     They are compared with detections of their class, and with those of the other classes of its group, if it has one.
+    `score` (M,) stands for the scores of the frame.
 
     Returns:
-        The measurements, the number below the score filter and the number suppressed.
+        The measurements, their rows in the frame, the number below the score filter and the number suppressed.
 
     Raises:
         EffortError: more than `most` pairs of detections may overlap.
     """
-    own_noise = frame.position_covariance is not None or table.noise_grows
+    own_noise = frame.position_covariance
     above, chosen, columns = select(
         frame.center,
         frame.size,
         frame.yaw,
         frame.velocity,
-        frame.score,
+        frame.score if score is None else score,
         frame.label,
         frame.source,
-        PLAIN + 3 if own_noise else PLAIN,
+        PLAIN if own_noise is None else PLAIN + 3,
         table.classes,
         most,
     )
     if above < 0:
         raise EffortError("center", f"at most {most} pairs of detections that may overlap", "more")
     measurements = Measurements(*columns)
-    if own_noise:
-        measurements.position[:, PLAIN:] = relative_noise(frame, chosen, table)
-    return measurements, frame.score.shape[0] - above, above - chosen.shape[0]
+    if own_noise is not None:
+        covariance, variance = own_noise[chosen], table["noise_position"][measurements.label, None] ** 2
+        measurements.position[:, PLAIN:] = np.where(np.isnan(covariance), (1.0, 0.0, 1.0), covariance / variance)
+    return measurements, chosen, frame.score.shape[0] - above, above - chosen.shape[0]
 
 
 @kernel

@@ -148,15 +148,24 @@ def test_a_component_worse_than_clutter_takes_no_birth_from_a_high_score(*, over
     np.testing.assert_allclose(existence, [r, 0.001 / 0.011, 0.1 / 0.11])
 
 
+def test_a_score_too_low_to_announce_is_clutter_with_a_component_or_without() -> None:
+    """It may continue a track, and starts none."""
+    measured = np.array([0.1, 0.1, 0.2]), np.zeros(3), np.zeros(3, np.int64)
+    classes = class_rows(1, clutter_intensity=0.01, birth_intensity=0.002, birth_score=0.5, announce_score=0.15)
+    kind, cost, existence = first_detections(np.array([0, 2]), np.log([0.1, 0.1]), *measured, classes)
+    np.testing.assert_array_equal(kind, [CLUTTER, CLUTTER, FROM_POISSON])
+    np.testing.assert_allclose(cost, [-math.log(0.01), -math.log(0.01), -math.log(0.11)])
+    np.testing.assert_allclose(existence, [0.0, 0.0, 0.1 / 0.11])
+
+
 @pytest.mark.parametrize("dt", [0.0, 0.05, 0.1, 0.5])
-def test_gates_widen_with_time_and_with_unknown_speed(dt: float) -> None:
-    """`eta [1 + g (dt / T - 1)]` beyond one period, at least k sd of v over dt; a NaN or an infinity widens none."""
+def test_gates_widen_with_unknown_speed(dt: float) -> None:
+    """A gate is eta, at least k standard deviations of v over dt; a NaN or an infinity widens none."""
     covariance = np.zeros((4, 6, 6))
     covariance[:, 2, 2] = [0.0, 100.0, np.nan, np.inf]
-    label, eta, growth, k = np.array([0, 0, 0, 1]), np.array([4.0, 1.0]), np.array([0.5, 0.0]), np.array([3.0, 0.0])
-    found = gate_radii(covariance, label, dt, 0.1, class_rows(2, gate=eta, gate_growth=growth, gate_deviations=k))
-    wanted = eta * (1 + growth * max(0.0, dt / 0.1 - 1))
-    np.testing.assert_allclose(found, [wanted[0], max(wanted[0], 30.0 * dt), wanted[0], wanted[1]])
+    label, eta, k = np.array([0, 0, 0, 1]), np.array([4.0, 1.0]), np.array([3.0, 0.0])
+    found = gate_radii(covariance, label, dt, class_rows(2, gate=eta, gate_deviations=k))
+    np.testing.assert_allclose(found, [eta[0], max(eta[0], 30.0 * dt), eta[0], eta[1]])
 
 
 @given(st.lists(st.floats(-4000, 600), min_size=1, max_size=6))
