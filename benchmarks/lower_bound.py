@@ -114,7 +114,6 @@ def arguments(parameters: optipmb.Parameters, density: optipmb.Density, frame: o
         p_d_poisson,
         measurements,
         table.period,
-        table.period,
         table.confusion,
         table.classes,
     )

@@ -62,7 +62,7 @@ def before_association(objects: int) -> tuple[Any, ...]:
     old, new = density.bernoulli, density.poisson
     p_d = TABLE["detection"][old.label], TABLE["detection"][new.label]
     known, undetected = objects_in(old.words), components_in(new.words)
-    given = known, UNGROUPED, p_d[0], undetected, p_d[1], measurements, TABLE.period, TABLE.period
+    given = known, UNGROUPED, p_d[0], undetected, p_d[1], measurements, TABLE.period
     return *given, TABLE.confusion, TABLE.classes
 
 

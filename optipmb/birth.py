@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import STATE, copy_state
+from optipmb.density import PHI, STATE, copy_state
 from optipmb.hypotheses import FROM_POISSON
-from optipmb.linearised import moment_match
 from optipmb.motion import wrap
 from optipmb.position_noise import PLAIN
 from optipmb.update import ukf_updates
@@ -159,3 +158,45 @@ def first_detected_states(
     for i in range(wanted.shape[0]):
         copy_state(matched, matched_spread, i, mean_out, covariance_out, wanted[i])
     return repaired
+
+
+@kernel
+def moment_match(
+    start: Index, weight: Array, mean: Array, covariance: Array, mean_out: Array, covariance_out: Array
+) -> None:
+    """Replace Gaussian mixtures by single Gaussians of the same mean and covariance.
+
+    Headings are averaged as differences from the heading of the heaviest component, taken in (-pi, pi].
+
+    Args:
+        start: (K + 1,) where the components of each mixture start.
+        weight: (L,) weights, summing to one within each mixture.
+        mean: (L, 6) component means.
+        covariance: (L, 6, 6) component covariances.
+        mean_out: (K, 6) receives the means.
+        covariance_out: (K, 6, 6) receives the covariances.
+    """
+    for k in range(start.shape[0] - 1):
+        first, last = start[k], start[k + 1]
+        heaviest = first
+        for j in range(first, last):
+            if weight[j] > weight[heaviest]:
+                heaviest = j
+        deviation = np.empty((last - first, STATE))
+        shift = np.zeros(STATE)
+        for j in range(first, last):
+            for s in range(STATE):
+                deviation[j - first, s] = mean[j, s] - mean[heaviest, s]
+            deviation[j - first, PHI] = wrap(deviation[j - first, PHI])
+            for s in range(STATE):
+                shift[s] += weight[j] * deviation[j - first, s]
+        for s in range(STATE):
+            mean_out[k, s] = mean[heaviest, s] + shift[s]
+            for t in range(s + 1):
+                value = 0.0
+                for j in range(first, last):
+                    spread = (deviation[j - first, s] - shift[s]) * (deviation[j - first, t] - shift[t])
+                    value += weight[j] * (covariance[j, s, t] + spread)
+                covariance_out[k, s, t] = value
+                covariance_out[k, t, s] = value
+        mean_out[k, PHI] = wrap(mean_out[k, PHI])

@@ -51,8 +51,8 @@ def check_effort(
     labels = np.concatenate((bernoulli.label, poisson.label, measurements.label))
     radius = np.concatenate(
         (
-            gate_radii(bernoulli.covariance, bernoulli.label, dt, table.period, table.classes),
-            gate_radii(poisson.covariance, poisson.label, dt, table.period, table.classes),
+            gate_radii(bernoulli.covariance, bernoulli.label, dt, table.classes),
+            gate_radii(poisson.covariance, poisson.label, dt, table.classes),
             table["gate"][measurements.label],
         )
     )

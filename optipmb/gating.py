@@ -37,29 +37,26 @@ def gate_radii(
     covariance: Array,
     label: Index,
     dt: float,
-    period: float,
     classes: Sequence[ClassRow],
 ) -> Array:
     """Compute the gating distance of each object.
 
-    ``eta_dist [1 + growth max(0, dt / period - 1)]``, at least the way that its speed may deviate: so many standard
-    deviations of v over dt. The paper has eta_dist alone, at the one frame rate of a data set.
+    It is eta_dist, and at least the way that its speed may deviate: so many standard deviations of v over dt. The paper
+    has eta_dist alone, at the one frame rate of a data set.
 
     Args:
         covariance: (N, 6, 6) predicted covariances.
         label: (N,) classes.
         dt: s since the last frame.
-        period: nominal period, s.
-        classes: (C,) parameters: eta_dist, its growth per nominal period, and how many standard deviations of v.
+        classes: (C,) parameters: eta_dist, and how many standard deviations of v.
 
     Returns:
         (N,) m.
     """
     radius = np.empty(label.shape[0])
-    beyond = max(0.0, dt / period - 1.0)
     for n in range(label.shape[0]):
         own = classes[label[n]]
-        radius[n] = own.gate * (1.0 + own.gate_growth * beyond)
+        radius[n] = own.gate
         reach = own.gate_deviations * math.sqrt(max(covariance[n, V, V], 0.0)) * dt
         if reach > radius[n]:  # noqa: PLR1730 - max() would keep NaN
             radius[n] = reach

@@ -73,7 +73,6 @@ def local_hypotheses(
     p_d_poisson: Array,
     measurements: Measurements,
     dt: float,
-    period: float,
     confusion: Array,
     classes: Sequence[ClassRow],
 ) -> Hypotheses:
@@ -91,14 +90,13 @@ def local_hypotheses(
         p_d_poisson: (J,) theirs.
         measurements: Z_k.
         dt: s since the last frame.
-        period: nominal period, s.
         confusion: (C, C) Lambda; (0, 0) where no classes have a group in common.
         classes: (C,) parameters.
     """
     grouped = confusion.shape[0] > 0
     position, label = measurements.position, measurements.label
-    radius = gate_radii(objects.covariance, objects.label, dt, period, classes)
-    radius_poisson = gate_radii(components.covariance, components.label, dt, period, classes)
+    radius = gate_radii(objects.covariance, objects.label, dt, classes)
+    radius_poisson = gate_radii(components.covariance, components.label, dt, classes)
     close_gates(p_d, radius)
     close_gates(p_d_poisson, radius_poisson)
     row, measurement, log_likelihood = gate(

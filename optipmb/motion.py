@@ -14,10 +14,7 @@ of x and y pass through unbent: turning the world turns the result, exactly. A f
 make the tracker prefer compass directions.
 
 Where the heading's standard deviation nears one radian the twelve points lie beyond half a turn, and the transform
-claims to know far more than it does. Objects of a class with `linearisations` are predicted by exact moments instead
-(`predict_moments`): the way of a frame is D = e^{i theta} (L + i o), with theta = phi + omega dt / 2 and a length L
-that are nearly linear in the state. This is done where the speed exceeds `KNOWN` standard deviations. One that is
-hardly known is not Gaussian enough: exact moments of it would spread an object over places that it cannot reach.
+claims to know more than it does.
 """
 
 from __future__ import annotations
@@ -52,9 +49,6 @@ square."""
 
 START = 5.0
 """Where the acceleration decays, it carries a speed to at most so many times its own beyond it (`travel`)."""
-
-KNOWN = 2.0
-"""Standard deviations by which a speed has to differ from zero to count as known."""
 
 TINY_PIVOT = 1e-12
 """A pivot of the square root is lifted to this: a covariance that lost rank in rounding is repaired, and counted."""
@@ -182,15 +176,13 @@ def predict_state(
     mean_out: Array,
     covariance_out: Array,
 ) -> int:
-    """Predict one state by the unscented transform of its motion model (eq. Motion Predict), or by exact moments.
+    """Predict one state by the unscented transform of its motion model (eq. Motion Predict).
 
     Args:
         mean: (6,) posterior mean.
         covariance: (6, 6) posterior covariance.
         dt: time to predict over, s, positive.
-        own: parameters of its class: the motion model and its time constant tau, q of ``Q = diag(q^2) dt``, and
-            whether measured velocities are linearised: then, where the speed is known and the acceleration does not
-            decay, `predict_moments`, unless the covariance has to be repaired.
+        own: parameters of its class: the motion model and its time constant tau, q of ``Q = diag(q^2) dt``.
         root: (6, 6) buffer for the square root.
         points: (12, 6) buffer for the transformed points, as deviations from the transformed centre; the mean is
             added last, so that large world coordinates cost no digits.
@@ -202,10 +194,6 @@ def predict_state(
     """
     straight, tau, process_noise = own.constant_velocity, own.acceleration_time, own.process_noise
     repaired = square_root(covariance, root)
-    known = abs(mean[V]) > KNOWN * math.sqrt(covariance[V, V])
-    if own.linearisations > 0 and tau == math.inf and known and repaired == 0:
-        predict_moments(mean, covariance, dt, own, mean_out, covariance_out)
-        return 0
     v, phi = mean[V], mean[PHI]
     omega, a = (0.0, 0.0) if straight else (mean[OMEGA], mean[A])
     kept, turn0 = 1.0, (1.0, 0.0, 1.0, 0.0)  # replaced where the acceleration decays, and not read elsewhere
@@ -276,100 +264,3 @@ def centred(points: Array, s: int) -> float:
     for i in range(2 * STATE):
         points[i, s] -= shift
     return shift
-
-
-@kernel
-def polar_moments(
-    length: float, offset: float, angle: float, p_l: float, c: float, s: float
-) -> tuple[float, float, float, float, float, float, float]:
-    """Compute moments of D = e^{i theta} (L + i o), with L and theta Gaussian and o known; all of them are exact.
-
-        E[D] = e^{i theta - s / 2} (L + i o + i c),                A_L = E[dD / dL] = e^{i theta - s / 2}
-        E[D^2] = e^{2 i theta - 2 s} ((L + i o + 2 i c)^2 + P_L),  A_theta = E[dD / dtheta] = i E[D]
-        E|D|^2 = L^2 + o^2 + P_L,                                  Omega = cov(D) - A P A'
-
-    Args:
-        length: mean of L, m for a way and m/s for a velocity.
-        offset: o, in the unit of L.
-        angle: mean of theta, rad.
-        p_l: P_L, variance of L.
-        c: covariance of L and theta, rad times the unit of L.
-        s: variance of theta, rad^2.
-
-    Returns:
-        E[D], as x and y; A_L, likewise (A_theta is (-E[D_y], E[D_x])); and Omega, what the best linear function of L
-        and theta leaves: xx, xy and yy.
-    """
-    cos, sin = math.cos(angle), math.sin(angle)
-    shrunk = math.exp(-0.5 * s)
-    along_x, along_y = shrunk * cos, shrunk * sin
-    aside = offset + c
-    x, y = along_x * length - along_y * aside, along_y * length + along_x * aside
-    aside += c
-    real, imaginary = length * length - aside * aside + p_l, 2.0 * length * aside
-    cos_2, sin_2, shrunk = cos * cos - sin * sin, 2.0 * sin * cos, shrunk * shrunk * shrunk * shrunk
-    square_x, square_y = shrunk * (cos_2 * real - sin_2 * imaginary), shrunk * (sin_2 * real + cos_2 * imaginary)
-    squared = length * length + offset * offset + p_l
-    o_xx = 0.5 * (squared + square_x) - x * x
-    o_yy = 0.5 * (squared - square_x) - y * y
-    o_xy = 0.5 * square_y - x * y
-    o_xx -= along_x * along_x * p_l - 2.0 * along_x * y * c + y * y * s
-    o_yy -= along_y * along_y * p_l + 2.0 * along_y * x * c + x * x * s
-    o_xy -= along_x * along_y * p_l + (along_x * x - along_y * y) * c - x * y * s
-    return x, y, along_x, along_y, o_xx, o_xy, o_yy
-
-
-@kernel
-def predict_moments(
-    mean: Array, covariance: Array, dt: float, own: ClassRow, mean_out: Array, covariance_out: Array
-) -> None:
-    """Predict one state with the exact moments of its way; arguments as for `predict_state`.
-
-    With u = omega dt / 2 and the way G = int (v + a t) e^{i omega t} dt of the mean, turned back by u,
-
-        D = e^{i (phi + u)} (G + sinc(u) dt dv + dt^2 / 2 da),    dv and da: deviations from the mean,
-
-    which is the motion itself at the mean, and to first order where the state deviates, but for terms of dt^3 in omega
-    and a. As x and y gain D, the covariance is F P F' + Q dt, with A_L and A_theta of `polar_moments` in F, and Omega
-    added for x and y.
-    """
-    straight, process_noise = own.constant_velocity, own.process_noise
-    v, phi, omega, a = mean[V], mean[PHI], mean[OMEGA], mean[A]
-    if straight:
-        omega = a = 0.0
-    u = 0.5 * omega * dt
-    along, across = ctra_displacement(v, omega, a, dt)
-    cos_u, sin_u = math.cos(u), math.sin(u)
-    length, offset = cos_u * along + sin_u * across, cos_u * across - sin_u * along
-    of_v = dt * (1.0 if u == 0.0 else sin_u / u)
-    of_a, of_omega, step = (0.0, 0.0, 0.0) if straight else (0.5 * dt * dt, 0.5 * dt, dt)
-
-    p_l = of_v * of_v * covariance[V, V] + of_a * (2.0 * of_v * covariance[V, A] + of_a * covariance[A, A])
-    c = of_v * (covariance[V, PHI] + of_omega * covariance[V, OMEGA])
-    c += of_a * (covariance[A, PHI] + of_omega * covariance[A, OMEGA])
-    s = covariance[PHI, PHI] + of_omega * (2.0 * covariance[PHI, OMEGA] + of_omega * covariance[OMEGA, OMEGA])
-    x, y, along_x, along_y, o_xx, o_xy, o_yy = polar_moments(length, offset, phi + u, p_l, c, s)
-
-    # P F', row by row, and then F of that, in place: rows that feed others are read before they change.
-    for r in range(STATE):
-        row, out = covariance[r], covariance_out[r]
-        way, turn = of_v * row[V] + of_a * row[A], row[PHI] + of_omega * row[OMEGA]
-        out[X], out[Y] = row[X] + along_x * way - y * turn, row[Y] + along_y * way + x * turn
-        out[V], out[PHI], out[OMEGA], out[A] = row[V] + step * row[A], row[PHI] + step * row[OMEGA], row[OMEGA], row[A]
-    for t in range(STATE):
-        way = of_v * covariance_out[V, t] + of_a * covariance_out[A, t]
-        turn = covariance_out[PHI, t] + of_omega * covariance_out[OMEGA, t]
-        covariance_out[X, t] += along_x * way - y * turn
-        covariance_out[Y, t] += along_y * way + x * turn
-        covariance_out[V, t] += step * covariance_out[A, t]
-        covariance_out[PHI, t] += step * covariance_out[OMEGA, t]
-    covariance_out[X, X] += o_xx
-    covariance_out[Y, Y] += o_yy
-    covariance_out[X, Y] += o_xy
-    for r in range(STATE):
-        for t in range(r):
-            covariance_out[r, t] = covariance_out[t, r]
-        if not (straight and r >= OMEGA):
-            covariance_out[r, r] += process_noise[r] ** 2 * dt
-    mean_out[X], mean_out[Y], mean_out[V] = mean[X] + x, mean[Y] + y, v + a * dt
-    mean_out[PHI], mean_out[OMEGA], mean_out[A] = wrap(phi + omega * dt), omega, a

@@ -90,12 +90,6 @@ class MeasurementNoise(_Table):
     position: Positive = Field(description="standard deviation of x and of y, m; its square fills R_xy")
     velocity: Positive = Field(description="of v_x and of v_y, m/s; unused where a detection has no velocity")
     heading: Positive = Field(description="of phi, rad")
-    position_growth: NonNegative = Field(
-        default=0.0,
-        exclude_if=not_,
-        description="by how much the standard deviation of x and of y grows per metre from the sensor, added in "
-        "quadrature; the paper: 0",
-    )
 
 
 class ReportedNoise(_Table):
@@ -230,9 +224,6 @@ class ClassParameters(_Table):
     heading_sign: HeadingSign | None = Field(
         default=None, description="how the sign of the heading is found; without it, it stays that of the birth"
     )
-    linearisations: Annotated[int, Field(ge=0, le=10)] = Field(
-        default=0, description="0: the paper's UKF; else linearisations of a velocity, and moments of known speeds"
-    )
     process_noise: ProcessNoise = Field(description="Q")
     measurement_noise: MeasurementNoise = Field(description="R")
     reported_noise: ReportedNoise | None = Field(
@@ -246,11 +237,6 @@ class ClassParameters(_Table):
     acceleration_time: Positive | None = Field(
         default=None,
         description="time constant, s, with which the acceleration decays; none: it stays constant (the paper)",
-    )
-    gate_growth: NonNegative = Field(
-        default=0.0,
-        description="by how much of eta_dist the gate widens for every nominal period that a frame comes later than "
-        "one; the paper: 0",
     )
     gate_deviations: NonNegative = Field(
         default=0.0,

@@ -1,16 +1,11 @@
-"""How accurate the position of a detection is, where the detector or the distance says so (not in the paper).
+"""How accurate the position of a detection is, where the detector says so (not in the paper).
 
 R of a class has sigma^2 for x and for y, the same for all its detections (eq. Single Object Measurement Model). A
-detection may bring a covariance of its own, Sigma; without one, R grows with the distance d from the sensor where the
-class has a growth g:
-
-    R_xy = Sigma    or    R_xy = (sigma^2 + g^2 d^2) I
-
-It is kept relative to that of the class, rho = R_xy / sigma^2, in the columns behind a measured position. All that a
-profile says beside sigma scales with it: the innovation covariance is S = P_xy + sigma^2 rho, R has sigma^2 rho, the
-birth covariance P^0 has its variance of x and y times rho, and R_x of `optipmb.reported` its own times rho_xx and
-rho_yy. The gate widens by the larger variance that rho adds (`optipmb.gating.gate_widening`). With rho = I everything
-is as without, to the last bit.
+detection may bring a covariance of its own, R_xy. It is kept relative to that of the class, rho = R_xy / sigma^2, in
+the columns behind a measured position. All that a profile says beside sigma scales with it: the innovation covariance
+is S = P_xy + sigma^2 rho, R has sigma^2 rho, the birth covariance P^0 has its variance of x and y times rho, and R_x of
+`optipmb.reported` its own times rho_xx and rho_yy. The gate widens by the larger variance that rho adds
+(`optipmb.gating.gate_widening`). With rho = I everything is as without, to the last bit.
 """
 
 from __future__ import annotations
@@ -24,11 +19,7 @@ from optipmb.errors import FrameError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from optipmb.frame import Frame
-    from optipmb.table import ClassTable
-
     Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 PLAIN: Final = 2
 """Columns of measured positions, x and y; five with rho_xx, rho_xy and rho_yy."""
@@ -83,24 +74,3 @@ def semidefinite(horizontal: Array) -> NDArray[np.bool_]:
     xx, xy, yy = horizontal.T
     good = (xx > 0.0) & (yy > 0.0) & (xy * xy <= (1.0 + SYMMETRY) * xx * yy) & (np.maximum(xx, yy) < np.inf)
     return np.asarray(good | np.isnan(horizontal).all(axis=1), np.bool_)
-
-
-def relative_noise(frame: Frame, rows: Index, table: ClassTable) -> Array:
-    """Return rho of detections: (K, 3) rho_xx, rho_xy and rho_yy.
-
-    Args:
-        frame: the detections.
-        rows: (K,) which of them.
-        table: parameters as columns.
-    """
-    label = frame.label[rows]
-    variance, growth = table["noise_position"][label] ** 2, table["noise_growth"][label]
-    sensor = np.zeros(2) if frame.pose is None else frame.pose.translation[:2]
-    away = frame.center[rows, :2] - sensor
-    noise = np.zeros((rows.shape[0], 3))
-    noise[:, 0] = noise[:, 2] = 1.0 + growth**2 * (away**2).sum(axis=1) / variance
-    if frame.position_covariance is not None:
-        own = frame.position_covariance[rows]
-        known = ~np.isnan(own[:, 0])
-        noise[known] = own[known] / variance[known, None]
-    return noise

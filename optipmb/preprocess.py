@@ -16,7 +16,7 @@ from optipmb.effort import UNLIMITED
 from optipmb.errors import EffortError
 from optipmb.geometry import iou_exceeds
 from optipmb.neighbours import NOBODY, block, empty_torus, insert
-from optipmb.position_noise import PLAIN, relative_noise
+from optipmb.position_noise import PLAIN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -65,7 +65,7 @@ def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[
     Raises:
         EffortError: more than `most` pairs of detections may overlap.
     """
-    own_noise = frame.position_covariance is not None or table.noise_grows
+    own_noise = frame.position_covariance
     above, chosen, columns = select(
         frame.center,
         frame.size,
@@ -74,15 +74,16 @@ def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[
         frame.score,
         frame.label,
         frame.source,
-        PLAIN + 3 if own_noise else PLAIN,
+        PLAIN if own_noise is None else PLAIN + 3,
         table.classes,
         most,
     )
     if above < 0:
         raise EffortError("center", f"at most {most} pairs of detections that may overlap", "more")
     measurements = Measurements(*columns)
-    if own_noise:
-        measurements.position[:, PLAIN:] = relative_noise(frame, chosen, table)
+    if own_noise is not None:
+        covariance, variance = own_noise[chosen], table["noise_position"][measurements.label, None] ** 2
+        measurements.position[:, PLAIN:] = np.where(np.isnan(covariance), (1.0, 0.0, 1.0), covariance / variance)
     return measurements, frame.score.shape[0] - above, above - chosen.shape[0]
 
 

@@ -34,7 +34,6 @@ class ClassRow(Protocol):
         constant_velocity: whether the motion model is that of constant velocity.
         process_noise: (6,) standard deviations in state order, per square root of a second.
         noise_position: standard deviation of z_x and z_y.
-        noise_growth: g of `optipmb.position_noise`.
         noise_velocity: of z_vx and z_vy.
         noise_heading: of z_phi.
         reported_position: variance that R_x of `optipmb.reported` leaves for z_x and z_y; zero without it.
@@ -60,7 +59,6 @@ class ClassRow(Protocol):
     nms_iou: float
     survival: float
     gate: float
-    gate_growth: float
     gate_deviations: float
     detection: float
     expected_points: float
@@ -80,7 +78,6 @@ class ClassRow(Protocol):
     confirm_until: float
     max_misses: int
     min_existence: float
-    linearisations: int
     group: int
     group_size: int
     class_memory: float
@@ -90,7 +87,6 @@ class ClassRow(Protocol):
     constant_velocity: bool
     process_noise: Spread
     noise_position: float
-    noise_growth: float
     noise_velocity: float
     noise_heading: float
     reported_position: float
@@ -134,14 +130,12 @@ class ClassTable:
         classes: (C,) array of `CLASS`, for kernels; `table["gate"]` is a column of it.
         period: nominal period, s.
         detection_over_time: whether p_d holds per nominal period (`optipmb.detection_probability.over_time`).
-        noise_grows: whether the position noise of any class grows with the distance.
         confusion: (C, C) Lambda of `optipmb.class_posterior`; (0, 0) where no two classes have a group in common.
     """
 
     classes: Sequence[ClassRow]
     period: float
     detection_over_time: bool
-    noise_grows: bool
     confusion: NDArray[np.float64]
 
     def __getitem__(self, name: str) -> NDArray[Any]:
@@ -158,9 +152,8 @@ class ClassTable:
             shared = {"group": groups.index(group), "group_size": groups.count(group)}
             for name, value in (_values(p) | shared).items():
                 classes[name][c] = value
-        grows = any(p.measurement_noise.position_growth > 0.0 for p in rows)
         confusion = _confusion(classes, np.array([p.class_confusion for p in rows]))
-        return cls(classes, parameters.nominal_period, parameters.detection_over_time, grows, confusion)
+        return cls(classes, parameters.nominal_period, parameters.detection_over_time, confusion)
 
 
 def _confusion(classes: Any, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -185,7 +178,6 @@ def _values(p: ClassParameters) -> dict[str, Any]:
         "constant_velocity": p.motion == "cv",
         "process_noise": (q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration),
         "noise_position": noise.position,
-        "noise_growth": noise.position_growth,
         "noise_velocity": noise.velocity,
         "noise_heading": noise.heading,
         "reported_position": _left_over(p, "position"),

@@ -107,9 +107,7 @@ def update(
         p_d, p_d_poisson = detection[objects.label], detection[components.label]
 
     # Local hypotheses: missed, detected, first-time detected; HABM
-    hypotheses = local_hypotheses(
-        objects, class_probability, p_d, components, p_d_poisson, z, dt, period, confusion, classes
-    )
+    hypotheses = local_hypotheses(objects, class_probability, p_d, components, p_d_poisson, z, dt, confusion, classes)
 
     # Data association: the best global hypothesis, and what of it outlives the pruning of the MB
     row, measurement, cost = hypotheses.row, hypotheses.measurement, hypotheses.detection_cost

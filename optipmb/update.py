@@ -17,7 +17,6 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.density import PHI, STATE, V, X, Y, copy_state
-from optipmb.linearised import MODES, linearised_update
 from optipmb.motion import ORDER, SPREAD, WEIGHT, square_root, wrap
 from optipmb.position_noise import PLAIN
 from optipmb.prune import NEW
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
-    Buffers = tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array]
+    Buffers = tuple[Array, Array, Array, Array, Array, Array]
 
 MEASURED = 5
 """Rows of z_M with a velocity; three without."""
@@ -40,10 +39,7 @@ MEASURED = 5
 
 @kernel
 def workspace() -> Buffers:
-    """Return the buffers of an update, to be used for one state after the other.
-
-    They are root, chi, psi, nu, factor and W, and of the modes of `optipmb.linearised` weights, means and covariances.
-    """
+    """Return the buffers of an update, to be used for one state after the other: root, chi, psi, nu, factor and W."""
     return (
         np.empty((STATE, STATE)),
         np.empty((2 * STATE, STATE)),
@@ -51,9 +47,6 @@ def workspace() -> Buffers:
         np.empty(MEASURED),
         np.empty((MEASURED, MEASURED)),
         np.empty((STATE, MEASURED)),
-        np.empty(MODES),
-        np.empty((MODES, STATE)),
-        np.empty((MODES, STATE, STATE)),
     )
 
 
@@ -76,7 +69,7 @@ def ukf_updates(
         mean: (N, 6) predicted means.
         covariance: (N, 6, 6) predicted covariances.
         measurements: Z_k.
-        classes: (C,) parameters: R, and `linearisations`, zero for the UKF.
+        classes: (C,) parameters: R.
         mean_out: (K, 6) receives the posterior means.
         covariance_out: (K, 6, 6) receives the posterior covariances.
 
@@ -107,11 +100,7 @@ def ukf_updates(
             sigma[MEASURED] = variance * position[m, 3]
         sigma[2] = sigma[3] = own.noise_velocity
         sigma[4] = own.noise_heading
-        if own.linearisations > 0 and not (math.isnan(z[2]) or math.isnan(z[3])):
-            linearised_update(
-                mean[n], covariance[n], z, sigma, own.linearisations, buffers, mean_out[k], covariance_out[k]
-            )
-        elif ukf_update(mean[n], covariance[n], z, sigma, buffers, mean_out[k], covariance_out[k]) > 0:
+        if ukf_update(mean[n], covariance[n], z, sigma, buffers, mean_out[k], covariance_out[k]) > 0:
             repaired += 1
     return repaired
 
@@ -146,7 +135,7 @@ def ukf_update(
     """
     with_velocity = not (math.isnan(z[2]) or math.isnan(z[3]))
     size = MEASURED if with_velocity else 3
-    root, chi, psi, innovation, factor, weighted, _, _, _ = buffers
+    root, chi, psi, innovation, factor, weighted = buffers
     repaired = square_root(covariance, root)
     v, phi = mean[V], mean[PHI]
 

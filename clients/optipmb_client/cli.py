@@ -5,36 +5,17 @@ import re
 import signal
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.metadata import version
 from types import FrameType
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, Final, NoReturn
 
 import typer
 from optipmb_schemas import MessageError
 from typer.core import TyperCommand, TyperGroup
 
 from optipmb_client.arguments import filled, spread
-from optipmb_client.commands.ablate import ablate
-from optipmb_client.commands.check import check
-from optipmb_client.commands.demo import demo
-from optipmb_client.commands.drain import drain
-from optipmb_client.commands.evaluate import evaluate
-from optipmb_client.commands.load import load
-from optipmb_client.commands.move import move
 from optipmb_client.commands.options import MANY, RAY_ADDRESS, grouped
-from optipmb_client.commands.play import play
-from optipmb_client.commands.plot import plot
-from optipmb_client.commands.profiles import profiles
-from optipmb_client.commands.record import record
-from optipmb_client.commands.replay import replay
-from optipmb_client.commands.set import set_profile
-from optipmb_client.commands.status import status
-from optipmb_client.commands.sweep import sweep
-from optipmb_client.commands.track import track
-from optipmb_client.commands.tracks import tracks
-from optipmb_client.commands.tune import tune
-from optipmb_client.commands.warm_up import warm_up
-from optipmb_client.commands.watch import watch
 from optipmb_client.datasets import DatasetError
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.extras import to_install
@@ -46,6 +27,30 @@ WRONG = 2
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
 
+COMMANDS: Final = {
+    "demo": "demo",
+    "check": "check",
+    "track": "track",
+    "replay": "replay",
+    "record": "record",
+    "play": "play",
+    "watch": "watch",
+    "evaluate": "evaluate",
+    "tune": "tune",
+    "ablate": "ablate",
+    "sweep": "sweep",
+    "plot": "plot",
+    "status": "status",
+    "tracks": "tracks",
+    "profiles": "profiles",
+    "load": "load",
+    "set": "set_profile",  # a function of the command's name would hide Python's own
+    "move": "move",
+    "drain": "drain",
+    "warm-up": "warm_up",
+}
+"""Functions of the commands, in modules of the commands' names, in the order of the help."""
+
 # What the option parser raises for a wrong option: the base of its public subclass, as it has no public name itself.
 _OptionError: Any = typer.BadParameter.__base__
 
@@ -55,9 +60,26 @@ class _Command(TyperCommand):
         return _without_types_of_flags(super().get_params(ctx))
 
 
-class _Group(TyperGroup):
+class _Commands(TyperGroup):
+    """The commands; the module of one is imported when it is called, or listed in the help."""
+
     def get_params(self, ctx: Any) -> list[Any]:  # as above
         return _without_types_of_flags(super().get_params(ctx))
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  as click calls it
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002  as click calls it
+        if cmd_name not in COMMANDS:
+            return None
+        module = import_module(f"optipmb_client.commands.{cmd_name.replace('-', '_')}")
+        command = getattr(module, COMMANDS[cmd_name])
+        paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
+        alone = typer.Typer(add_completion=False)
+        alone.command(cmd_name, cls=_Command, help="\n\n".join(" ".join(part.split()) for part in paragraphs))(
+            grouped(command)
+        )
+        return typer.main.get_command(alone)
 
 
 def _without_types_of_flags(parameters: list[Any]) -> list[Any]:
@@ -70,35 +92,10 @@ def _without_types_of_flags(parameters: list[Any]) -> list[Any]:
 
 app = typer.Typer(
     name="optipmb",
-    cls=_Group,
+    cls=_Commands,
     help="Track objects in 3D: offline, or through a tracking service.",
     add_completion=False,
 )
-for command in (
-    demo,
-    check,
-    track,
-    replay,
-    record,
-    play,
-    watch,
-    evaluate,
-    tune,
-    ablate,
-    sweep,
-    plot,
-    status,
-    tracks,
-    profiles,
-    load,
-    set_profile,
-    move,
-    drain,
-    warm_up,
-):
-    paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
-    name = "set" if command is set_profile else None  # a function of that name would hide Python's own
-    app.command(name, cls=_Command, help="\n\n".join(" ".join(part.split()) for part in paragraphs))(grouped(command))
 
 
 def _version(value: bool) -> None:  # noqa: FBT001  the parser calls it so

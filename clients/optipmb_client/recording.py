@@ -12,7 +12,6 @@ from optipmb_schemas import Tracks
 
 from optipmb_client.class_names import class_like
 from optipmb_client.datasets import DataSequence, Dataset, DetectionFrame, Truth
-from optipmb_client.datasets.nuscenes import NuScenesDataset
 from optipmb_client.errors import UsageError
 from optipmb_client.results.full import full_path, write_full
 from optipmb_client.results.table import join, track_columns
@@ -142,5 +141,5 @@ class Results:
         parts = {name: written for name, written in self._taken.items() if not isinstance(written, Path)}
         if parts:
             write_table(self._out, join([parts[name] for name in sorted(parts)]))
-        elif isinstance(self._dataset, NuScenesDataset) and all(one.name in self._taken for one in sequences):
+        elif hasattr(self._dataset, "join") and all(one.name in self._taken for one in sequences):
             self._dataset.join(self._out, sequences)

@@ -33,7 +33,6 @@ __all__ = ["Pace", "ReplayedSequence", "replay"]
 CLOUD_WAIT_S = 10.0  # a cloud may be late on a busy machine; tracking without it would change the result
 CACHED_CLOUDS = 16  # for a service that is killed and restarted meanwhile; it keeps no more of a stream by default
 CLOUDS_AHEAD = 4  # frames under way then: a successor goes back to a checkpoint, and needs the clouds since then, too
-TAKEOVER_S = 15.0  # how long a successor may take; then frames are sent whether or not their clouds will be there
 STRAGGLERS_S = 5.0  # how long frames that were overtaken by later ones may still be recovered
 POINTS_WANTED_S = 20.0  # how long to wait until the service's subscription to clouds has come to this session
 TICK_S = 0.2  # how often a waiting thread looks whether it shall stop
@@ -263,8 +262,8 @@ class _Replay:
             if self.task.stop.is_set():
                 return False
             self._take(tracks, min(left, TICK_S))
-        while self.sequence.has_clouds and self._under_way >= CLOUDS_AHEAD and self._silent_s < TAKEOVER_S:
-            if self.task.stop.is_set():
+        while self.sequence.has_clouds and self._under_way >= CLOUDS_AHEAD:
+            if not self._alive():
                 return False
             self._take(tracks, TICK_S)
         return self._alive()

@@ -11,8 +11,7 @@ Automatic Control 53(3), 2008), with the motion models of the tracker. From the 
     P^s_k = P_k + G (P^s_{k+1} - P-) G'
 
 m_k and P_k are the state and covariance of every frame in which the filter holds the object; in frames in which it is a
-track, those of its published box (`optipmb.reported`). So frames without detection need no rule of their own. Where the
-filter predicts by exact moments (`optipmb.motion.predict_moments`), the smoother is the unscented one nevertheless.
+track, those of its published box (`optipmb.reported`). So frames without detection need no rule of their own.
 
 An object does not turn by pi from frame to frame, so one sign of the heading holds for the whole track: the one in
 favour of which the mean of the log odds (`optipmb.heading`) is; and this mean is the confidence in it.
@@ -21,7 +20,7 @@ Size, height, existence and score stay as the tracker tells them.
 """
 
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -156,11 +155,9 @@ def _predictions(
 ) -> tuple[Floats, Floats, Floats]:
     """Return m- (R, 6), P- (R, 6, 6) and G (R, 6, 6) of filtered states, each over its own time dt (R,), s."""
     root, points = np.empty((STATE, STATE)), np.empty((2 * STATE, STATE))
-    classes: Any = np.array(table.classes)
-    classes["linearisations"] = 0  # the smoother is the unscented one
     predicted, spread, cross = np.empty_like(mean), np.empty_like(covariance), np.empty_like(covariance)
     for row, c in enumerate(label.tolist()):
-        own = classes[c]
+        own = table.classes[c]
         predict_state(mean[row], covariance[row], dt[row], own, root, points, predicted[row], spread[row])
         # The deviations X - m_k are SPREAD times the columns of the root, once plus and once minus.
         cross[row, ORDER] = root @ (points[0::2] - points[1::2]) * (SPREAD * WEIGHT)

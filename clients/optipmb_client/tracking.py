@@ -10,7 +10,6 @@ from typing import Final
 from optipmb import Modules, Parameters
 from optipmb_client.bulk import Done, Executor, Failed, Here, Outcome, in_order, run
 from optipmb_client.datasets import DataSequence, Dataset, DatasetArguments
-from optipmb_client.datasets.nuscenes import NuScenesDataset
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.files import remove_unfinished
 from optipmb_client.offline import track_whole
@@ -109,7 +108,7 @@ def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Col
         on_frame=opened.on_frame,
     )
     written = Results(opened.dataset, shared.out, full=shared.full).write(sequence, found.tracks)
-    limited = isinstance(opened.dataset, NuScenesDataset) and isinstance(written, Path)
+    limited = opened.dataset.name == "nuscenes" and isinstance(written, Path)
     counts = [len(one.id) for one in found.tracks.values()] if limited else []
     beyond = [count - NUSCENES_MAX_BOXES for count in counts if count > NUSCENES_MAX_BOXES]
     return TrackedSequence(

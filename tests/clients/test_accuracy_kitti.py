@@ -72,7 +72,7 @@ def test_cars_of_every_detector_are_tracked_as_well_as_with_the_papers_values(de
 
 @pytest.mark.parametrize(("name", "every", "most"), [("0004", 3, 1), ("0020", 5, 7)])
 def test_cars_keep_their_ids_in_slow_streams(name: str, every: int, most: int) -> None:
-    """With every third or fifth frame of a sequence the gates grow with the time between frames."""
+    """With every third or fifth frame of a sequence few ids switch: gates widen with the unknown speed."""
     scorers, clips = material("kitti", "pointrcnn")
     (clip,) = (thinned(one, every) for one in clips["Car"] if one.name == name)
     tracks = track_clip(clip, only(optipmb.load_profile("kitti"), "Car"))

@@ -180,6 +180,23 @@ def test_help_does_not_load_the_tracker() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+def test_tracking_a_table_loads_nothing_else(tmp_path: Path) -> None:
+    """`optipmb track boxes.csv` imports neither other commands nor other formats."""
+    table = tmp_path / "boxes.csv"
+    table.write_text(
+        "t,x,y,z,length,width,height,yaw,score,class\n0.0,1,2,0,4,2,1,0,0.9,car\n0.1,1,2,0,4,2,1,0,0.9,car\n"
+    )
+    code = (
+        "import sys; from optipmb_client.cli import run; "
+        f"run(['track', {str(table)!r}, '--out', {str(tmp_path / 'out')!r}]); "
+        "others = ('optuna', 'optipmb_client.tuning', 'optipmb_client.load', 'optipmb_client.datasets.scene', "
+        "'optipmb_client.datasets.kitti', 'optipmb_client.datasets.nuscenes', 'optipmb_client.commands.replay'); "
+        "sys.exit(','.join(sorted(set(others) & set(sys.modules))) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_a_replay_cleanly(endpoint: str, tmp_path: Path, number: int, status: int) -> None:
     """Ctrl-C and SIGTERM end a replay within seconds: its session is closed, no file or traceback is left."""

@@ -12,8 +12,8 @@ from optipmb_client.camera import synthetic_camera
 from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.geometry import Floats, Ints, Pose, planar_pose, wrap_angle
 from optipmb_client.offline import read_profile, track_whole
-from optipmb_client.results import KittiResultWriter, empty_table, read_kitti_results
-from optipmb_client.results.kitti import SUBMISSION_SCORES
+from optipmb_client.results import empty_table
+from optipmb_client.results.kitti import SUBMISSION_SCORES, KittiResultWriter, read_kitti_results
 from real_data import kitti_root
 
 LABELS = ("Car", "Pedestrian", "Cyclist")

@@ -14,7 +14,7 @@ from optipmb_client.evaluation.cases import prepare
 from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
 from optipmb_client.evaluation.nuscenes import evaluate_nuscenes, evaluate_scenes
 from optipmb_client.evaluation.nuscenes_scene import NuScenesConfig, prepare_scene
-from optipmb_client.results import read_kitti_results
+from optipmb_client.results.kitti import read_kitti_results
 from optipmb_client.tracking import track
 from optipmb_client.tuning.degrade import Degradation, degrade
 from optipmb_client.tuning.folds import deal

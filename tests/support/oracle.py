@@ -27,7 +27,7 @@ from oracle_formulas import (
     periods,
     predict,
     report,
-    update,
+    ukf_update,
 )
 from scipy.optimize import linear_sum_assignment
 
@@ -156,7 +156,7 @@ class Oracle:
             Q = np.diag(np.square([q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration]))
             tau, straight = c.acceleration_time or math.inf, c.motion == "cv"
             component.mean, component.covariance = predict(
-                component.mean, component.covariance, Q, dt, tau, straight=straight, exact=c.linearisations > 0
+                component.mean, component.covariance, Q, dt, tau, straight=straight
             )
             survival = c.survival ** (dt / self.nominal)
             if isinstance(component, Bernoulli):
@@ -214,9 +214,8 @@ class Oracle:
         if z.label not in known:
             return False
         distance, c = math.hypot(*(component.mean[:2] - z.xy)), self.classes[component.label]
-        eta = c.gate * (1 + c.gate_growth * max(0.0, self.dt / self.nominal - 1))
         spread = math.sqrt(component.covariance[2, 2])
-        return distance <= max(eta, c.gate_deviations * spread * self.dt)
+        return distance <= max(c.gate, c.gate_deviations * spread * self.dt)
 
     def _log_likelihood(self, component: Bernoulli | Poisson, z: Measurement) -> float:
         position = self.classes[z.label].measurement_noise.position
@@ -261,7 +260,7 @@ class Oracle:
             log_sum = log_e.max() + math.log(np.sum(np.exp(log_e - log_e.max())))
             log_total = np.logaddexp(log_sum, math.log(clutter))
             weights = [float(w) for w in np.exp(log_e - log_sum)]
-            parts = [update(u.mean, u.covariance, z, c) for u in members]
+            parts = [ukf_update(u.mean, u.covariance, z, c) for u in members]
         shadowed = c.birth_over_clutter and z.score >= c.birth_score
         if gate and not (shadowed and log_sum < math.log(clutter)):
             return NewObject(-log_total, math.exp(log_sum - log_total), *moment_match(weights, parts))
@@ -306,7 +305,7 @@ class Oracle:
             c = self.classes[b.label]
             if i in chosen:
                 z = zs[chosen[i]]
-                b.mean, b.covariance = update(b.mean, b.covariance, z, self.classes[z.label])
+                b.mean, b.covariance = ukf_update(b.mean, b.covariance, z, self.classes[z.label])
                 b.existence = 1.0
                 self._follow_class(b, z)
                 c = self.classes[b.label]

@@ -89,41 +89,18 @@ def sigma_points(m: Array, P: Array) -> list[Array]:
 
 
 def predict(
-    m: Array, P: Array, Q: Array, dt: float, tau: float = math.inf, *, straight: bool = False, exact: bool = False
+    m: Array, P: Array, Q: Array, dt: float, tau: float = math.inf, *, straight: bool = False
 ) -> tuple[Array, Array]:
-    """Eq. (Motion Predict): (m+, P+) by the unscented transform through the motion model, Q = diag(q)^2 dt.
-
-    With `exact`, a known speed and an acceleration that does not decay, by the moments of the way instead.
-    """
+    """Eq. (Motion Predict): (m+, P+) by the unscented transform through the motion model, Q = diag(q)^2 dt."""
     if dt == 0.0:
         return m.copy(), P.copy()
     if straight:
         m, Q = np.array([*m[:4], 0.0, 0.0]), np.diag([*np.diag(Q)[:4], 0.0, 0.0])
-    if exact and tau == math.inf and m[2] ** 2 > 4 * P[2, 2]:
-        return predict_moments(m, P, Q, dt, straight=straight)
     points = [constant_velocity(x, dt) if straight else ctra(x, dt, tau) for x in sigma_points(m, P)]
     mean = np.mean(points, axis=0)
     covariance = np.mean([np.outer(x - mean, x - mean) for x in points], axis=0) + Q * dt
     mean[3] = wrap(mean[3])
     return mean, 0.5 * (covariance + covariance.T)
-
-
-def predict_moments(m: Array, P: Array, Q: Array, dt: float, *, straight: bool) -> tuple[Array, Array]:
-    """X and y gain e^{i theta} (G + L'dx), with L and theta linear in x; its moments are those of `polar`."""
-    moved = constant_velocity(m, dt) if straight else ctra(m, dt)
-    u = m[4] * dt / 2
-    length, angle, F = np.zeros(6), np.eye(6)[3], np.eye(6)
-    length[2] = dt * np.sinc(u / np.pi)
-    if not straight:
-        length[5], angle[4], F[2, 5], F[3, 4] = dt**2 / 2, dt / 2, dt, dt
-    way = complex(*(moved[:2] - m[:2])) * np.exp(-1j * (m[3] + u))
-    mean, A, omega = polar(way, m[3] + u, np.array([length, angle]), P)
-    F[:2] += A
-    covariance = F @ P @ F.T + Q * dt
-    covariance[:2, :2] += omega
-    moved[:2] = m[:2] + mean
-    moved[3] = wrap(moved[3])
-    return moved, covariance
 
 
 def smooth(means: Array, covariances: Array, t: Array, Q: Array, tau: float) -> tuple[Array, Array]:
@@ -149,72 +126,6 @@ def measure(x: Array, *, with_velocity: bool) -> Array:
     """Eq. (Single Object Measurement Model): H(x) = [x, y, v cos phi, v sin phi, phi]."""
     px, py, v, phi = x[:4]
     return np.array([px, py, v * np.cos(phi), v * np.sin(phi), phi] if with_velocity else [px, py, phi])
-
-
-def polar(G: complex, theta: float, rows: Array, P: Array) -> tuple[Array, Array, Array]:
-    """Mean, Jacobian (2, 6) and error covariance of the best linear function for D = e^{i theta} (G + dL).
-
-    dL and theta are the two `rows` (2, 6) of a state with covariance P.
-    """
-    (p, c), (_, s) = rows @ P @ rows.T
-    turned = np.exp(1j * theta - s / 2)
-    w = turned * (G + 1j * c)
-    square = np.exp(2j * theta - 2 * s) * ((G + 2j * c) ** 2 + p)
-    length = abs(G) ** 2 + p
-    second = np.array([[length + square.real, square.imag], [square.imag, length - square.real]]) / 2
-    mean = np.array([w.real, w.imag])
-    A = np.array([[turned.real, -w.imag], [turned.imag, w.real]]) @ rows
-    return mean, A, second - np.outer(mean, mean) - A @ P @ A.T
-
-
-def linear_velocity(m: Array, P: Array) -> tuple[Array, Array, Array]:
-    """Mean, Jacobian (2, 6) and error covariance of the best linear function for v (cos phi, sin phi) over N(m, P)."""
-    return polar(complex(m[2]), m[3], np.eye(6)[2:4], P)
-
-
-def linearised_update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array, Array]:
-    """Iterated posterior linearisation, begun with position and heading, of each heading modulo pi; moment-matched."""
-    noise = c.measurement_noise
-    R = np.diag(np.square([noise.position, noise.position, noise.velocity, noise.velocity, noise.heading]))
-    nearest, parts, weights = fold(z.yaw - m[3]), [], []
-    for turn in (nearest, nearest + np.pi, nearest - np.pi):
-        if turn**2 - nearest**2 > 24.0 * (P[3, 3] + noise.heading**2):
-            continue
-        measured = np.array([*z.xy, *np.asarray(z.velocity), m[3] + turn])
-        mean, covariance = m, P
-        for iteration in range(c.linearisations + 1):
-            w, A_w, omega = linear_velocity(mean, covariance)
-            A = np.zeros((5, 6))
-            A[0, 0] = A[1, 1] = A[4, 3] = 1.0
-            A[2:4] = A_w
-            extra = np.zeros((5, 5))
-            extra[2:4, 2:4] = omega
-            expected = np.array([m[0], m[1], *(w + A_w @ (m - mean)), m[3]])
-            used = [0, 1, 4] if iteration == 0 else [0, 1, 2, 3, 4]
-            A, S, nu = A[used], (A @ P @ A.T + R + extra)[np.ix_(used, used)], (measured - expected)[used]
-            K = P @ A.T @ np.linalg.inv(S)
-            mean, covariance = m + K @ nu, P - K @ S @ K.T
-        parts.append((mean, covariance))
-        weights.append(-0.5 * nu @ np.linalg.inv(S) @ nu - 0.5 * math.log(np.linalg.det(S)))
-    heaviest, described = parts[int(np.argmax(weights))][0], []
-    around = np.diag([1.0, 1.0, -1.0, 1.0, 1.0, -1.0])
-    for mean, covariance in parts:
-        if math.cos(mean[3] - heaviest[3]) < 0:
-            described.append((around @ mean + np.array([0, 0, 0, np.pi, 0, 0]), around @ covariance @ around))
-        else:
-            described.append((mean, covariance))
-    likely = np.exp(np.array(weights) - max(weights))
-    mean, covariance = moment_match(list(likely / likely.sum()), described)
-    if math.cos(mean[3] - m[3]) < 0:  # the sign of the heading is a state of its own
-        mean, covariance = around @ mean + np.array([0, 0, 0, np.pi, 0, 0]), around @ covariance @ around
-    return mean, covariance
-
-
-def update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array, Array]:
-    """The update that the class asks for."""
-    if c.linearisations and z.velocity is not None:
-        return linearised_update(m, P, z, c)
-    return ukf_update(m, P, z, c)
 
 
 def ukf_update(m: Array, P: Array, z: Measurement, c: Any) -> tuple[Array, Array]:

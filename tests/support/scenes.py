@@ -266,7 +266,6 @@ def random_parameters(
             "measurement_noise": {
                 "position": rng.uniform(0.05, 0.6), "velocity": rng.uniform(0.2, 2), "heading": rng.uniform(0.05, 0.4),
             },
-            "linearisations": int(rng.integers(0, 4)),
             "reported_noise": {"position": 0.06, "heading": 0.06} if rng.random() < 0.75 else None,
             "birth": {
                 "position": rng.uniform(0.1, 1), "speed": rng.uniform(0.3, 3), "unknown_speed": rng.uniform(2, 8),
@@ -274,7 +273,7 @@ def random_parameters(
                 "acceleration": rng.uniform(0.2, 2),
             },
             "motion": str(rng.choice(["ctra", "cv"])), "acceleration_time": rng.choice([None, 0.5, 2.0]),
-            "gate_growth": rng.choice([0.0, 0.5]), "gate_deviations": rng.choice([0.0, 2.0]),
+            "gate_deviations": rng.choice([0.0, 2.0]),
             "birth_over_clutter": bool(rng.random() < 0.5), "birth_overlap": rng.choice([0.02, 0.3, 1.0]),
             "ground_clearance": rng.choice([0.0, 0.2]),
             "confirm_from": rng.uniform(0.3, 0.9), "confirm_until": rng.uniform(0.0, 0.3),

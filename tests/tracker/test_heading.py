@@ -33,17 +33,6 @@ def drives(parameters: optipmb.Parameters, label: str, seed: int) -> list[tuple[
     return found
 
 
-def without_growth(parameters: optipmb.Parameters) -> optipmb.Parameters:
-    """The profile with one R for all distances: a hundred drives side by side go farther than any sensor sees."""
-    classes = {
-        name: one.model_copy(
-            update={"measurement_noise": one.measurement_noise.model_copy(update={"position_growth": 0.0})}
-        )
-        for name, one in parameters.classes.items()
-    }
-    return parameters.model_copy(update={"classes": classes})
-
-
 def seen(
     parameters: optipmb.Parameters,
     label: str,
@@ -77,7 +66,7 @@ def seen(
 @pytest.mark.parametrize("profile", optipmb.profiles())
 def test_one_turned_box_costs_no_id(profile: str, *, velocity: bool) -> None:
     """In 100 random drives of every class each object keeps the id that it got first, and in the end faces forwards."""
-    parameters = without_growth(optipmb.load_profile(profile))
+    parameters = optipmb.load_profile(profile)
     for seed, label in enumerate(parameters.labels):
         path = drives(parameters, label, seed)
         turned = np.random.default_rng(seed).integers(1, FRAMES - 8, DRIVES)

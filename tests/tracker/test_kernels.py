@@ -447,7 +447,7 @@ def test_announced_objects_are_matched_mixtures(seed: int) -> None:
     root = rng.normal(0, 0.5, (count, 6, 6))
     mean, covariance = rng.normal(0, 3, (count, 6)), root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(6)
     measured = random_measurements(rng, 5)._replace(label=np.array([0, 0, 0, 1, 0]))
-    classes = class_rows(2, linearisations=[0, 2], birth_heading_speed=rng.uniform(0, 2, 2))
+    classes = class_rows(2, birth_heading_speed=rng.uniform(0, 2, 2))
     for name in ("noise_position", "noise_velocity", "noise_heading", "birth_known", "birth_unknown"):
         classes[name] = rng.uniform(0.1, 1, classes[name].shape)
     out, spread = np.full((3, 6), np.nan), np.full((3, 6, 6), np.nan)

@@ -126,12 +126,11 @@ def predicted(
     tau: float = math.inf,
     *,
     straight: bool = False,
-    exact: bool = False,
 ) -> tuple[Array, Array]:
     """One state through the kernel, with buffers that hold rubbish."""
     root, points = np.full((6, 6), np.nan), np.full((12, 6), np.nan)
     out, spread = np.full(6, np.nan), np.full((6, 6), np.nan)
-    own = class_row(process_noise=noise, acceleration_time=tau, constant_velocity=straight, linearisations=int(exact))
+    own = class_row(process_noise=noise, acceleration_time=tau, constant_velocity=straight)
     assert predict_state(mean, covariance, dt, own, root, points, out, spread) == 0
     return out, spread
 
@@ -208,48 +207,6 @@ def test_the_prediction_is_the_textbook_unscented_transform(seed: int, dt: float
     np.testing.assert_allclose(np.exp(1j * found[0][3]), np.exp(1j * wanted[0][3]), atol=1e-10)
     np.testing.assert_allclose(np.delete(found[0], 3), np.delete(wanted[0], 3), rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(found[1], wanted[1], rtol=1e-9, atol=1e-9 * np.abs(wanted[1]).max())
-
-
-@pytest.mark.parametrize("straight", [False, True])
-@pytest.mark.parametrize("dt", [1e-3, 0.1, 0.5, 2.0])
-@pytest.mark.parametrize("seed", range(8))
-def test_the_prediction_by_moments_is_the_textbook_one(seed: int, dt: float, *, straight: bool) -> None:
-    """Mean and covariance equal the moments written out with matrices and complex numbers, where the speed is known."""
-    rng = np.random.default_rng(seed)
-    mean, covariance = random_state(rng)
-    mean[2] = 2.1 * math.copysign(math.sqrt(covariance[2, 2]), mean[2])
-    if seed == 0:
-        mean[4] = 0.0
-    noise = rng.uniform(0.01, 1, 6)
-    found = predicted(mean, covariance, dt, noise, straight=straight, exact=True)
-    wanted = textbook.predict(mean, covariance, np.diag(noise**2), dt, straight=straight, exact=True)
-    np.testing.assert_allclose(np.exp(1j * found[0][3]), np.exp(1j * wanted[0][3]), atol=1e-10)
-    np.testing.assert_allclose(np.delete(found[0], 3), np.delete(wanted[0], 3), rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(found[1], wanted[1], rtol=1e-9, atol=1e-9 * np.abs(wanted[1]).max())
-
-
-def test_a_speed_that_is_hardly_known_is_predicted_by_sigma_points() -> None:
-    """Below two standard deviations the transform is unscented, as it is for classes without `linearisations`."""
-    mean, covariance = random_state(np.random.default_rng(0))
-    mean[2] = 1.9 * math.sqrt(covariance[2, 2])
-    unscented, found = (predicted(mean, covariance, 0.5, np.ones(6), exact=exact) for exact in (False, True))
-    np.testing.assert_array_equal(found[0], unscented[0])
-    np.testing.assert_array_equal(found[1], unscented[1])
-
-
-@pytest.mark.parametrize("deviation", [0.1, 1.0, 1.6])
-def test_the_prediction_by_moments_is_that_of_its_samples(deviation: float) -> None:
-    """However little is known of the heading, mean and covariance are those of a large sample that moves by CTRA."""
-    rng = np.random.default_rng(3)
-    mean, dt = np.array([0.0, 0.0, 5.0, 0.4, 0.3, 0.5]), 0.5
-    covariance = np.diag(np.square([0.2, 0.2, 0.7, deviation, 0.4, 0.5]))
-    covariance[2, 3] = covariance[3, 2] = 0.3 * 0.7 * deviation
-    covariance[3, 4] = covariance[4, 3] = 0.5 * 0.4 * deviation
-    x = rng.multivariate_normal(mean, covariance, 20_000)
-    moved = np.array([textbook.ctra(one, dt) for one in x])
-    found = predicted(mean, covariance, dt, np.full(6, 1e-9), exact=True)
-    np.testing.assert_allclose(found[0], moved.mean(axis=0), atol=0.04)
-    np.testing.assert_allclose(found[1], np.cov(moved.T), atol=0.05)
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -1,4 +1,4 @@
-"""Detections with a covariance of their own, and noise that grows with the distance, against numpy's formulas."""
+"""Detections with a covariance of their own, against numpy's formulas."""
 
 from __future__ import annotations
 
@@ -13,19 +13,10 @@ import optipmb
 from optipmb.birth import birth_states
 from optipmb.gating import gate
 from optipmb.preprocess import Measurements
-from optipmb.table import ClassTable
 from optipmb.update import ukf_updates
 
 CARS, FRAMES, DT_NS = 6, 12, 100_000_000
 HALF = np.pi / 6
-
-
-def parameters_of(profile: str, growth: float = 0.0) -> optipmb.Parameters:
-    """The profile with the growth in every class."""
-    document = optipmb.load_profile(profile).model_dump()
-    for table in document["classes"].values():
-        table["measurement_noise"]["position_growth"] = growth
-    return optipmb.parse_parameters(document)
 
 
 def drive(parameters: optipmb.Parameters, **given: Any) -> list[optipmb.StepResult]:
@@ -69,7 +60,7 @@ def bytes_of(results: list[optipmb.StepResult]) -> list[bytes]:
 @pytest.mark.parametrize("profile", ["kitti", "kitti-paper", "nuscenes", "nuscenes-paper", "generic"])
 def test_the_covariance_of_the_profile_changes_no_byte(profile: str) -> None:
     """Detections whose covariance is R of their class, or unknown, give the density and tracks of those without."""
-    parameters = parameters_of(profile)
+    parameters = optipmb.load_profile(profile)
     sigma = np.array([one.measurement_noise.position for one in parameters.classes.values()])
 
     def same(label: Any) -> Any:
@@ -85,26 +76,6 @@ def test_the_covariance_of_the_profile_changes_no_byte(profile: str) -> None:
     assert far != expected
 
 
-def test_noise_that_grows_is_that_covariance() -> None:
-    """R is (sigma^2 + g^2 d^2) I, d from the sensor; a covariance of the detection takes its place."""
-    parameters, growing = parameters_of("kitti"), parameters_of("kitti", growth=0.02)
-    assert "position_growth" not in optipmb.load_profile("kitti").model_dump()["classes"]["Car"]["measurement_noise"]
-    sensor = np.array([30.0, -10.0, 1.5])
-    pose = optipmb.Pose(sensor, np.array([np.cos(HALF / 2), 0.0, 0.0, np.sin(HALF / 2)]))
-    found, tables = [], [ClassTable.of(one) for one in (parameters, growing)]
-    center = np.array([[40.0, 3.0, 0.0], [5.0, -60.0, 0.0]])
-    sigma = parameters.classes["Car"].measurement_noise.position
-    for k, one in enumerate((parameters, growing)):
-        own = (sigma**2 + 0.02**2 * (center[:, :2] ** 2).sum(axis=1))[:, None, None] * np.eye(3)
-        boxes: Any = {"center": center, "size": np.ones((2, 3)), "yaw": [0.0, 1.0], "score": [0.9, 0.8]}
-        frame, _ = optipmb.make_frame(
-            one, stamp_ns=0, labels=("Car",), label=[0, 0], pose=pose, position_covariance=None if k else own, **boxes
-        )
-        found.append(optipmb.tracker.preprocess(frame, tables[k])[0].position)
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-12, atol=1e-12)
-    assert found[1][0, 2] > 1.5
-
-
 def pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A state, its covariance, and a covariance of a position that is far from a circle."""
     root = rng.normal(0, 0.3, (6, 6))
@@ -113,12 +84,12 @@ def pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return mean, root @ root.T + 0.05 * np.eye(6), turned @ np.diag([2.0, 0.1]) @ turned.T
 
 
-def updated(mean: Any, covariance: Any, z: Any, spread: Any, velocity: Any, iterations: int) -> tuple[Any, Any]:
+def updated(mean: Any, covariance: Any, z: Any, spread: Any, velocity: Any) -> tuple[Any, Any]:
     """The kernel's update with a detection of covariance `spread`, under sigma = 0.5."""
     position = np.array([[z[0], z[1], *(spread[[0, 0, 1], [0, 1, 1]] / 0.25)]])
     out, out_spread = np.empty((1, 6)), np.empty((1, 6, 6))
     zero = np.zeros(1, np.int64)
-    classes = class_rows(1, noise_position=0.5, noise_velocity=0.7, noise_heading=0.2, linearisations=iterations)
+    classes = class_rows(1, noise_position=0.5, noise_velocity=0.7, noise_heading=0.2)
     measured = Measurements(position, np.array([z[2]]), np.array([velocity]), np.empty((1, 4)), np.empty(1), zero, zero)
     assert ukf_updates(zero, zero, mean[None], covariance[None], measured, classes, out, out_spread) == 0
     return out[0], out_spread[0]
@@ -133,13 +104,12 @@ def test_the_update_is_the_kalman_filter_with_that_covariance() -> None:
         noise = np.zeros((3, 3))
         noise[:2, :2], noise[2, 2] = spread, 0.2**2
         gain = covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + noise)
-        found, found_spread = updated(mean, covariance, z, spread, [np.nan, np.nan], 0)
+        found, found_spread = updated(mean, covariance, z, spread, [np.nan, np.nan])
         np.testing.assert_allclose(found, mean + gain @ (z - h @ mean), rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(found_spread, covariance - gain @ h @ covariance, rtol=1e-9, atol=1e-10)
 
 
-@pytest.mark.parametrize("iterations", [0, 3])
-def test_turning_the_world_turns_the_update(iterations: int) -> None:
+def test_turning_the_world_turns_the_update() -> None:
     """With a velocity too: the full covariance does what the diagonal one does in its own axes."""
     rng = np.random.default_rng(1)
     cos, sin = np.cos(HALF), np.sin(HALF)
@@ -150,12 +120,12 @@ def test_turning_the_world_turns_the_update(iterations: int) -> None:
         mean, covariance, spread = pair(rng)
         z = np.array([*(mean[:2] + rng.normal(0, 0.5, 2)), mean[3] + 0.1])
         velocity = np.array([6.5, 3.0])
-        one, one_spread = updated(mean, covariance, z, spread, velocity, iterations)
+        one, one_spread = updated(mean, covariance, z, spread, velocity)
         turned = whole @ mean
         turned[3] -= HALF
         z_turned = np.array([*(back @ z[:2]), z[2] - HALF])
         other, other_spread = updated(
-            turned, whole @ covariance @ whole.T, z_turned, back @ spread @ back.T, back @ velocity, iterations
+            turned, whole @ covariance @ whole.T, z_turned, back @ spread @ back.T, back @ velocity
         )
         expected = whole @ one
         expected[3] -= HALF
@@ -169,7 +139,7 @@ def test_a_less_certain_detection_moves_a_track_less() -> None:
     z = np.array([mean[0] + 1.0, mean[1] - 1.0, mean[3]])
     moved, left = [], []
     for scale in (0.01, 0.1, 1.0, 10.0, 1000.0):
-        found, found_spread = updated(mean, covariance, z, scale * spread, [np.nan, np.nan], 0)
+        found, found_spread = updated(mean, covariance, z, scale * spread, [np.nan, np.nan])
         moved.append(float(np.hypot(*(found - mean)[:2])))
         left.append(float(np.trace(found_spread[:2, :2])))
     assert moved == sorted(moved, reverse=True)
@@ -209,7 +179,7 @@ def test_a_detection_outside_the_gate_keeps_its_id_where_its_covariance_allows(
     deviation: float | None, *, same: bool
 ) -> None:
     """Half a metre beyond the gate is a new track, unless the covariance of the detection is large enough."""
-    parameters = parameters_of("kitti-paper")
+    parameters = optipmb.load_profile("kitti-paper")
     tracker, ids = optipmb.OnlineTracker(parameters), []
     for k in range(6):
         away = parameters.classes["Car"].gate + 0.5 if k == 5 else 0.0
@@ -245,7 +215,13 @@ def test_a_covariance_of_the_sensor_is_turned_to_the_world() -> None:
     given = root @ root.transpose(0, 2, 1) + 0.01 * np.eye(3)
     boxes: Any = {"center": np.ones((2, 3)), "size": np.ones((2, 3)), "yaw": [0, 1], "score": [0.0, 0.5]}
     frame, left_out = optipmb.make_frame(
-        parameters_of("kitti"), stamp_ns=0, labels=("Car",), label=[0, 0], pose=pose, position_covariance=given, **boxes
+        optipmb.load_profile("kitti"),
+        stamp_ns=0,
+        labels=("Car",),
+        label=[0, 0],
+        pose=pose,
+        position_covariance=given,
+        **boxes,
     )
     assert left_out == 1
     world = pose.rotation @ given[1] @ pose.rotation.T

@@ -91,7 +91,7 @@ def test_the_papers_profiles_keep_the_papers_gates_and_motion() -> None:
         assert not parameters.detection_over_time
         for one in parameters.classes.values():
             assert (one.motion, one.acceleration_time) == ("ctra", None)
-            assert (one.gate_growth, one.gate_deviations, one.ground_clearance) == (0.0, 0.0, 0.0)
+            assert (one.gate_deviations, one.ground_clearance) == (0.0, 0.0)
             assert not one.birth_over_clutter
 
 

@@ -13,8 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from optipmb.birth import birth_states
-from optipmb.linearised import linearised_update, moment_match
+from optipmb.birth import birth_states, moment_match
 from optipmb.preprocess import Measurements
 from optipmb.prune import NEW
 from optipmb.update import ukf_update, ukf_updates, workspace
@@ -42,7 +41,7 @@ def noise(rng: np.random.Generator) -> SimpleNamespace:
     deviations = SimpleNamespace(
         position=rng.uniform(0.05, 1), velocity=rng.uniform(0.1, 2), heading=rng.uniform(0.02, 1)
     )
-    return SimpleNamespace(measurement_noise=deviations, linearisations=0)
+    return SimpleNamespace(measurement_noise=deviations)
 
 
 def updated(mean: Array, covariance: Array, z: textbook.Measurement, c: SimpleNamespace) -> tuple[Array, Array]:
@@ -106,37 +105,6 @@ def test_a_box_turned_by_pi_is_the_same_measurement(*, velocity: bool) -> None:
     assert_same_gaussian(updated(mean, covariance, z, c), updated(mean, covariance, flipped, c))
 
 
-@pytest.mark.parametrize("iterations", [1, 3])
-@pytest.mark.parametrize("seed", range(6))
-def test_the_linearised_update_is_the_textbook_one(seed: int, iterations: int) -> None:
-    """Mean and covariance equal the iterated posterior linearisation written out with matrices and complex numbers."""
-    rng = np.random.default_rng(seed)
-    mean, covariance = random_state(rng)
-    covariance[3, 3] += rng.uniform(0, 3)
-    z, c = measurement(rng, mean, velocity=True), noise(rng)
-    c.linearisations = iterations
-    r = c.measurement_noise
-    sigma = np.array([r.position, r.position, r.velocity, r.velocity, r.heading, 0.0])
-    out, spread = np.full(6, np.nan), np.full((6, 6), np.nan)
-    vector = np.array([*z.xy, *np.asarray(z.velocity), z.yaw])
-    linearised_update(mean, covariance, vector, sigma, iterations, workspace(), out, spread)
-    assert_same_gaussian((out, spread), textbook.linearised_update(mean, covariance, z, c))
-
-
-def test_the_moments_of_the_velocity_are_those_of_its_samples() -> None:
-    """Mean, Jacobian and what a line leaves over, of v (cos phi, sin phi), against a large sample."""
-    rng = np.random.default_rng(5)
-    mean, covariance = np.array([0, 0, 3.0, 0.7, 0, 0]), np.diag([1.0, 1.0, 0.8, 0.9, 1.0, 1.0])
-    covariance[2, 3] = covariance[3, 2] = 0.4
-    x = rng.multivariate_normal(mean, covariance, 400_000)
-    w = x[:, 2:3] * np.column_stack([np.cos(x[:, 3]), np.sin(x[:, 3])])
-    expected, jacobian, left = textbook.linear_velocity(mean, covariance)
-    cross = (x - mean).T @ (w - w.mean(axis=0)) / len(x)
-    np.testing.assert_allclose(w.mean(axis=0), expected, atol=0.02)
-    np.testing.assert_allclose(covariance @ jacobian.T, cross, atol=0.03)
-    np.testing.assert_allclose(np.cov(w.T) - jacobian @ covariance @ jacobian.T, left, atol=0.05)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_an_update_never_widens(seed: int) -> None:
     """The posterior covariance is positive definite and below the prior."""
@@ -154,7 +122,6 @@ def test_states_without_a_measurement_stay_as_predicted() -> None:
     mean, covariance = np.stack([m for m, _ in states]), np.stack([p for _, p in states])
     zs = [measurement(rng, mean[2], velocity=True), measurement(rng, mean[0], velocity=False)]
     classes = [noise(rng), noise(rng)]
-    classes[1].linearisations = 2
     rows, chosen, label = np.array([0, 1, 2, 3, 0, NEW]), np.array([1, -1, 0, -1, -1, 0]), np.array([1, 0])
     out, spread = np.full((6, 6), np.nan), np.full((6, 6, 6), np.nan)
     ukf_updates(
@@ -176,7 +143,6 @@ def test_states_without_a_measurement_stay_as_predicted() -> None:
             noise_position=[c.measurement_noise.position for c in classes],
             noise_velocity=[c.measurement_noise.velocity for c in classes],
             noise_heading=[c.measurement_noise.heading for c in classes],
-            linearisations=[c.linearisations for c in classes],
         ),
         out,
         spread,
@@ -189,7 +155,7 @@ def test_states_without_a_measurement_stay_as_predicted() -> None:
             np.testing.assert_array_equal(out[k], mean[n])
             np.testing.assert_array_equal(spread[k], covariance[n])
         else:
-            wanted = textbook.update(mean[n], covariance[n], zs[m], classes[label[m]])
+            wanted = textbook.ukf_update(mean[n], covariance[n], zs[m], classes[label[m]])
             assert_same_gaussian((out[k], spread[k]), wanted)
 
 

@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from optipmb_client.commands.options import AsJson, Out, Speed, print_json, say, speed_of
+from optipmb_client.commands.options import AsJson, Out, print_json, say
 from optipmb_client.commands.replay import complain
+from optipmb_client.commands.service_options import Speed, speed_of
 from optipmb_client.extras import needed
 from optipmb_client.progress import FrameProgress
 

@@ -4,7 +4,8 @@ from typing import Annotated
 
 import typer
 
-from optipmb_client.commands.options import AsJson, ServiceOptions, print_json, say
+from optipmb_client.commands.options import AsJson, print_json, say
+from optipmb_client.commands.service_options import ServiceOptions
 from optipmb_client.sessions import drain_service, only_service
 
 

@@ -10,12 +10,12 @@ from optipmb_client.commands.options import (
     AsJson,
     DatasetOptions,
     Profile,
-    ServiceOptions,
     open_sequences,
     print_json,
     print_table,
     say,
 )
+from optipmb_client.commands.service_options import ServiceOptions
 from optipmb_client.errors import UsageError
 from optipmb_client.load import Frames, Load, Run, draw_runs, find_limit, generated, recorded, run_load, table_of
 from optipmb_client.progress import FrameProgress

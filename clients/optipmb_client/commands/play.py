@@ -7,16 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optipmb_client.commands.options import (
-    AsJson,
-    Full,
-    PaceOptions,
-    ServiceOptions,
-    mcap_needed,
-    print_json,
-    say,
-    warn,
-)
+from optipmb_client.commands.options import AsJson, Full, mcap_needed, print_json, say, warn
+from optipmb_client.commands.service_options import PaceOptions, ServiceOptions
 from optipmb_client.datasets import open_dataset
 from optipmb_client.progress import FrameProgress
 from optipmb_client.recording import Results

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optipmb_client.commands.options import AsJson, ServiceOptions, mcap_needed, print_json, say
+from optipmb_client.commands.options import AsJson, mcap_needed, print_json, say
+from optipmb_client.commands.service_options import ServiceOptions
 from optipmb_client.errors import UsageError
 from optipmb_client.progress import StatusLine
 

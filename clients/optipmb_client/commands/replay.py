@@ -12,13 +12,12 @@ from optipmb_client.commands.options import (
     DataOptions,
     Full,
     Out,
-    PaceOptions,
     Profile,
-    ServiceOptions,
     open_sequences,
     print_json,
     say,
 )
+from optipmb_client.commands.service_options import PaceOptions, ServiceOptions
 from optipmb_client.errors import UsageError
 from optipmb_client.links import linked
 from optipmb_client.progress import FrameProgress

@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.live import Live
 
 from optipmb_client.board import Board
-from optipmb_client.commands.options import AsJson, ServiceOptions, print_json, print_table
+from optipmb_client.commands.options import AsJson, print_json, print_table
+from optipmb_client.commands.service_options import ServiceOptions
 from optipmb_client.errors import ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
 from optipmb_client.sessions import find_services
 from optipmb_client.status import render

@@ -5,7 +5,8 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from optipmb_client.commands.options import AsJson, ServiceOptions, print_json, say
+from optipmb_client.commands.options import AsJson, print_json, say
+from optipmb_client.commands.service_options import ServiceOptions
 from optipmb_client.errors import ServiceUnavailable, UsageError
 from optipmb_client.history import kept_tracks
 from optipmb_client.results.table import track_columns

@@ -23,7 +23,8 @@ from optipmb_schemas import (
 )
 
 from optipmb_client.asking import DensityAsker
-from optipmb_client.commands.options import ServiceOptions, mcap_needed, say, speed_of
+from optipmb_client.commands.options import mcap_needed, say
+from optipmb_client.commands.service_options import ServiceOptions, speed_of
 from optipmb_client.errors import UsageError
 from optipmb_client.extras import needed
 from optipmb_client.incoming import Inbox

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
-from optipmb_client.datasets.fused import FusedDataset
 from optipmb_client.datasets.interface import (
     Cloud,
     DataSequence,
@@ -14,9 +13,6 @@ from optipmb_client.datasets.interface import (
     Regions,
     Truth,
 )
-from optipmb_client.datasets.kitti import KittiDataset
-from optipmb_client.datasets.nuscenes import NuScenesDataset
-from optipmb_client.datasets.scene import SceneDataset, scene_options
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Pose
 from optipmb_client.table_files import tables_in
@@ -79,6 +75,8 @@ def open_dataset(
     if name == "scene":
         if root is not None or detections is not None:
             raise DatasetError("--root and --detections", "nothing, for scenes are generated", str(root or detections))
+        from optipmb_client.datasets.scene import SceneDataset, scene_options  # noqa: PLC0415 - of one format
+
         return SceneDataset(scene_options(_numbers(options)))
     if name not in DATASETS:
         raise DatasetError("--dataset", " or ".join(DATASETS), repr(name))
@@ -90,19 +88,28 @@ def open_dataset(
     if fuse and name not in {"table", "mcap"}:
         raise DatasetError("--fuse", "a table with a column `sensor`, or a recording (.mcap)", name)
     opened = _OPEN[name](Path(root), detections, options)
-    return FusedDataset(opened) if fuse else opened
+    if not fuse:
+        return opened
+    from optipmb_client.datasets.fused import FusedDataset  # noqa: PLC0415 - of one format
+
+    return FusedDataset(opened)
 
 
+# Each function imports the modules of its format: a command reads one, and some need packages of extras.
 _Options: TypeAlias = dict[str, float | str]
 
 
 def _kitti(root: Path, detections: str | Path | None, options: _Options) -> Dataset:
+    from optipmb_client.datasets.kitti import KittiDataset  # noqa: PLC0415 - of one format
+
     _known(options, {"clouds", "poses", "split", "submission"})
     text = {name: str(options[name]) for name in ("poses", "split", "submission") if name in options}
     return KittiDataset(root, detections, clouds=bool(options.get("clouds", True)), **text)
 
 
 def _nuscenes(root: Path, detections: str | Path | None, options: _Options) -> Dataset:
+    from optipmb_client.datasets.nuscenes import NuScenesDataset  # noqa: PLC0415 - of one format
+
     _known(options, {"clouds", "z_bottom", "submission"})
     z_bottom = bool(options["z_bottom"]) if "z_bottom" in options else None
     clouds, submission = bool(options.get("clouds", True)), "submission" in options
@@ -112,20 +119,20 @@ def _nuscenes(root: Path, detections: str | Path | None, options: _Options) -> D
 
 
 def _mcap(root: Path, _: str | Path | None, options: _Options) -> Dataset:
-    from optipmb_client.datasets.mcap import RecordedDataset  # noqa: PLC0415 - needs packages of an extra
+    from optipmb_client.datasets.mcap import RecordedDataset  # noqa: PLC0415 - of one format
 
     _known(options, set())
     return RecordedDataset(root)
 
 
 def _table(root: Path, _: str | Path | None, options: _Options) -> Dataset:
-    from optipmb_client.datasets.table import TableDataset  # noqa: PLC0415 - needs packages of an extra
+    from optipmb_client.datasets.table import TableDataset  # noqa: PLC0415 - of one format
 
     return TableDataset(root, {key: str(value) for key, value in options.items()})
 
 
 def _rosbag(root: Path, _: str | Path | None, options: _Options) -> Dataset:
-    from optipmb_client.datasets.rosbag import RosbagDataset  # noqa: PLC0415 - needs packages of an extra
+    from optipmb_client.datasets.rosbag import RosbagDataset  # noqa: PLC0415 - of one format
 
     return RosbagDataset(root, dict(options))
 

@@ -38,8 +38,8 @@ from optipmb_client.datasets.kitti_files import (
 )
 from optipmb_client.files import DatasetError, read_points, read_rows
 from optipmb_client.geometry import Floats, Ints, Pose, pose_of, stack_poses, to_world
-from optipmb_client.results import KittiResultWriter, ResultWriter
-from optipmb_client.results.kitti import SUBMISSION_SCORES
+from optipmb_client.results import ResultWriter
+from optipmb_client.results.kitti import SUBMISSION_SCORES, KittiResultWriter
 
 PERIOD_NS = 100_000_000
 

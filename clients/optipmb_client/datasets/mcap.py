@@ -22,7 +22,8 @@ from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFram
 from optipmb_client.errors import ClientError
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Pose, rotation_of, to_sensor
-from optipmb_client.results import KittiResultWriter, ResultWriter
+from optipmb_client.results import ResultWriter
+from optipmb_client.results.kitti import KittiResultWriter
 
 try:
     from optipmb_client.mcap_files.plan import StreamPlan, plan, steps

@@ -15,7 +15,8 @@ from optipmb_client.datasets.interface import DETECTION_COLUMNS, Cloud, DataSequ
 from optipmb_client.errors import ClientError
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Pose
-from optipmb_client.results import KittiResultWriter, ResultWriter
+from optipmb_client.results import ResultWriter
+from optipmb_client.results.kitti import KittiResultWriter
 
 try:
     from optipmb_schemas import MessageError

@@ -12,9 +12,9 @@ from optipmb_client.datasets.kitti import KittiSequence
 from optipmb_client.datasets.nuscenes import NuScenesSequence
 from optipmb_client.datasets.table import TableSequence
 from optipmb_client.datasets.table.truth import ObjectTable, TableOptions, read_objects
-from optipmb_client.results import ResultTable, read_kitti_results
+from optipmb_client.results import ResultTable
 from optipmb_client.results.full import FullTable, full_path, read_full
-from optipmb_client.results.kitti import LEAST_SHOWN
+from optipmb_client.results.kitti import LEAST_SHOWN, read_kitti_results
 from optipmb_client.results.nuscenes import NUSCENES_FILE, read_nuscenes_results, result_table
 from optipmb_client.results.rows import empty_table
 from optipmb_client.table_files import SUFFIXES, is_table

@@ -41,7 +41,7 @@ log = structlog.get_logger("optipmb_service")
 
 FIRST_PAUSE_S: Final = 0.5
 LONGEST_PAUSE_S: Final = 30.0
-STEADY_S: Final = 60.0
+STEADY_S: Final = 10.0
 """A worker that has lived for so long is taken for sound: if it dies, it is started again at once."""
 
 START_S: Final = 900.0

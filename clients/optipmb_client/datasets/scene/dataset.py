@@ -20,7 +20,8 @@ from optipmb_client.datasets.scene.roads import fixed_boxes
 from optipmb_client.datasets.scene.world import Crowd, World, build_world
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Bools, Floats, Ints, Pose, planar_pose, wrap_angle
-from optipmb_client.results import KittiResultWriter, ResultWriter
+from optipmb_client.results import ResultWriter
+from optipmb_client.results.kitti import KittiResultWriter
 
 HEIGHT = 1.75
 """Of the sensor above the ground."""
