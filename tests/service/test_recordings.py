@@ -161,7 +161,9 @@ class SessionSeam:
             elif isinstance(output, Quarantined):
                 self._out.add("quarantined", output.error.encode())
             else:
-                self._out.add(f"begun {output.reason}", repr(output).encode())
+                self._out.add(
+                    f"begun {output.reason}", f"{self._out.session(output.session)} {output.jump_ns}".encode()
+                )
 
 
 class Process(Around):
