@@ -7,17 +7,14 @@ silenced; existence probabilities are not calibrated.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Final
-
-import numpy as np
 
 from optipmb.class_names import common_name
 from optipmb.parameters import parse_parameters
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from numpy.typing import ArrayLike
+    from collections.abc import Iterable
 
     from optipmb.parameters import Parameters
 
@@ -37,29 +34,24 @@ DETECTION_S: Final = 0.5
 """Time that the detection probability holds for: what hides an object hides it about so long."""
 SHOWN_S: Final = 0.4
 """How long a track is shown without a detection; two frames at least."""
-LEAVING_RATE: Final = 0.02
-"""Share of the objects that leave in a second."""
-BIRTH_QUANTILE: Final = 0.5
-BIRTH_SCORE: Final = (0.2, 0.6)
-"""Least and greatest score from which an unused detection starts a track at once."""
-USUAL_SCORE: Final = 0.5
+EVIDENCE: Final = tuple(round(-3.0 + 0.5 * k, 1) for k in range(13))
+EXISTENCE: Final = tuple(round(1.0 / (1.0 + math.exp(0.56 - 1.82 * e)), 3) for e in EVIDENCE)
+MEMORY: Final = 0.8
+"""Weight that the evidence keeps over a tenth of a second."""
 
 
-def generic_parameters(
-    labels: Iterable[str], period: float, scores: Mapping[str, ArrayLike] | None = None, *, name: str = "auto"
-) -> Parameters:
+def generic_parameters(labels: Iterable[str], period: float, *, name: str = "auto") -> Parameters:
     """Return parameters for classes, by what their names mean (`optipmb.class_names`).
 
     Args:
         labels: names of the classes; what their names do not tell is taken for objects of middling size and speed.
         period: seconds between frames.
-        scores: of some detections, by class.
         name: of the profile.
 
     Raises:
         ParameterError: no label, a name that is none, or a period that is not positive.
     """
-    classes = {label: _of_class(common_name(label) or OTHER, period, _birth_score(label, scores)) for label in labels}
+    classes = {label: _of_class(common_name(label) or OTHER, period) for label in labels}
     kinds = ", ".join(f"{label} as {common_name(label) or OTHER}" for label in classes)
     provenance = f"For a detector that nobody tuned: {1.0 / period if period > 0.0 else 0.0:.3g} Hz; {kinds}."
     return parse_parameters(
@@ -67,31 +59,27 @@ def generic_parameters(
             "name": name,
             "nominal_period": period,
             "detection_time": DETECTION_S,
+            "self_calibration": True,
             "provenance": provenance[:10_000],
             "classes": classes,
         }
     )
 
 
-def _birth_score(label: str, scores: Mapping[str, ArrayLike] | None) -> float:
-    values = np.asarray(scores[label], dtype=np.float64) if scores and label in scores else np.empty(0)
-    usual = float(np.quantile(values, BIRTH_QUANTILE)) if len(values) else USUAL_SCORE
-    return round(float(np.clip(usual, *BIRTH_SCORE)), 3)
-
-
-def _of_class(kind: str, period: float, birth_score: float) -> dict[str, Any]:
+def _of_class(kind: str, period: float) -> dict[str, Any]:
     gate, unknown_speed = dict(REACH)[kind]
     agile, two_wheeled, sized = kind in AGILE, kind in TWO_WHEELED, kind in SIZED
     return {
-        "score_filter": round(0.3 * birth_score, 3),
+        "score_filter": 0.05,
+        "announce_score": 0.15,
+        "birth_score": 0.5,
         "nms_iou": 0.1,
-        "survival": max(0.5, 1.0 - LEAVING_RATE * period),
+        "survival": 1.0,
         "gate": gate,
         "gate_deviations": GATE_DEVIATIONS,
         "detection": 0.8,
         "expected_points": 10.0,
         "detection_floor": 0.6,
-        "birth_score": birth_score,
         "adaptive_birth_rate": 0.2,
         "undetected_birth_rate": 0.5,
         "clutter_rate": 2.0,
@@ -111,6 +99,19 @@ def _of_class(kind: str, period: float, birth_score: float) -> dict[str, Any]:
         "birth_heading_speed": 1.0,
         "birth_over_clutter": True,  # a wide gate holds components that are of other objects
         "birth_overlap": 0.1,
+        "motion": "cv" if agile else "ctra",
+        "acceleration_time": None if agile else 1.0 if two_wheeled else 3.0,
+        "confirm_from": 0.5,
+        "confirm_until": 0.3,
+        "calibration": {
+            "memory": round(MEMORY ** (10.0 * period), 4),
+            "missed": 1.0,
+            "evidence": EVIDENCE,
+            "existence": EXISTENCE,
+            "along": [0.15] * len(EVIDENCE),
+            "across": [0.1] * len(EVIDENCE),
+        },
+        "reported_noise": {"position": 0.06, "heading": 0.1 if agile else 0.06},
         "process_noise": {
             "position": 0.1,
             "speed": 0.8 if agile else 1.0,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -64,6 +64,7 @@ class ClassRow(Protocol):
     expected_points: float
     detection_floor: float
     ground_clearance: float
+    announce_score: float
     birth_score: float
     birth_over_clutter: bool
     birth_overlap: float
@@ -141,6 +142,11 @@ class ClassTable:
     def __getitem__(self, name: str) -> NDArray[Any]:
         column: NDArray[Any] = np.asarray(self.classes)[name]
         return column
+
+    def copy(self) -> ClassTable:
+        """Return a table whose classes may be written."""
+        classes: Any = np.array(self.classes)
+        return replace(self, classes=classes)
 
     @classmethod
     def of(cls, parameters: Parameters) -> ClassTable:

@@ -93,6 +93,12 @@ def test_the_profiles_that_ship_are_listed_and_load() -> None:
         assert parameters.provenance
 
 
+def test_the_default_of_the_service_is_the_one_for_any_detector() -> None:
+    """`generic` is what `auto` makes of its classes at 10 Hz."""
+    generic = optipmb.load_profile("generic")
+    assert generic == optipmb.generic_parameters(generic.labels, 0.1, name="generic")
+
+
 @pytest.mark.parametrize("profile", PAPER)
 def test_the_profiles_hold_the_papers_table(profile: str) -> None:
     """Every value that the paper's table of parameters gives stands in the profile."""
@@ -250,9 +256,3 @@ def test_any_document_is_refused_by_name(document: Any) -> None:
     """Nothing but ParameterError comes out, whatever is read."""
     error = refused(document)
     assert str(error).startswith(error.path)
-
-
-def test_generic_is_what_is_made_for_ten_hertz() -> None:
-    """The file and the function do not differ."""
-    generic = optipmb.load_profile("generic")
-    assert generic == optipmb.generic_parameters(generic.labels, 0.1, name="generic")
