@@ -26,7 +26,7 @@ from optipmb_service.session.values import MAX_COUNT, Deliveries, Lineage
 
 if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
-    from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, Recorded, SensorState
+    from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, ProcessedFrame, SensorState
     from optipmb_service.session.timeline import Cursor
 
 VERSION: Final = 1
@@ -153,7 +153,7 @@ def _table(values: Cursor | FrameCounts | PoseHistory | Deliveries) -> dict[str,
     return {name: getattr(values, name) for name in values.__match_args__}
 
 
-def _packed_cloud(one: Recorded) -> bytes | None:
+def _packed_cloud(one: ProcessedFrame) -> bytes | None:
     if one.points is not None and not one.packed:
         one.packed.append(schemas.encode(one.points))
     return one.packed[0] if one.packed else None
