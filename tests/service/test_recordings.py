@@ -41,7 +41,7 @@ BETWEEN_NS: Final = SECOND // 50
 """Time between two steps."""
 
 RECORDED: Final = optipmb.load_profile(PROFILE)
-OTHER: Final = RECORDED.model_copy(update={"name": "other", "nominal_period": 0.2})
+OTHER: Final = RECORDED.model_copy(update={"name": "other", "nominal_period": 0.2, "detection_time": 0.2})
 PROFILES: Final = Profiles("recorded", (), {one.name: one for one in (RECORDED, OTHER)})
 TRACKERS: Final = {"chained": chained, "filter": optipmb.Tracker}
 KEYS: Final = schemas.Keys()
@@ -161,7 +161,9 @@ class SessionSeam:
             elif isinstance(output, Quarantined):
                 self._out.add("quarantined", output.error.encode())
             else:
-                self._out.add(f"begun {output.reason}", repr(output).encode())
+                self._out.add(
+                    f"begun {output.reason}", f"{self._out.session(output.session)} {output.jump_ns}".encode()
+                )
 
 
 class Process(Around):

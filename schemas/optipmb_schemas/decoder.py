@@ -1,0 +1,278 @@
+"""Messages from bytes that are what `encode` writes: msgspec decodes them by the types that the models define.
+
+Nothing is refused here. Bytes that are no valid message in this form give None; `codec` reads other forms and names
+errors. So there is one set of rules and one set of errors. Tests hold the messages of both ways equal.
+
+msgspec builds what the types allow and no more, so the memory for a payload is bounded by its size. Of a map with a
+field twice it takes the last one and it skips fields that are not known: `is_encoding` finds that the bytes are others.
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from itertools import chain
+from math import prod
+from typing import Annotated, Any, Final, TypeVar, get_type_hints
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, TypeAdapter
+from typing_extensions import TypedDict
+
+from optipmb_schemas.arrays import Array, numeric
+from optipmb_schemas.blocks import DTYPES, LARGE
+from optipmb_schemas.encoder import is_encoding
+from optipmb_schemas.limits import DEFAULT, Limits
+from optipmb_schemas.messages import Density, Detections, FieldOfView, Points, Pose, Tracks
+from optipmb_schemas.model import Message
+
+T = TypeVar("T", bound=Message)
+
+KINDS: Final[frozenset[type[Message]]] = frozenset({Detections, Points, Tracks, Density})
+"""Messages with columns. Others are small."""
+
+MOST_BYTES: Final = 2**16
+"""Bytes of a payload up to which msgspec encodes the fields again to compare them."""
+
+MOST_NUMBERS: Final = 2**13
+"""Numbers of a message up to which the ranges of all columns are compared at once."""
+
+_MOST_TEXT: Final = 2000
+_MOST_VALUES: Final = 1000
+_MOST_DEPTH: Final = 4
+"""Bytes of a text, values and levels of lists and maps that no valid message in this form exceeds."""
+
+_TypedDict: Any = TypedDict  # made of types that are not known before
+_PARTS: Final[frozenset[type[Message]]] = frozenset({Pose, FieldOfView})
+_LITTLE: Final = sys.byteorder == "little"
+REFUSED: Final = (msgspec.MsgspecError, ValueError, TypeError, LookupError, RecursionError)
+"""Errors of `checked`, and of msgspec."""
+
+
+class Block(msgspec.Struct, gc=False):
+    """Array block as it was received."""
+
+    dtype: str
+    shape: Annotated[list[int], msgspec.Meta(max_length=4)]
+    data: memoryview
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    """How messages with some fields are read.
+
+    Attributes:
+        scalars, arrays, nested: names of the fields, by what they hold.
+        checks: further checks of arrays.
+        in_order: whether the fields are in the order in which they are encoded.
+    """
+
+    scalars: tuple[str, ...]
+    arrays: tuple[str, ...]
+    nested: tuple[str, ...]
+    checks: tuple[tuple[str, Callable[[Any], Any]], ...]
+    in_order: bool
+
+
+@lru_cache(256)
+def _form_of(kind: type[Message], names: tuple[str, ...]) -> _Form:
+    """Return how messages with these fields are read. Raises ValueError: one is missing or unknown."""
+    _need(kind.names_required <= set(names) <= set(kind.names))
+    arrays = tuple(name for name in names if name in kind.arrays)
+    nested = tuple(name for name in names if name in kind.nested)
+    checks: list[tuple[str, Any]] = [
+        (name, one.func) for name in arrays for one in kind.metadata_of(name) if isinstance(one, AfterValidator)
+    ]
+    scalars = tuple(name for name in names if name not in {*arrays, *nested})
+    in_order = tuple(name for name in kind.names if name in names) == names
+    return _Form(scalars, arrays, nested, tuple(checks), in_order)
+
+
+@cache
+def _checker_of(kind: type[Message]) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    """Return what checks the scalars of a message."""
+    others = kind.arrays.keys() | kind.nested.keys()
+    hints = get_type_hints(kind, include_extras=True)
+    scalars = {name: hints[name] for name in kind.names if name not in others}
+    return TypeAdapter(_TypedDict(kind.__name__, scalars, total=False)).validate_python
+
+
+@cache
+def _type_of(kind: type[Message]) -> Any:
+    """Return the type by which msgspec decodes a message: that of the model, its arrays as blocks."""
+    types = {name: hint for name, hint in get_type_hints(kind, include_extras=True).items() if name in kind.names}
+    types |= dict.fromkeys(kind.arrays, Block)
+    types |= {name: _type_of(inner) for name, inner in kind.nested.items()}
+    if "labels" in types:
+        types["labels"] = Annotated[list[str], msgspec.Meta(max_length=256)]
+    return _TypedDict(kind.__name__, types, total=False)
+
+
+@cache
+def decoder_of(kind: type[Message]) -> Callable[[bytes], dict[str, Any]]:
+    """Return what decodes the fields of a message by their types alone; it raises what `REFUSED` names."""
+    return msgspec.msgpack.Decoder(_type_of(kind)).decode
+
+
+_encode: Final = msgspec.msgpack.Encoder().encode
+
+
+def read(payload: bytes, kind: type[T], limits: Limits) -> T | None:
+    """Return the message of a payload in this form, else None."""
+    if kind not in KINDS:
+        return None
+    fields_of = decoder_of(kind)
+    try:
+        fields = fields_of(payload)
+        message = checked(fields, kind, limits)
+    except REFUSED:
+        return None
+    if len(payload) <= MOST_BYTES and _encode(fields) == payload:
+        kept = _is_in_order(fields, kind)
+    elif is_encoding(payload, message):
+        kept = True
+    else:
+        return None
+    if kept and isinstance(message, Detections):
+        object.__setattr__(message, "encoded", payload)
+    return message
+
+
+def _is_in_order(fields: dict[str, Any], kind: type[Message]) -> bool:
+    """Return whether `encode` gives these fields in this order, and the blocks among them without padding."""
+    form = _form_of(kind, tuple(fields))
+    if None in fields.values():
+        return False
+    inner = (_is_in_order(fields[name], kind.nested[name]) for name in form.nested)
+    return form.in_order and all(inner) and all(len(fields[name].data) < LARGE for name in form.arrays)
+
+
+def checked(fields: dict[str, Any], kind: type[T], limits: Limits) -> T:
+    """Return the message of its fields, arrays as blocks and messages as their fields.
+
+    Raises:
+        ValueError, TypeError, LookupError: it is not valid, or not in this form.
+    """
+    form = _form_of(kind, tuple(fields))
+    _need(_LITTLE and (limits is DEFAULT or _is_generous(limits)))
+    values = kind.optional | _checker_of(kind)({name: fields[name] for name in form.scalars})
+    for name in form.nested:
+        inner = kind.nested[name]
+        values[name] = _part(inner, _key(fields[name])) if inner in _PARTS else checked(fields[name], inner, limits)
+    if form.arrays:
+        key = tuple([(name, (one := fields[name]).dtype, tuple(one.shape), len(one.data)) for name in form.arrays])
+        values |= _plan_of(kind, key, limits)(fields)
+    for name, check in form.checks:
+        check(values[name])
+    message = kind.of_valid(values, set(fields))
+    message.check()
+    return message
+
+
+def _key(blocks: dict[str, Block]) -> tuple[tuple[str, str, tuple[int, ...], bytes], ...]:
+    return tuple([(name, one.dtype, tuple(one.shape), bytes(one.data)) for name, one in blocks.items()])
+
+
+@lru_cache(1024)
+def _part(kind: type[Message], key: tuple[tuple[str, str, tuple[int, ...], bytes], ...]) -> Message:
+    """Return a message of a few arrays: most sensors send the same ones over and over."""
+    blocks = {name: Block(dtype, list(shape), memoryview(data)) for name, dtype, shape, data in key}
+    return checked(blocks, kind, DEFAULT)
+
+
+def _is_generous(limits: Limits) -> bool:
+    return (
+        limits.max_text >= _MOST_TEXT
+        and limits.max_values >= _MOST_VALUES
+        and limits.max_depth >= _MOST_DEPTH
+        and limits.max_labels >= DEFAULT.max_labels
+    )
+
+
+_Key = tuple[tuple[str, str, tuple[int, ...], int], ...]
+_Plan = Callable[[dict[str, Block]], dict[str, Any]]
+
+
+@lru_cache(64)
+def _plan_of(kind: type[Message], key: _Key, limits: Limits) -> _Plan:
+    """Return what makes arrays of blocks with these names, number types, shapes and bytes.
+
+    Raises:
+        ValueError: no message has them.
+    """
+    lengths: dict[str, int] = {}
+    for name, dtype, shape, size in key:
+        described = kind.arrays[name]
+        _need(dtype == described.dtype and size == DTYPES[dtype] * prod(shape) > 0)
+        for want, length in zip(described.shape, shape, strict=True):
+            _need(length == (want if isinstance(want, int) else lengths.setdefault(want, length)))
+    _need(all(0 < length <= limits.rows(letter) for letter, length in lengths.items()))
+    shapes = {name: shape for name, _, shape, _ in key}
+    if sum(map(prod, shapes.values())) > MOST_NUMBERS:
+        return lambda blocks: {
+            name: _column(blocks[name].data, kind.arrays[name], shape) for name, shape in shapes.items()
+        }
+    by_type: dict[str, dict[str, tuple[int, ...]]] = {}
+    for name, shape in shapes.items():
+        by_type.setdefault(kind.arrays[name].dtype, {})[name] = shape
+    groups = [_Group.of(kind, dtype, members) for dtype, members in by_type.items()]
+    return lambda blocks: dict(chain.from_iterable(group.arrays(blocks).items() for group in groups))
+
+
+def _column(data: memoryview, described: Array, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return a column, a view of the bytes where they are aligned. Raises ValueError: a number is out of its range."""
+    array = numeric.canonical(np.frombuffer(data, described.dtype).reshape(shape), described)
+    _need(numeric.first_outside(array, described) is None)
+    return array
+
+
+@dataclass(frozen=True, slots=True)
+class _Group:
+    """Columns of one number type, one behind the other, those with unknown rows last.
+
+    Attributes:
+        dtype: their number type.
+        columns: name, place and shape of each, and whether rows of it may be unknown.
+        known: how many numbers must be within their bounds.
+        low, high: bounds of each number.
+    """
+
+    dtype: str
+    columns: tuple[tuple[str, slice, tuple[int, ...], bool], ...]
+    known: int
+    low: NDArray[Any]
+    high: NDArray[Any]
+
+    @classmethod
+    def of(cls, kind: type[Message], dtype: str, shapes: dict[str, tuple[int, ...]]) -> "_Group":
+        columns, end, known = [], 0, 0
+        low, high = [], []
+        for name in sorted(shapes, key=lambda name: kind.arrays[name].unknown):
+            described, begin, size = kind.arrays[name], end, prod(shapes[name])
+            end += size
+            known = known if described.unknown else end
+            columns.append((name, slice(begin, end), shapes[name], described.unknown))
+            least = np.asarray(described.low, dtype)
+            low.append(np.full(size, np.nextafter(least, np.inf, dtype=dtype) if described.above else least))
+            high.append(np.full(size, np.asarray(described.high, dtype)))
+        return cls(dtype, tuple(columns), known, np.concatenate(low), np.concatenate(high))
+
+    def arrays(self, blocks: dict[str, Block]) -> dict[str, NDArray[Any]]:
+        """Return the columns. Raises ValueError: a number is out of its range."""
+        numbers = np.frombuffer(b"".join([blocks[name].data for name, *_ in self.columns]), self.dtype)
+        good = (numbers >= self.low) & (numbers <= self.high)
+        arrays = {name: numbers[place].reshape(shape) for name, place, shape, _ in self.columns}
+        if not good[good.argmin()]:
+            _need(bool(good[: self.known].all()))
+            for name, place, shape, unknown in self.columns:
+                if unknown:
+                    unknown_rows = np.isnan(arrays[name]).all(axis=-1, keepdims=True)
+                    _need(bool((good[place].reshape(shape) | unknown_rows).all()))
+        return arrays
+
+
+def _need(fact: bool) -> None:  # noqa: FBT001 - one condition, as after assert
+    if not fact:
+        raise ValueError
