@@ -36,7 +36,7 @@ from optipmb_service.session.values import (
     Count,
     Deliveries,
     Epoch,
-    Lineage,
+    Incarnation,
     SensorName,
     Whole,
 )
@@ -67,17 +67,17 @@ _SOFTWARE: Final = version("optipmb")
 class CheckpointError(ValueError):
     """The bytes are no checkpoint that this service can read; the text says why.
 
-    `lineage` has the ids that the session used, where the checkpoint is whole and of another version; else None.
+    `incarnation` has the ids that the session used, where the checkpoint is whole and of another version; else None.
     """
 
-    def __init__(self, text: str, lineage: Lineage | None = None) -> None:
+    def __init__(self, text: str, incarnation: Incarnation | None = None) -> None:
         super().__init__(text)
-        self.lineage = lineage
+        self.incarnation = incarnation
 
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """What a session is made of, between two frames. Nothing in it changes any more.
+    """State of a session between two frames. Nothing in it changes any more.
 
     Attributes:
         stream: `site/node/sensor`; that of the tracks, where several sensors feed the session.
@@ -89,7 +89,7 @@ class Checkpoint:
         base: the state before the window.
         window: the frames of the window.
         head: the present state.
-        deliveries: what was not tracked, and what was corrected.
+        deliveries: counts of frames that were not tracked, and of corrections.
         newest_cloud_ns: stamp of the cloud that arrived last, by sensor.
         run: see `Session.run`: the sum of the fences under which the session began and was taken up again.
         software: version of the service that wrote it.
@@ -111,12 +111,12 @@ class Checkpoint:
 
     @property
     def session(self) -> str:
-        """The id of the present life of the density."""
+        """Id of the present incarnation of the density."""
         return self.head.session
 
 
 def forgotten(checkpoint: Checkpoint) -> Checkpoint:
-    """Return a checkpoint of a session that was reset, without its counts: what remains of a stream that was closed."""
+    """Return the checkpoint of a stream that is closed: that of its session after a reset, without its counts."""
     state = replace(checkpoint.head, counts=FrameCounts())
     seen = checkpoint.seen
     if checkpoint.fused:  # the next frames may have any clock
@@ -127,7 +127,7 @@ def forgotten(checkpoint: Checkpoint) -> Checkpoint:
 def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
     """Return the bytes of a checkpoint; equal ones give equal bytes."""
     head = checkpoint.head
-    return seal(_msgpack.packb(_body(checkpoint), default=_packed), Lineage(head.starts, head.density.next_id))
+    return seal(_msgpack.packb(_body(checkpoint), default=_packed), Incarnation(head.starts, head.density.next_id))
 
 
 def state_bytes(checkpoint: Checkpoint) -> bytes:
@@ -154,9 +154,9 @@ def decode_checkpoint(data: bytes) -> Checkpoint:
         raise CheckpointError(str(error)) from error
 
 
-def seal(body: bytes, lineage: Lineage) -> bytes:
+def seal(body: bytes, incarnation: Incarnation) -> bytes:
     """Return a body with the head that names its version, holds the next ids and guards it."""
-    start = _START + _IDS.pack(lineage.starts, lineage.next_id)
+    start = _START + _IDS.pack(incarnation.starts, incarnation.next_id)
     return b"".join((start, _digest(start, body), body))
 
 
@@ -172,7 +172,7 @@ def _open(data: bytes) -> bytes:
     if version != VERSION:
         raise CheckpointError(
             f"version {version}: expected {VERSION}, the only one of this release; start the release that wrote it",
-            Lineage(*(min(one, MAX_COUNT) for one in _IDS.unpack_from(start, len(_START)))),
+            Incarnation(*(min(one, MAX_COUNT) for one in _IDS.unpack_from(start, len(_START)))),
         )
     return body
 

@@ -37,7 +37,7 @@ from optipmb_service.session.values import (
     Begun,
     Counters,
     Deliveries,
-    Lineage,
+    Incarnation,
     Output,
     Policy,
     Quarantined,
@@ -70,7 +70,7 @@ class Session:
         policy: waiting, restarting, going back.
         fused: whether frames are those of several sensors, by the streams of the messages.
         instance: name of the service, for problems.
-        life: ids that an earlier session of the stream used.
+        incarnation: ids that an earlier session of the stream used.
         tracker: makes the tracker; tests put their own here.
         clock: measures how long a step takes, ns.
     """
@@ -83,13 +83,13 @@ class Session:
         *,
         fused: bool = False,
         instance: str = "session",
-        life: Lineage | None = None,
+        incarnation: Incarnation | None = None,
         tracker: Callable[[optipmb.Parameters], Steps] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> None:
-        life = life or Lineage()
+        incarnation = incarnation or Incarnation()
         self.stream = stream
-        self.run = life.run
+        self.run = incarnation.run
         """Number that grows whenever a session of the stream begins or is restored, by whichever process.
 
         A frame that was tracked before a crash may be tracked again after it, with others that were missing then, and
@@ -108,7 +108,8 @@ class Session:
         self._limit_wait(self._policy.cloud_wait_ns)
         limits, transition = self._policy.jump_limits, self._transition(parameters)
         self._timeline: Timeline = FusedTimeline(limits) if fused else StreamTimeline(limits, {"": ()})
-        start = FilterState(transition.no_objects(life.next_id), transition.name(None, life.starts), life.starts)
+        name = transition.name(None, incarnation.starts)
+        start = FilterState(transition.no_objects(incarnation.next_id), name, incarnation.starts)
         self._window = ReorderWindow(start, transition)
         # Recovery: until when it lasts, the stamp and the arrival of the first frame of a fused session that waits for
         # its other sensors, whether frames come faster than time passes, and the first stamp of one restored so early.
@@ -387,7 +388,7 @@ class Session:
 
     @property
     def session(self) -> str:
-        """The id of the present life of the density."""
+        """Id of the present incarnation of the density."""
         return self._window.head.session
 
     @property
@@ -440,10 +441,10 @@ class Session:
         return self._policy.cloud_wait_ns / SECOND
 
     @property
-    def life(self) -> Lineage:
+    def incarnation(self) -> Incarnation:
         """The ids that it used, for a later session of the stream."""
         head = self._window.head
-        return Lineage(head.starts, head.density.next_id, self.run)
+        return Incarnation(head.starts, head.density.next_id, self.run)
 
     def state(self, *, shed: int = 0, queue: int = 0, closed: bool = False) -> schemas.SessionState:
         """Return the state as the message that answers a query.
@@ -535,7 +536,7 @@ class Session:
         self._recovery_ns, self._began, self._backlog, self._young_ns = None, None, False, None
 
     def _is_behind_gap(self, frame_id: FrameId) -> bool:
-        """Whether a frame waits for others that caches may hold: of its sensor, and of those that were live.
+        """Return whether a frame waits for others that caches may hold: of its sensor, and of those that were live.
 
         After a restore the frames between the checkpoint and the crash come from the caches. When a fused session
         begins, the caches come one after the other: until it is known which sensors there are, none goes ahead of the
