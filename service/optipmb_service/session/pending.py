@@ -35,7 +35,7 @@ MAX_HELD: Final = 1024
 Beyond it the oldest goes on without its cloud, and behind a gap.
 """
 
-FRAMES: Final = 20
+CHECKED_FRAMES: Final = 20
 """Frames after which the advance of their stamps is looked at."""
 
 SHORTEST_STEP_NS: Final = SECOND // 1000
@@ -335,17 +335,19 @@ class StampCheck:
         self._count += 1
         first_ns, first_arrived_ns = self._first
         self._constant &= stamp_ns == first_ns
-        if self._count < FRAMES:
+        if self._count < CHECKED_FRAMES:
             return ""
         self._count = 0
         if self._constant:
-            return f"{FRAMES} frames with the stamp {stamp_ns}: the clock does not advance"
+            return f"{CHECKED_FRAMES} frames with the stamp {stamp_ns}: the clock does not advance"
         advance_ns, took_ns = stamp_ns - first_ns, arrived_ns - first_arrived_ns
-        if not 0 < advance_ns < (FRAMES - 1) * SHORTEST_STEP_NS or took_ns < SHORTEST_ARRIVAL_NS:
+        if not 0 < advance_ns < (CHECKED_FRAMES - 1) * SHORTEST_STEP_NS or took_ns < SHORTEST_ARRIVAL_NS:
             return ""
         for unit, factor in UNITS.items():
             if 1 / CERTAIN < advance_ns * factor / took_ns < CERTAIN:
-                return f"{FRAMES} frames in {took_ns / SECOND:.1f} s, {advance_ns} apart: stamps look like {unit}"
+                return (
+                    f"{CHECKED_FRAMES} frames in {took_ns / SECOND:.1f} s, {advance_ns} apart: stamps look like {unit}"
+                )
         return ""
 
 
