@@ -12,8 +12,7 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.transcode import transcode
 from optipmb_service.grpc.selection import Pace, Selection
-from optipmb_service.session.checkpoint import CheckpointError
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint, seal
+from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
 from optipmb_service.session.convert import density_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Lineage, Policy

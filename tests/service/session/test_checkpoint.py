@@ -14,12 +14,13 @@ import optipmb_schemas as schemas
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.session.checkpoint import Checkpoint, CheckpointError
-from optipmb_service.session.checkpoint_codec import (
+from optipmb_service.session.checkpoint import (
     DIGEST,
     HEAD,
     MAGIC,
     VERSION,
+    Checkpoint,
+    CheckpointError,
     decode_checkpoint,
     encode_checkpoint,
     seal,

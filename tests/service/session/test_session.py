@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import sessions
 from optipmb_schemas import PATHS, Detections, decode, encode
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Lineage, Output, Policy, RefusedError
 from router import SECOND, Sensor, plain
