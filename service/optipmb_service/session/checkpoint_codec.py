@@ -16,7 +16,7 @@ import struct
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-import msgpack
+import msgspec
 import optipmb_schemas as schemas
 
 import optipmb
@@ -26,8 +26,7 @@ from optipmb_service.session.values import MAX_COUNT, Deliveries, Lineage
 
 if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
-    from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, Recorded, SensorState
-    from optipmb_service.session.timeline import Cursor
+    from optipmb_service.session.state import FilterState, Recorded
 
 VERSION: Final = 1
 MAGIC: Final = b"OPTIPMB\0"
@@ -41,7 +40,8 @@ MAX_BYTES: Final = 2**28
 MAX_PROFILES: Final = 64
 """Profiles whose form in checkpoints is remembered."""
 
-_msgpack: Any = msgpack  # its type information is partial
+_encode: Final = msgspec.msgpack.Encoder(order="deterministic").encode
+"""Writes records by their fields, maps and sets in the order of their keys."""
 _profiles: dict[int, tuple[optipmb.Parameters, bytes]] = {}
 """The profiles that were written last, by their ids."""
 
@@ -49,7 +49,7 @@ _profiles: dict[int, tuple[optipmb.Parameters, bytes]] = {}
 def encode_checkpoint(checkpoint: Checkpoint) -> bytes:
     """Return the bytes of a checkpoint; equal ones give equal bytes."""
     head = checkpoint.head
-    return seal(_msgpack.packb(_body(checkpoint)), Lineage(head.starts, head.density.next_id))
+    return seal(_encode(_body(checkpoint)), Lineage(head.starts, head.density.next_id))
 
 
 def state_bytes(checkpoint: Checkpoint) -> bytes:
@@ -116,10 +116,10 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
         "parameters": _packed_profile(checkpoint.parameters),
         "fused": checkpoint.fused,
         "cloud_wait_ns": checkpoint.cloud_wait_ns,
-        "quarantine": dict(sorted(checkpoint.quarantine.items())),
+        "quarantine": checkpoint.quarantine,
         "epochs": {
             name: [(seen.epoch, seen.highest, _mask(seen.mask)) for seen in epochs]
-            for name, epochs in sorted(checkpoint.seen.items())
+            for name, epochs in checkpoint.seen.items()
         },
         "base": _state(checkpoint.base),
         "window": [
@@ -133,8 +133,8 @@ def _body(checkpoint: Checkpoint) -> dict[str, Any]:
         ],
         # Without a window the present is its beginning.
         "head": _state(checkpoint.head) if checkpoint.window else None,
-        "deliveries": _table(checkpoint.deliveries),
-        "newest_cloud_ns": dict(sorted(checkpoint.newest_cloud_ns.items())),
+        "deliveries": checkpoint.deliveries,
+        "newest_cloud_ns": checkpoint.newest_cloud_ns,
         "run": checkpoint.run,
     }
 
@@ -145,12 +145,8 @@ def _packed_profile(parameters: optipmb.Parameters) -> bytes:
     if known is None or known[0] is not parameters:
         if len(_profiles) >= MAX_PROFILES:
             _profiles.clear()
-        known = _profiles[id(parameters)] = parameters, _msgpack.packb(parameters.model_dump(mode="json"))
+        known = _profiles[id(parameters)] = parameters, msgspec.msgpack.encode(parameters.model_dump(mode="json"))
     return known[1]
-
-
-def _table(values: Cursor | FrameCounts | PoseHistory | Deliveries) -> dict[str, Any]:
-    return {name: getattr(values, name) for name in values.__match_args__}
 
 
 def _packed_cloud(one: Recorded) -> bytes | None:
@@ -174,15 +170,6 @@ def _state(state: FilterState) -> dict[str, Any]:
         "generation": state.generation,
         "last": state.last,
         "tracks": state.tracks,
-        "counts": _table(state.counts),
-        "sensors": {name: _sensor(one) for name, one in sorted(state.sensors.items())},
-    }
-
-
-def _sensor(one: SensorState) -> dict[str, Any]:
-    return {
-        "cursor": _table(one.cursor),
-        "tracked": one.tracked,
-        "reported": sorted(one.reported),
-        "pose_history": _table(one.pose_history),
+        "counts": state.counts,
+        "sensors": state.sensors,
     }
