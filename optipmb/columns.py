@@ -5,12 +5,27 @@ Names are `bernoulli.mean`, `poisson.weight` and so on; the two scalars of a den
 
 from __future__ import annotations
 
+from math import prod
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.density import NO_FRAME, Bernoullis, Density, Misses, Poissons, components_in, objects_in
+from optipmb.density import (
+    BINS,
+    COUNTS,
+    NO_BIN,
+    NO_FRAME,
+    SLOT,
+    SLOTS,
+    Bernoullis,
+    Density,
+    Misses,
+    Poissons,
+    SelfCalibration,
+    components_in,
+    objects_in,
+)
 from optipmb.errors import DensityError
 from optipmb.rows import Rows, shown
 
@@ -23,6 +38,12 @@ if TYPE_CHECKING:
 
 CLASSES: Final = "classes.probability"
 """Name of `Density.class_probability` among the columns."""
+
+COUNTED: Final = "calibration"
+"""Part of the names of `Density.self_calibration` among the columns."""
+
+MOST_COUNTED: Final = 1e9
+"""Bound of the counts of scores; those of the tracker are far below."""
 
 ROUNDING: Final = 1e-6
 """By how much the sum of probabilities may differ from 1."""
@@ -40,6 +61,12 @@ def fitting(density: Density, classes: int) -> bool:
         return False
     if misses is not None and len(misses) != len(objects):
         return False
+    own = density.self_calibration
+    if own is not None:
+        for name, (shape, kind) in _shapes(classes, len(objects), len(density.poisson)).items():
+            column = getattr(own, name)
+            if not isinstance(column, np.ndarray) or column.shape != shape or column.dtype != kind:
+                return False
     return bool(labels_within(objects.words, density.poisson.words, classes))
 
 
@@ -77,7 +104,18 @@ def columns_of(density: Density) -> dict[str, NDArray[Any]]:
     columns: dict[str, NDArray[Any]] = {
         f"{part}.{name}": column for part, rows in parts for name, column in rows.columns()
     }
+    if density.self_calibration is not None:
+        columns |= {f"{COUNTED}.{name}": getattr(density.self_calibration, name) for name in _shapes(0, 0, 0)}
     return columns if density.class_probability is None else columns | {CLASSES: density.class_probability}
+
+
+def _shapes(classes: int, objects: int, components: int) -> dict[str, tuple[tuple[int, ...], Any]]:
+    """Return shape and type of the arrays of `SelfCalibration`."""
+    return {
+        "classes": ((classes, COUNTS, BINS), np.float64),
+        "objects": ((objects, SLOTS, SLOT), np.float64),
+        "components": ((components,), np.int64),
+    }
 
 
 def bytes_of(density: Density) -> dict[str, bytes]:
@@ -91,6 +129,10 @@ def bytes_of(density: Density) -> dict[str, bytes]:
         parts["misses"] = density.misses.words
     if density.class_probability is not None:
         parts["classes"] = density.class_probability
+    if density.self_calibration is not None:
+        parts |= {
+            f"{COUNTED}.{name}": getattr(density.self_calibration, name).view(np.float64) for name in _shapes(0, 0, 0)
+        }
     return {part: words.astype("<f8", copy=False).tobytes() for part, words in parts.items()}
 
 
@@ -98,7 +140,7 @@ def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[An
     """Return the named arrays that bytes hold: what `columns_of` gives for the density of which `bytes_of` made them.
 
     Args:
-        parts: `bernoulli` and `poisson`, and `misses` and `classes` where the density has them.
+        parts: `bernoulli` and `poisson`; `misses`, `classes` and those of `COUNTED` where the density has them.
         classes: of the parameters that the density belongs to.
 
     Raises:
@@ -115,6 +157,10 @@ def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[An
                     raise DensityError(f"{kind.part}.{name}", "flags, 0 or 1", "another number")
     if "classes" in parts:
         columns[CLASSES] = _words(parts, "classes", classes).reshape(-1, classes)
+    if f"{COUNTED}.classes" in parts:
+        for name, (shape, kind) in _shapes(0, 0, 0).items():
+            words = _words(parts, f"{COUNTED}.{name}", prod(shape[1:]))
+            columns[f"{COUNTED}.{name}"] = words.view(kind).reshape(-1, *shape[1:])
     return columns
 
 
@@ -179,7 +225,24 @@ def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: 
                 text = f"a stamp from seen_ns, {bernoulli.seen_ns[row]}, to {stamp_ns}"
                 raise DensityError(f"misses.{name}[{row}]", text, str(since[row]))
     pi = _class_probability(columns[CLASSES], len(bernoulli), len(labels)) if CLASSES in columns else None
-    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses, pi)
+    own = None
+    if f"{COUNTED}.classes" in columns:
+        own = _self_calibration(columns, _shapes(len(labels), len(bernoulli), len(poisson)))
+    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses, pi, own)
+
+
+def _self_calibration(columns: Mapping[str, Any], shapes: Mapping[str, tuple[tuple[int, ...], Any]]) -> SelfCalibration:
+    """Return the counts of scores, none of which is negative or above `MOST_COUNTED`."""
+    found = {}
+    for name, (shape, kind) in shapes.items():
+        column, path = columns.get(f"{COUNTED}.{name}"), f"{COUNTED}.{name}"
+        if not isinstance(column, np.ndarray) or column.dtype != kind or column.shape != shape:
+            raise DensityError(path, f"{shape} {kind.__name__}", shown(column))
+        low, high = (NO_BIN, BINS - 1) if kind is np.int64 else (0, MOST_COUNTED)
+        if column.size and not low <= column.min() <= column.max() <= high:
+            raise DensityError(path, f"numbers from {low} to {high:g}", f"{column.min():g} to {column.max():g}")
+        found[name] = np.array(column, order="C")
+    return SelfCalibration(**found)
 
 
 def _class_probability(column: Any, count: int, classes: int) -> NDArray[np.float64]:

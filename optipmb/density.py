@@ -173,6 +173,41 @@ def components_in(words: Array) -> Poissons:
     return columns
 
 
+BINS: Final = 26
+COUNTS: Final = 5
+SLOTS: Final = 3
+SLOT: Final = BINS + 2
+"""Shapes of `SelfCalibration`; a slot has looks and seconds behind the bins."""
+NO_BIN: Final = -1
+
+
+@record
+class SelfCalibration:
+    """Counts of the detections of a stream by score.
+
+    Attributes:
+        classes: (C, `COUNTS`, `BINS`) of the classes.
+        objects: (N, `SLOTS`, `SLOT`) of each detected object: detections by bin, looks and seconds of its slots, the
+            oldest first.
+        components: (J,) int64 bin of the detection of each Poisson component, `NO_BIN` where it is not known.
+    """
+
+    classes: Array
+    objects: Array
+    components: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, density: Density) -> SelfCalibration:
+        """Return the counts of a density; without any, those before the first frame."""
+        if density.self_calibration is not None:
+            return density.self_calibration
+        return cls(
+            np.zeros((len(density.labels), COUNTS, BINS)),
+            np.zeros((len(density.bernoulli), SLOTS, SLOT)),
+            np.full(len(density.poisson), NO_BIN, np.int64),
+        )
+
+
 @record
 class Density:
     """The whole state of a session between two frames.
@@ -186,6 +221,7 @@ class Density:
         misses: of the detected objects; None while no frame has had a field of view: every frame looks at all of them.
         class_probability: (N, C) posterior of each detected object over the classes (`optipmb.class_posterior`); None
             where the profile has no groups.
+        self_calibration: counts of scores; None where the profile does not calibrate them itself.
     """
 
     stamp_ns: int
@@ -195,6 +231,7 @@ class Density:
     labels: tuple[str, ...]
     misses: Misses | None = None
     class_probability: NDArray[np.float64] | None = None
+    self_calibration: SelfCalibration | None = None
 
     @property
     def missed_from_ns(self) -> NDArray[np.int64]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 LEAST_SHARE: Final = 0.02
-"""Least share of the nominal period that a look counts for."""
+"""Least share of the time that p_d holds for that a look counts for."""
 
 
 def detection_probability(
@@ -55,16 +55,16 @@ def detection_probability(
 
 
 def over_time(p_d: Array, share: float | Array) -> Array:
-    """Return the probability of a detection within a share of the nominal period, ``1 - (1 - p_d)^share``.
+    """Return the probability of a detection within a share of the time that p_d holds for, ``1 - (1 - p_d)^share``.
 
     A detector that looks twice as often does not see twice as much: what hides an object hides it in the next look as
-    well. So p_d holds per nominal period, and a miss weighs by the time that it lasts. Looks farther apart than a
-    period are independent: the share is at most one. It is at least `LEAST_SHARE`, so that frames of equal stamps can
+    well. So p_d holds for `detection_time`, and a miss weighs by the time that it lasts. Looks farther apart are
+    independent: the share is at most one. It is at least `LEAST_SHARE`, so that frames of equal stamps can
     be associated.
 
     Args:
         p_d: (N,) probabilities.
-        share: of the nominal period, one for all or (N,).
+        share: of that time, one for all or (N,).
     """
     kept: Array
     if isinstance(share, np.ndarray):

@@ -241,12 +241,12 @@ def detection_probability_in_view(p_d: Array, looks: Looks, share: float, table:
     Args:
         p_d: (N + J,) as if all were in view.
         looks: what is.
-        share: of the nominal period, for the components.
+        share: of the time that p_d holds for, for the components.
         table: parameters as columns.
     """
     count = len(looks.misses)
     shares = np.full(len(p_d), share)
-    shares[:count] = looks.time / table.period if table.detection_over_time else 1.0
+    shares[:count] = looks.time / table.detection_time if table.detection_time > 0.0 else 1.0
     return over_time(p_d * np.concatenate((looks.in_view, looks.poisson_in_view)), shares)
 
 

@@ -7,81 +7,79 @@ silenced; existence probabilities are not calibrated.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Final
-
-import numpy as np
 
 from optipmb.class_names import common_name
 from optipmb.parameters import parse_parameters
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from numpy.typing import ArrayLike
+    from collections.abc import Iterable
 
     from optipmb.parameters import Parameters
 
 OTHER: Final = "other"
-REACH: Final = (  # gate: metres at once, and metres per second of the period
+REACH: Final = (  # the gate, m, and the standard deviation of an unknown speed, m/s, of which it holds GATE_DEVIATIONS
     ("car", (3.0, 12.0)), ("truck", (4.0, 12.0)), ("bus", (4.0, 12.0)), ("trailer", (4.0, 12.0)),
-    ("pedestrian", (1.8, 0.4)), ("bicycle", (2.5, 3.0)), ("motorcycle", (2.5, 8.0)), (OTHER, (2.5, 6.0)),
+    ("pedestrian", (1.8, 2.0)), ("bicycle", (2.5, 5.0)), ("motorcycle", (2.5, 12.0)), (OTHER, (2.5, 10.0)),
 )  # fmt: skip
+GATE_DEVIATIONS: Final = 2.75
 SIZED: Final = frozenset({"truck", "bus", "trailer"})
 AGILE: Final = frozenset({"pedestrian"})
 TWO_WHEELED: Final = frozenset({"bicycle", "motorcycle"})
 
 REMEMBERED_S: Final = 2.0
 """How long an object is kept without a detection."""
+DETECTION_S: Final = 0.5
+"""Time that the detection probability holds for: what hides an object hides it about so long."""
 SHOWN_S: Final = 0.4
 """How long a track is shown without a detection; two frames at least."""
-LEAVING_RATE: Final = 0.02
-"""Share of the objects that leave in a second."""
-BIRTH_QUANTILE: Final = 0.5
-BIRTH_SCORE: Final = (0.2, 0.6)
-"""Least and greatest score from which an unused detection starts a track at once."""
-USUAL_SCORE: Final = 0.5
+EVIDENCE: Final = tuple(round(-3.0 + 0.5 * k, 1) for k in range(13))
+EXISTENCE: Final = tuple(round(1.0 / (1.0 + math.exp(0.56 - 1.82 * e)), 3) for e in EVIDENCE)
+MEMORY: Final = 0.8
+"""Weight that the evidence keeps over a tenth of a second."""
 
 
-def generic_parameters(
-    labels: Iterable[str], period: float, scores: Mapping[str, ArrayLike] | None = None, *, name: str = "auto"
-) -> Parameters:
+def generic_parameters(labels: Iterable[str], period: float, *, name: str = "auto") -> Parameters:
     """Return parameters for classes, by what their names mean (`optipmb.class_names`).
 
     Args:
         labels: names of the classes; what their names do not tell is taken for objects of middling size and speed.
         period: seconds between frames.
-        scores: of some detections, by class.
         name: of the profile.
 
     Raises:
         ParameterError: no label, a name that is none, or a period that is not positive.
     """
-    classes = {label: _of_class(common_name(label) or OTHER, period, _birth_score(label, scores)) for label in labels}
+    classes = {label: _of_class(common_name(label) or OTHER, period) for label in labels}
     kinds = ", ".join(f"{label} as {common_name(label) or OTHER}" for label in classes)
     provenance = f"For a detector that nobody tuned: {1.0 / period if period > 0.0 else 0.0:.3g} Hz; {kinds}."
     return parse_parameters(
-        {"name": name, "nominal_period": period, "provenance": provenance[:10_000], "classes": classes}
+        {
+            "name": name,
+            "nominal_period": period,
+            "detection_time": DETECTION_S,
+            "self_calibration": True,
+            "provenance": provenance[:10_000],
+            "classes": classes,
+        }
     )
 
 
-def _birth_score(label: str, scores: Mapping[str, ArrayLike] | None) -> float:
-    values = np.asarray(scores[label], dtype=np.float64) if scores and label in scores else np.empty(0)
-    usual = float(np.quantile(values, BIRTH_QUANTILE)) if len(values) else USUAL_SCORE
-    return round(float(np.clip(usual, *BIRTH_SCORE)), 3)
-
-
-def _of_class(kind: str, period: float, birth_score: float) -> dict[str, Any]:
-    still, moving = dict(REACH)[kind]
+def _of_class(kind: str, period: float) -> dict[str, Any]:
+    gate, unknown_speed = dict(REACH)[kind]
     agile, two_wheeled, sized = kind in AGILE, kind in TWO_WHEELED, kind in SIZED
     return {
-        "score_filter": round(0.3 * birth_score, 3),
+        "score_filter": 0.05,
+        "announce_score": 0.15,
+        "birth_score": 0.5,
         "nms_iou": 0.1,
-        "survival": max(0.5, 1.0 - LEAVING_RATE * period),
-        "gate": round(still + moving * period, 3),
+        "survival": 1.0,
+        "gate": gate,
+        "gate_deviations": GATE_DEVIATIONS,
         "detection": 0.8,
         "expected_points": 10.0,
         "detection_floor": 0.6,
-        "birth_score": birth_score,
         "adaptive_birth_rate": 0.2,
         "undetected_birth_rate": 0.5,
         "clutter_rate": 2.0,
@@ -91,7 +89,7 @@ def _of_class(kind: str, period: float, birth_score: float) -> dict[str, Any]:
         "extract_known": 0.8,
         "extract_misses": max(2, round(SHOWN_S / period)),
         "max_misses": max(4, round(REMEMBERED_S / period)),
-        "min_existence": 0.01,
+        "min_existence": 1e-4,  # objects are kept for their time, not for their misses
         "heading_sign": {  # vehicles reverse at up to 4 m/s
             "memory": 0.9,
             "detection": 1.0,
@@ -99,11 +97,26 @@ def _of_class(kind: str, period: float, birth_score: float) -> dict[str, Any]:
             "speed": 1.0 if agile or two_wheeled else 4.0,
         },
         "birth_heading_speed": 1.0,
+        "birth_over_clutter": True,  # a wide gate holds components that are of other objects
+        "birth_overlap": 0.1,
+        "motion": "cv" if agile else "ctra",
+        "acceleration_time": None if agile else 1.0 if two_wheeled else 3.0,
+        "confirm_from": 0.5,
+        "confirm_until": 0.3,
+        "calibration": {
+            "memory": round(MEMORY ** (10.0 * period), 4),
+            "missed": 1.0,
+            "evidence": EVIDENCE,
+            "existence": EXISTENCE,
+            "along": [0.15] * len(EVIDENCE),
+            "across": [0.1] * len(EVIDENCE),
+        },
+        "reported_noise": {"position": 0.06, "heading": 0.1 if agile else 0.06},
         "process_noise": {
             "position": 0.1,
             "speed": 0.8 if agile else 1.0,
             "heading": 0.6 if agile else 0.2 if two_wheeled else 0.08,
-            "turn_rate": 0.4 if agile or two_wheeled else 0.3,
+            "turn_rate": 0.4 if agile or two_wheeled else 0.15,
             "acceleration": 0.5 if agile else 1.5,
         },
         "measurement_noise": {
@@ -114,7 +127,7 @@ def _of_class(kind: str, period: float, birth_score: float) -> dict[str, Any]:
         "birth": {
             "position": 0.5,
             "speed": 1.0 if agile else 3.0,
-            "unknown_speed": 2.0 if agile else 5.0 if two_wheeled else 8.0,
+            "unknown_speed": unknown_speed,
             "heading": 0.8 if agile else 0.4,
             "turn_rate": 0.3,
             "acceleration": 0.5 if agile else 1.0,

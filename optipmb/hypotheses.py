@@ -184,13 +184,16 @@ def first_detections(
     lambda_c``, announces nothing: the measurement is newborn, and not lost between a component that it does not fit
     and a birth that the component forbids.
 
+    A score below `announce_score` is clutter, with components or without.
+
     Args:
         measurement: (L,) measurement of each announced pair.
         log_e: (L,) ln e^j.
         score: (M,) z_s.
         association: (M,) p_a.
         label: (M,) z_c.
-        classes: (C,) parameters: lambda_c, mu_b0 / A, eta_score and `birth_over_clutter`.
+        classes: (C,) parameters: lambda_c, mu_b0 / A, eta_score, `announce_score` and
+            `birth_over_clutter`.
 
     Returns:
         (M,) `FROM_POISSON`, `CLUTTER` or `NEWBORN`, (M,) w and (M,) r.
@@ -207,6 +210,8 @@ def first_detections(
     for m in range(n_measurements):
         own = classes[label[m]]
         clutter = own.clutter_intensity
+        if score[m] < own.announce_score:
+            kind[m] = CLUTTER
         shadowed = own.birth_over_clutter and score[m] >= own.birth_score and log_sum[m] < math.log(clutter)
         if kind[m] == FROM_POISSON and not shadowed:
             ratio = math.exp(min(log_sum[m] - math.log(clutter), 700.0))  # e / lambda_c

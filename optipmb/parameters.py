@@ -195,8 +195,9 @@ class ClassParameters(_Table):
     detection: OpenProbability = Field(description="p_d0: baseline detection probability")
     expected_points: Positive = Field(description="PTS_0: number of LiDAR points in the box of an object in full view")
     detection_floor: NonZeroProbability = Field(description="s_d: what is left of p_d0 without points")
-    birth_score: Probability = Field(
-        description="eta_score: unused detections from this score on start a track at once"
+    birth_score: Probability = Field(description="eta_score: unused detections from this score on start a track")
+    announce_score: Probability = Field(
+        default=0.0, exclude_if=not_, description="lower scores continue tracks and announce none; the paper: 0"
     )
     adaptive_birth_rate: Positive = Field(description="mu_ab: Poisson weight of a low-scored detection")
     baseline_birth_rate: Positive = Field(
@@ -206,16 +207,10 @@ class ClassParameters(_Table):
     clutter_rate: Positive = Field(description="mu_c: expected false detections in a frame")
     area: Positive = Field(description="A: area of the region of observation, m^2")
     poisson_steps: Periods = Field(description="eta_step: nominal periods a Poisson component survives")
-    extract_new: Probability = Field(
-        description="eta_ext1: existence from which a track is extracted for the first time"
-    )
+    extract_new: Probability = Field(description="eta_ext1: existence from which a track is extracted first")
     extract_known: Probability = Field(description="eta_ext2: existence from which a known track is extracted again")
-    extract_misses: Periods = Field(
-        description="eta_cnt: missed nominal periods from which a known track is no longer extracted"
-    )
-    max_misses: Periods = Field(
-        description="missed nominal periods after which a Bernoulli is removed; with p_s = 1 nothing else does"
-    )
+    extract_misses: Periods = Field(description="eta_cnt: missed periods from which a known track is not extracted")
+    max_misses: Periods = Field(description="missed periods after which a Bernoulli is removed; the paper: never")
     min_existence: OpenProbability = Field(description="existence probability below which a Bernoulli is removed")
     birth_heading_speed: NonNegative = Field(
         default=0.0,
@@ -299,10 +294,13 @@ class Parameters(_Table):
     nominal_period: Positive = Field(
         description="seconds between frames for which p_s and the counted limits hold; with another dt they are scaled"
     )
-    detection_over_time: bool = Field(
-        default=False,
-        description="true: p_d holds per nominal period, and a miss weighs by its time where frames come faster; "
-        "false: per frame (the paper)",
+    detection_time: NonNegative = Field(
+        default=0.0,
+        description="time, s, that p_d holds for: a miss weighs by its share of it where frames come faster; 0: p_d "
+        "holds per frame (the paper)",
+    )
+    self_calibration: bool = Field(
+        default=False, exclude_if=not_, description="true: scores are calibrated by `optipmb.self_calibration`"
     )
     horizons: Annotated[tuple[float, ...], AfterValidator(_ascending)] = Field(
         default=(),

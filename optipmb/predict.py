@@ -62,7 +62,8 @@ def predict(density: Density, stamp_ns: int, table: ClassTable) -> tuple[Density
     """
     misses, before_ns = density.misses, density.stamp_ns
     dt = 0.0 if before_ns == NO_FRAME else (stamp_ns - before_ns) * 1e-9
-    if dt == 0.0 or misses is not None or len(table.confusion):
+    own = density.self_calibration
+    if dt == 0.0 or misses is not None or len(table.confusion) or own is not None:
         check_fitting(density, density.labels)
     if dt == 0.0:
         pi = predict_classes(density, None, dt, table)

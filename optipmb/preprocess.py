@@ -54,13 +54,16 @@ class Measurements(NamedTuple):
     source: Index
 
 
-def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[Measurements, int, int]:
+def preprocess(
+    frame: Frame, table: ClassTable, most: int = UNLIMITED, score: Array | None = None
+) -> tuple[Measurements, Index, int, int]:
     """Remove detections scored below eta_sf, then those that overlap a better one by more than eta_iou.
 
     They are compared with detections of their class, and with those of the other classes of its group, if it has one.
+    `score` (M,) stands for the scores of the frame.
 
     Returns:
-        The measurements, the number below the score filter and the number suppressed.
+        The measurements, their rows in the frame, the number below the score filter and the number suppressed.
 
     Raises:
         EffortError: more than `most` pairs of detections may overlap.
@@ -71,7 +74,7 @@ def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[
         frame.size,
         frame.yaw,
         frame.velocity,
-        frame.score,
+        frame.score if score is None else score,
         frame.label,
         frame.source,
         PLAIN if own_noise is None else PLAIN + 3,
@@ -84,7 +87,7 @@ def preprocess(frame: Frame, table: ClassTable, most: int = UNLIMITED) -> tuple[
     if own_noise is not None:
         covariance, variance = own_noise[chosen], table["noise_position"][measurements.label, None] ** 2
         measurements.position[:, PLAIN:] = np.where(np.isnan(covariance), (1.0, 0.0, 1.0), covariance / variance)
-    return measurements, frame.score.shape[0] - above, above - chosen.shape[0]
+    return measurements, chosen, frame.score.shape[0] - above, above - chosen.shape[0]
 
 
 @kernel

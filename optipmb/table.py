@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -64,6 +64,7 @@ class ClassRow(Protocol):
     expected_points: float
     detection_floor: float
     ground_clearance: float
+    announce_score: float
     birth_score: float
     birth_over_clutter: bool
     birth_overlap: float
@@ -129,18 +130,23 @@ class ClassTable:
     Attributes:
         classes: (C,) array of `CLASS`, for kernels; `table["gate"]` is a column of it.
         period: nominal period, s.
-        detection_over_time: whether p_d holds per nominal period (`optipmb.detection_probability.over_time`).
+        detection_time: s that p_d holds for, zero per frame (`optipmb.detection_probability.over_time`).
         confusion: (C, C) Lambda of `optipmb.class_posterior`; (0, 0) where no two classes have a group in common.
     """
 
     classes: Sequence[ClassRow]
     period: float
-    detection_over_time: bool
+    detection_time: float
     confusion: NDArray[np.float64]
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         column: NDArray[Any] = np.asarray(self.classes)[name]
         return column
+
+    def copy(self) -> ClassTable:
+        """Return a table whose classes may be written."""
+        classes: Any = np.array(self.classes)
+        return replace(self, classes=classes)
 
     @classmethod
     def of(cls, parameters: Parameters) -> ClassTable:
@@ -153,7 +159,7 @@ class ClassTable:
             for name, value in (_values(p) | shared).items():
                 classes[name][c] = value
         confusion = _confusion(classes, np.array([p.class_confusion for p in rows]))
-        return cls(classes, parameters.nominal_period, parameters.detection_over_time, confusion)
+        return cls(classes, parameters.nominal_period, parameters.detection_time, confusion)
 
 
 def _confusion(classes: Any, kappa: NDArray[np.float64]) -> NDArray[np.float64]:

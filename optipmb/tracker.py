@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +18,7 @@ from optipmb.density import (
     Bernoullis,
     Density,
     Poissons,
+    SelfCalibration,
     components_in,
     misses_counted_from,
     objects_in,
@@ -33,7 +34,8 @@ from optipmb.paths import paths_of
 from optipmb.predict import predict
 from optipmb.preprocess import Measurements, preprocess
 from optipmb.prune import Survivors, surviving_objects
-from optipmb.records import record
+from optipmb.records import read_only, record
+from optipmb.self_calibration import calibrate, followed
 from optipmb.table import ClassTable
 from optipmb.undetected import update_undetected, with_measurement_births
 from optipmb.update import ukf_updates
@@ -73,7 +75,7 @@ def update(
     period: float,
     confusion: Array,
     classes: Sequence[ClassRow],
-) -> tuple[Array, Array, Array, Index, Index, int, int, int]:
+) -> tuple[Array, Array, Array, Index, Index, Index, int, int, int]:
     """Update the prediction with the measurements: the PMB update of Algorithm 1.
 
     Args:
@@ -96,8 +98,8 @@ def update(
         classes: (C,) parameters.
 
     Returns:
-        The array of the objects, their class posteriors and the array of the Poisson components; the other fields of
-        `Survivors`; how many covariances had to be repaired.
+        The array of the objects, their class posteriors, the array of the Poisson components and their fates; the other
+        fields of `Survivors`; how many covariances had to be repaired.
     """
     z = Measurements(*measurements)
     objects, components = objects_in(object_words), components_in(component_words)
@@ -129,10 +131,10 @@ def update(
     light_weight_filter(kept, label, posterior, objects, next_id, z, stamp_ns, before_ns, period, classes)
 
     # Undetected objects: PPP update, RPP, and the births of HABM
-    undetected = update_undetected(
+    undetected, fate = update_undetected(
         components, p_d_poisson, n_predicted, hypotheses, z, stamp_ns, period, classes, adaptive
     )
-    return words, class_probability, undetected, kept.row, kept.measurement, known, kept.detected, repaired
+    return words, class_probability, undetected, fate, kept.row, kept.measurement, known, kept.detected, repaired
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,7 +268,11 @@ class Tracker:
         bernoulli, poisson = predicted.bernoulli, predicted.poisson
 
         # Measurements, and the detection probabilities p_d(x_+) of what is in view
-        measurements, below_score, suppressed = preprocess(frame, table, self._max_pairs)
+        own, score = None, frame.score
+        if self.parameters.self_calibration:
+            own, table = SelfCalibration.of(density), table.copy()
+            score = read_only(calibrate(own.classes, score, frame.label, table.classes))
+        measurements, chosen, below_score, suppressed = preprocess(frame, table, self._max_pairs, score)
         check_effort(bernoulli, poisson, measurements, dt, table, self._max_pairs)
         if not modules.habm:
             poisson = with_measurement_births(poisson, measurements, now, table)
@@ -278,7 +284,7 @@ class Tracker:
         # PMB update: hypotheses, association, states, births
         missed_from_ns = predicted.missed_from_ns if looks is None else looks.misses.missed_from_ns
         pi = predicted.class_probability
-        words, class_probability, undetected, row, hits, known, detected, repaired_now = update(
+        words, class_probability, undetected, fate, row, hits, known, detected, repaired_now = update(
             bernoulli.words,
             UNGROUPED if pi is None else pi,
             p_d,
@@ -304,6 +310,11 @@ class Tracker:
         poisson = Poissons.of(undetected) if modules.rpp else Poissons.empty()
         pi = None if pi is None else class_probability
         posterior = Density(now, predicted.next_id + born, objects, poisson, density.labels, misses, pi)
+        if own is not None:
+            objects.score[hits >= 0] *= (frame.score / score)[chosen[hits[hits >= 0]]]
+            given = frame.score, frame.label, chosen
+            own = followed(own, density, predicted, posterior, hits, fate, *given, table)
+            posterior = replace(posterior, self_calibration=own)
 
         # Track extraction
         tracks = extract(objects, posterior.missed_from_ns, hits, measurements, now, table, two_thresholds=modules.ote)
@@ -337,7 +348,7 @@ class Tracker:
 
         Without a cloud and a field of view it is that of the class: then of each class.
         """
-        share = dt / self._table.period if self._table.detection_over_time else 1.0
+        share = dt / self._table.detection_time if self._table.detection_time > 0.0 else 1.0
         if cloud is None and looks is None:
             return over_time(self._detection, share)
         p_d = detection_probability(

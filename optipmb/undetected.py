@@ -6,7 +6,7 @@ frames may find (hybrid adaptive birth model, HABM, Section IV.G).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
 
+AGED: Final = -1
+MARKED: Final = -2
+"""Fate of a Poisson component that goes: too old, or part of a first-time detection."""
+
 
 @kernel
 def update_undetected(
@@ -39,8 +43,11 @@ def update_undetected(
     period: float,
     classes: Sequence[ClassRow],
     adaptive: bool,
-) -> Array:
-    """Return the array of the Poisson components that stay under RPP, and of lambda_b.
+) -> tuple[Array, Index]:
+    """Return the array of the Poisson components that stay under RPP, and of lambda_b; and the fate of each, (J + M,).
+
+    The fate of a component, and behind them of a measurement, is its row in the array; `AGED` or `MARKED` where a
+    component goes, `AGED` where a measurement makes none.
 
     Components that took part in any first-time detection hypothesis are marked and go, so that they cannot start a
     second track; the others go after eta_step nominal periods.
@@ -64,24 +71,29 @@ def update_undetected(
         classes: (C,) parameters.
         adaptive: whether HABM is on; off: nothing is born here.
     """
-    marked = np.zeros(p_d.shape[0], np.bool_)
-    for j in hypotheses.component:
-        marked[j] = j < n_predicted
     capacity = p_d.shape[0] + measurements.score.shape[0]
+    fate = np.full(capacity, AGED, np.int64)
+    for k in range(hypotheses.component.shape[0]):
+        j, m = hypotheses.component[k], hypotheses.announced[k]
+        if j < n_predicted and measurements.score[m] >= classes[measurements.label[m]].announce_score:
+            fate[j] = MARKED
     chosen, weight = np.empty(capacity, np.int64), np.empty(capacity)
     old = 0
     for j in range(p_d.shape[0]):
         steps = whole_periods(components.born_ns[j], stamp_ns, period)
-        if not marked[j] and steps <= classes[components.label[j]].poisson_steps:
-            chosen[old], weight[old] = j, components.weight[j] * (1.0 - p_d[j])
+        if fate[j] != MARKED and steps <= classes[components.label[j]].poisson_steps:
+            chosen[old], weight[old], fate[j] = j, components.weight[j] * (1.0 - p_d[j]), old
             old += 1
     count = old
     for m in range(measurements.score.shape[0]):
-        born = classes[measurements.label[m]].adaptive_birth_rate * (1.0 - hypotheses.association[m])
-        if adaptive and hypotheses.first_kind[m] == CLUTTER and born > 0.0:
-            chosen[count], weight[count] = m, born
+        own = classes[measurements.label[m]]
+        born = own.adaptive_birth_rate * (1.0 - hypotheses.association[m])
+        low = measurements.score[m] < own.announce_score
+        if adaptive and hypotheses.first_kind[m] == CLUTTER and born > 0.0 and not low:
+            chosen[count], weight[count], fate[p_d.shape[0] + m] = m, born, count
             count += 1
-    return with_births(components, chosen[:old], chosen[old:count], weight[:count], measurements, stamp_ns, classes)
+    kept, born_of = chosen[:old], chosen[old:count]
+    return with_births(components, kept, born_of, weight[:count], measurements, stamp_ns, classes), fate
 
 
 @kernel

@@ -60,7 +60,7 @@ def warm_up() -> int:
 
 def _run() -> None:
     curve = dict.fromkeys(("evidence", "existence", "along", "across"), (0.1, 0.9))
-    document = load_profile("nuscenes").model_dump()
+    document = load_profile("nuscenes").model_dump() | {"self_calibration": True}
     document["classes"]["pedestrian"] |= {
         "score_filter": 0.1,
         "birth_score": 0.5,

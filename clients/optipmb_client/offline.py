@@ -60,7 +60,7 @@ __all__ = [
 ]
 
 AUTO: Final = "auto"
-"""Name of the profile that is made for the data: rate, classes and scores as they come."""
+"""Name of the profile that is made for the data: rate and classes as they come."""
 USUAL_PERIOD: Final = 0.1
 FAR: Final = 1.6
 """A rate so many times that of the profile, or a part of it, is far from it."""
@@ -191,13 +191,8 @@ def _period(sequences: Sequence[DataSequence], frames: int) -> float | None:
 
 def _made_for(sequences: Sequence[DataSequence]) -> Parameters:
     labels = _labels(sequences)
-    scores: dict[str, list[float]] = {label: [] for label in labels}
-    for one in sequences[:LOOKED_AT]:
-        for frame in itertools.islice(one.frames(), LOOKED_INTO):
-            for label, score in zip(frame.label.tolist(), frame.score.tolist(), strict=True):
-                scores[frame.labels[label]].append(score)
     try:
-        return generic_parameters(labels or ("object",), _period(sequences, LOOKED_INTO) or USUAL_PERIOD, scores)
+        return generic_parameters(labels or ("object",), _period(sequences, LOOKED_INTO) or USUAL_PERIOD)
     except OptipmbError as error:
         raise UsageError(f"--profile {AUTO}: {error}") from error
 

@@ -41,7 +41,7 @@ BETWEEN_NS: Final = SECOND // 50
 """Time between two steps."""
 
 RECORDED: Final = optipmb.load_profile(PROFILE)
-OTHER: Final = RECORDED.model_copy(update={"name": "other", "nominal_period": 0.2})
+OTHER: Final = RECORDED.model_copy(update={"name": "other", "nominal_period": 0.2, "detection_time": 0.2})
 PROFILES: Final = Profiles("recorded", (), {one.name: one for one in (RECORDED, OTHER)})
 TRACKERS: Final = {"chained": chained, "filter": optipmb.Tracker}
 KEYS: Final = schemas.Keys()

@@ -91,7 +91,7 @@ class Oracle:
     def __init__(self, parameters: Any, modules: Any) -> None:
         self.classes = list(parameters.classes.values())
         self.nominal: float = parameters.nominal_period
-        self.over_time: bool = parameters.detection_over_time
+        self.detection_time: float = parameters.detection_time
         self.dt = self.nominal
         self.modules = modules
         self.bernoulli: list[Bernoulli] = []
@@ -205,8 +205,8 @@ class Oracle:
             points = count_inside(world, component.mean[:2], component.mean[3], box)
             scale = (1 - c.detection_floor) * points / c.expected_points + c.detection_floor
             p_d *= min(1.0, scale)
-        share = self.dt / self.nominal
-        return float(1 - (1 - p_d) ** max(share, 0.02)) if self.over_time and share < 1 else p_d
+        share = self.dt / self.detection_time if self.detection_time else 1.0
+        return float(1 - (1 - p_d) ** max(share, 0.02)) if share < 1 else p_d
 
     def _in_gate(self, component: Bernoulli | Poisson, z: Measurement) -> bool:
         """Class gate, open to the group of a detected object, and distance gate."""

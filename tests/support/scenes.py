@@ -287,8 +287,8 @@ def random_parameters(
     if calibrated:
         for values in classes.values():
             values["calibration"] = _calibration(rng)
-    over_time = bool(rng.random() < 0.5)
-    return {"name": f"random-{seed}", "nominal_period": 0.1, "detection_over_time": over_time, "classes": classes}
+    detection_time = 0.1 if rng.random() < 0.5 else 0.0
+    return {"name": f"random-{seed}", "nominal_period": 0.1, "detection_time": detection_time, "classes": classes}
 
 
 def _heading_sign(rng: np.random.Generator) -> dict[str, Any] | None:

@@ -148,6 +148,16 @@ def test_a_component_worse_than_clutter_takes_no_birth_from_a_high_score(*, over
     np.testing.assert_allclose(existence, [r, 0.001 / 0.011, 0.1 / 0.11])
 
 
+def test_a_score_too_low_to_announce_is_clutter_with_a_component_or_without() -> None:
+    """It may continue a track, and starts none."""
+    measured = np.array([0.1, 0.1, 0.2]), np.zeros(3), np.zeros(3, np.int64)
+    classes = class_rows(1, clutter_intensity=0.01, birth_intensity=0.002, birth_score=0.5, announce_score=0.15)
+    kind, cost, existence = first_detections(np.array([0, 2]), np.log([0.1, 0.1]), *measured, classes)
+    np.testing.assert_array_equal(kind, [CLUTTER, CLUTTER, FROM_POISSON])
+    np.testing.assert_allclose(cost, [-math.log(0.01), -math.log(0.01), -math.log(0.11)])
+    np.testing.assert_allclose(existence, [0.0, 0.0, 0.1 / 0.11])
+
+
 @pytest.mark.parametrize("dt", [0.0, 0.05, 0.1, 0.5])
 def test_gates_widen_with_unknown_speed(dt: float) -> None:
     """A gate is eta, at least k standard deviations of v over dt; a NaN or an infinity widens none."""

@@ -37,7 +37,7 @@ from optipmb.neighbours import NOBODY, block, empty_torus, insert
 from optipmb.predict import predict_density
 from optipmb.preprocess import Measurements, gather, select, sort_canonically
 from optipmb.prune import NEW, Survivors, surviving_objects
-from optipmb.undetected import update_undetected, with_births
+from optipmb.undetected import AGED, MARKED, update_undetected, with_births
 from optipmb.update import ukf_updates
 
 Array = NDArray[np.float64]
@@ -472,7 +472,10 @@ def test_announced_objects_are_matched_mixtures(seed: int) -> None:
 @pytest.mark.parametrize("adaptive", [True, False])
 @SEEDS
 def test_what_is_undetected_stays_or_is_born(seed: int, *, adaptive: bool) -> None:
-    """Components in no J^m and young enough, weight mu (1 - p_d); with HABM clutter too, weight mu_ab (1 - p_a)."""
+    """Components in no J^m and young enough, weight mu (1 - p_d); with HABM clutter too, weight mu_ab (1 - p_a).
+
+    Scores below the threshold announce nothing and mark no component; the fates say where each went.
+    """
     rng = np.random.default_rng(seed)
     weight, p_d, label, born = rng.uniform(0, 2, 25), rng.uniform(0, 1, 25), rng.integers(0, 2, 25), stamps(rng, 25)
     components = components_of(
@@ -485,17 +488,23 @@ def test_what_is_undetected_stays_or_is_born(seed: int, *, adaptive: bool) -> No
     )
     marked, kind = rng.integers(0, 25, 8), rng.choice([FROM_POISSON, CLUTTER, NEWBORN], 20)
     association, measured = rng.choice([0.0, 0.3, 1.0], 20), random_measurements(rng, 20)
-    hypotheses = hypotheses_of(component=marked, first_kind=kind, association=association)
+    announced, least = rng.integers(0, 20, 8), np.array([0.0, 0.4])
+    hypotheses = hypotheses_of(component=marked, announced=announced, first_kind=kind, association=association)
     steps, rate = np.array([2, 9]), np.array([0.5, 2.0])
     births = rng.uniform(0, 2, 2), rng.uniform(0.1, 1, (2, 6)), rng.uniform(0.1, 1, (2, 6))
-    classes = class_rows(2, poisson_steps=steps, adaptive_birth_rate=rate)
+    classes = class_rows(2, poisson_steps=steps, adaptive_birth_rate=rate, announce_score=least)
     classes["birth_heading_speed"], classes["birth_known"], classes["birth_unknown"] = births
-    found = update_undetected(components, p_d, 15, hypotheses, measured, NOW, PERIOD, classes, adaptive)
-    stays = np.flatnonzero((periods(born) <= steps[label]) & ~np.isin(np.arange(25), marked[marked < 15]))
-    new = np.flatnonzero((kind == CLUTTER) & (association < 1) & adaptive)
+    found, fate = update_undetected(components, p_d, 15, hypotheses, measured, NOW, PERIOD, classes, adaptive)
+    high = measured.score >= least[measured.label]
+    used = np.isin(np.arange(25), marked[(marked < 15) & high[announced]])
+    stays = np.flatnonzero((periods(born) <= steps[label]) & ~used)
+    new = np.flatnonzero((kind == CLUTTER) & (association < 1) & high & adaptive)
     carried = [*(weight * (1 - p_d))[stays], *rate[measured.label[new]] * (1 - association[new])]
     wanted = with_births(components, stays, new, np.array(carried), measured, NOW, classes)
     np.testing.assert_array_equal(found, wanted)
+    rows = np.where(np.r_[used, np.zeros(20, bool)], MARKED, AGED)
+    rows[np.r_[stays, 25 + new]] = np.arange(len(carried))
+    np.testing.assert_array_equal(fate, rows)
 
 
 @SEEDS

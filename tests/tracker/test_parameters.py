@@ -93,6 +93,12 @@ def test_the_profiles_that_ship_are_listed_and_load() -> None:
         assert parameters.provenance
 
 
+def test_the_default_of_the_service_is_the_one_for_any_detector() -> None:
+    """`generic` is what `auto` makes of its classes at 10 Hz."""
+    generic = optipmb.load_profile("generic")
+    assert generic == optipmb.generic_parameters(generic.labels, 0.1, name="generic")
+
+
 @pytest.mark.parametrize("profile", PAPER)
 def test_the_profiles_hold_the_papers_table(profile: str) -> None:
     """Every value that the paper's table of parameters gives stands in the profile."""

@@ -84,11 +84,91 @@ def test_a_component_lives_until_the_next_frame_at_least(profile: str, rate: flo
     assert found == [0, 1, 1]
 
 
+def made(kind: str, rate: float) -> optipmb.Parameters:
+    """The default for a detector that nobody tuned: that of the service, or one made for the rate."""
+    return optipmb.load_profile("generic") if kind == "generic" else optipmb.generic_parameters(["car"], 1.0 / rate)
+
+
+def file_of_cars(
+    parameters: optipmb.Parameters, rate: float, speed: float, *, velocity: bool, gaps: str
+) -> tuple[dict[int, set[int]], int]:
+    """The ids that four cars in one lane are given, farther apart than they drive unseen, and how many there are.
+
+    With gaps, nothing is detected in the last of every three seconds: frames are empty, or there are none.
+    """
+    tracker, rng, found = optipmb.Tracker(parameters), np.random.default_rng(0), dict[int, set[int]]()
+    density, cars = tracker.initial(), np.arange(4)
+    apart = 10.0 + 2.5 * speed * (1.0 / rate + (gaps != ""))
+    for k in range(max(10, int(7.0 * rate))):
+        t = k / rate
+        center = np.column_stack((speed * t + apart * cars, np.zeros(4), np.ones(4)))
+        center[:, :2] += rng.normal(0.0, 0.1, (4, 2))
+        driven = np.column_stack((np.full(4, speed), np.zeros(4))) + rng.normal(0.0, 0.3, (4, 2))
+        seen = cars if not gaps or t % 3.0 < 2.0 else cars[:0]
+        if gaps == "no frames" and not len(seen):
+            continue
+        frame, _ = optipmb.make_frame(
+            parameters,
+            stamp_ns=round(t * 1e9),
+            labels=("car",),
+            label=np.zeros(len(seen), np.int64),
+            center=center[seen],
+            size=np.tile([4.5, 1.9, 1.6], (len(seen), 1)),
+            yaw=rng.normal(0.0, 0.03, 4)[seen],
+            score=np.full(len(seen), 0.9),
+            velocity=driven[seen] if velocity else None,
+        )
+        result = tracker.step(density, frame)
+        density = result.density
+        for identity, car in zip(result.tracks.id.tolist(), result.tracks.detection.tolist(), strict=True):
+            if car >= 0:
+                found.setdefault(car, set()).add(identity)
+    return found, density.next_id - 1
+
+
+@pytest.mark.parametrize("velocity", [False, True], ids=["positions", "velocities"])
+@pytest.mark.parametrize("kind", ["generic", "auto"])
+def test_cars_keep_their_ids_at_any_rate_and_speed(kind: str, *, velocity: bool) -> None:
+    """From 0.5 to 50 Hz and up to 30 m/s; without velocities where a car drives at most 30 m from frame to frame."""
+    for rate in RATES[1:]:
+        for speed in (0.0, 15.0, 30.0):
+            if velocity or speed <= 30.0 * rate:
+                found, count = file_of_cars(made(kind, rate), rate, speed, velocity=velocity, gaps="")
+                assert count == len(found) == 4, (rate, speed, found)
+
+
+@pytest.mark.parametrize("gaps", ["empty frames", "no frames"])
+@pytest.mark.parametrize("kind", ["generic", "auto"])
+def test_cars_keep_their_ids_over_gaps_of_a_second(kind: str, gaps: str) -> None:
+    """Every three seconds, from 2 to 50 Hz."""
+    for rate in (2.0, 5.0, 10.0, 20.0, 50.0):
+        for speed, velocity in ((0.0, False), (10.0, False), (30.0, False), (30.0, True)):
+            found, count = file_of_cars(made(kind, rate), rate, speed, velocity=velocity, gaps=gaps)
+            assert count == len(found) == 4, (rate, speed, found)
+
+
+@pytest.mark.parametrize("rate", [2.0, 5.0, 10.0, 20.0, 50.0])
+@pytest.mark.parametrize("kind", ["generic", "auto"])
+def test_an_object_is_kept_for_two_seconds_at_every_rate(kind: str, rate: float) -> None:
+    """Within one period of the stream or of the profile, whether it was detected once or for long."""
+    parameters = made(kind, rate)
+    tracker = optipmb.Tracker(parameters)
+    for detected in (1, int(2 * rate)):
+        density = tracker.initial()
+        for k in range(detected):
+            density = tracker.step(density, boxes(parameters, k / rate, (0, 0), label="car", score=0.9)).density
+        k = detected - 1
+        while len(density.bernoulli):
+            k += 1
+            density = tracker.step(density, boxes(parameters, k / rate)).density
+        assert abs((k - detected + 1) / rate - 2.0) <= max(1.0 / rate, parameters.nominal_period) + 1e-9
+
+
 def test_the_papers_profiles_keep_the_papers_gates_and_motion() -> None:
     """What goes beyond the paper is off in them."""
     for name in ("kitti-paper", "nuscenes-paper"):
         parameters = optipmb.load_profile(name)
-        assert not parameters.detection_over_time
+        assert parameters.detection_time == 0.0
         for one in parameters.classes.values():
             assert (one.motion, one.acceleration_time) == ("ctra", None)
             assert (one.gate_deviations, one.ground_clearance) == (0.0, 0.0)

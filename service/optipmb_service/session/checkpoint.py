@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import optipmb
-    from optipmb_service.session.seen_numbers import SeenNumbers
-    from optipmb_service.session.state import FilterState, Recorded
+    from optipmb_service.session.state import FilterState, ProcessedFrame
+    from optipmb_service.session.timeline import SeenNumbers
 
 _SOFTWARE: Final = version("optipmb")
 
@@ -57,7 +57,7 @@ class Checkpoint:
     quarantine: Mapping[str, str]
     seen: Mapping[str, tuple[SeenNumbers, ...]]
     base: FilterState
-    window: tuple[Recorded, ...]
+    window: tuple[ProcessedFrame, ...]
     head: FilterState
     deliveries: Deliveries
     newest_cloud_ns: Mapping[str, int]

@@ -26,7 +26,7 @@ from optipmb_service.session.values import MAX_COUNT, Deliveries, Lineage
 
 if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
-    from optipmb_service.session.state import FilterState, Recorded
+    from optipmb_service.session.state import FilterState, ProcessedFrame
 
 VERSION: Final = 1
 MAGIC: Final = b"OPTIPMB\0"
@@ -149,7 +149,7 @@ def _packed_profile(parameters: optipmb.Parameters) -> bytes:
     return known[1]
 
 
-def _packed_cloud(one: Recorded) -> bytes | None:
+def _packed_cloud(one: ProcessedFrame) -> bytes | None:
     if one.points is not None and not one.packed:
         one.packed.append(schemas.encode(one.points))
     return one.packed[0] if one.packed else None

@@ -16,9 +16,8 @@ from pydantic import BaseModel, Field, ValidationError
 import optipmb
 from optipmb_service.session import convert
 from optipmb_service.session.checkpoint import Checkpoint
-from optipmb_service.session.seen_numbers import EPOCHS, WINDOW, SeenNumbers
-from optipmb_service.session.state import FilterState, FrameCounts, Recorded, SensorState
-from optipmb_service.session.timeline import FrameId
+from optipmb_service.session.state import UNPLACED, FilterState, FrameCounts, ProcessedFrame, SensorState
+from optipmb_service.session.timeline import EPOCHS, WINDOW, FrameId, SeenNumbers
 from optipmb_service.session.values import (
     MAX_CLOUD_WAIT_NS,
     MAX_ERROR,
@@ -92,7 +91,7 @@ def read_body(data: bytes) -> Checkpoint:
     parameters = optipmb.parse_parameters(read_map(body.parameters, schemas.STORED))
     schemas.SessionParameters(profile=parameters.name)  # as messages take it
     base = _state_of(body.base, stream, parameters)
-    window = tuple(_recorded_of(one, None if fused else stream, parameters) for one in body.window)
+    window = tuple(_frame_of(one, None if fused else stream, parameters) for one in body.window)
     head = base if body.head is None else _state_of(body.head, stream, parameters)
     if (body.head is None) != (not window):
         raise schemas.MessageError("invalid_value", "head", "a state, exactly where there is a window", "another")
@@ -130,7 +129,7 @@ def _seen_of(epochs: tuple[_Seen, ...]) -> tuple[SeenNumbers, ...]:
     return seen
 
 
-def _recorded_of(one: _Frame, stream: str | None, parameters: optipmb.Parameters) -> Recorded:
+def _frame_of(one: _Frame, stream: str | None, parameters: optipmb.Parameters) -> ProcessedFrame:
     """Return a frame of the window, of one stream or, without its name, of the stream that it says."""
     message = schemas.decode(one.detections, schemas.Detections, limits=schemas.STORED)
     cloud = None if one.points is None else schemas.decode(one.points, schemas.Points, limits=schemas.STORED)
@@ -143,7 +142,7 @@ def _recorded_of(one: _Frame, stream: str | None, parameters: optipmb.Parameters
             raise schemas.MessageError("invalid_value", "window", expected, f"that of {cloud.stamp_ns}")
         convert.cloud_of(cloud)
     convert.frame_of(parameters, message)  # the tracker takes it
-    return Recorded(frame_id, schemas.encoded(message), cloud, one.missed, one.revision, [])
+    return ProcessedFrame(frame_id, schemas.encoded(message), cloud, one.missed, one.revision, [], UNPLACED)
 
 
 def _state_of(one: _State, stream: str, parameters: optipmb.Parameters) -> FilterState:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Protocol
+from typing import Annotated, Any, Final, Literal, NamedTuple, Protocol
 
+import numpy as np
 import optipmb_schemas as schemas
 from pydantic import AfterValidator, Field
 
-from optipmb.records import record
-
-if TYPE_CHECKING:
-    import optipmb
-    from optipmb_service.session.frame_tracks import FrameTracks
+import optipmb
 
 SECOND: Final = 1_000_000_000
+
+COLUMNS: Final = tuple(optipmb.Tracks.described)
+"""Columns of the tracks in the order of the message."""
 
 MAX_COUNT: Final = 2**61
 """Where counters end, so that neither one more nor the sum of two leaves the 64 bits of a message."""
@@ -139,41 +139,62 @@ class Lineage:
     run: int = 0
 
 
-@record
+@dataclass(slots=True)
 class Tracked:
-    """Tracks to be published, without their delivery part.
+    """Tracks of a frame.
+
+    The message is built when somebody reads it. The bytes to publish are put together without it: the columns of the
+    tracks lie one behind the other in one array, in the order in which the message has them.
 
     Attributes:
-        made: the tracks.
-        ticket: what the caller gave with the detections.
+        estimates: tracks of the tracker, with numbers that a message may hold.
+        header: the fields of the message before the columns, those without a value left out.
+        others: the fields behind the columns: classes and predicted paths, where the profile has them.
+        ticket: value that the caller gave with the detections.
         step_ns: time that conversion and tracking took.
         run: see `Session.run`.
     """
 
-    made: FrameTracks
-    ticket: Any
-    step_ns: int
+    estimates: optipmb.Tracks
+    header: dict[str, Any]
+    others: dict[str, Any]
+    ticket: Any = None
+    step_ns: int = 0
     run: int = 0
 
     @property
     def tracks(self) -> schemas.Tracks:
-        """The message, made anew."""
-        return self.made.message
+        """The message, without its delivery part."""
+        columns: dict[str, Any] = dict(self.estimates.columns())
+        columns["confirmed"] = columns["confirmed"].astype(np.int64)
+        for column in columns.values():
+            column.flags.writeable = False
+        return schemas.Tracks.trusted(self.header | columns | self.others)
+
+    def encoded(self, delivery: dict[str, Any]) -> bytes:
+        """Return the bytes of the message with a delivery part of these values, all that it has, in its order."""
+        if self.others:
+            return schemas.encode(self.tracks, delivery=schemas.Delivery.trusted(delivery))
+        words = self.estimates.words
+        return schemas.encode_columns(schemas.Tracks, self.header, COLUMNS, words, {"delivery": delivery})
+
+
+Reason = Literal["first", "jump", "clock", "publisher", "pose", "effort", "reset", "parameters", "quarantine"]
+"""Why the density started again; `clock`: after a step back, with its objects."""
 
 
 @dataclass(frozen=True, slots=True)
 class Begun:
-    """A new life of the density began: at the first frame, at a jump, by a reset.
+    """Start of a session id: at the first frame, at a jump, by a reset.
 
     Attributes:
-        session: its id.
-        reason: "first", "jump", "clock" (a step back, after which the objects are kept), "publisher", "pose", "effort",
-            "reset", "parameters" or "quarantine".
+        session: the id.
+        reason: why.
         jump_ns: how far the stamps jumped.
     """
 
     session: str
-    reason: str
+    reason: Reason
     jump_ns: int = 0
 
 

@@ -147,7 +147,7 @@ def test_large_clouds_shorten_the_window_not_the_checkpoint() -> None:
         one.on_points(SENSOR.points(seq, count=3000), 0)
         feed(one, [seq], SENSOR)
     checkpoint = one.snapshot()
-    assert len(one._processed.entries) == 6
+    assert len(one._window.frames) == 6
     assert [entry.frame_id.seq for entry in checkpoint.window] == [5, 6]
     assert len(encode_checkpoint(checkpoint)) < 130_000
     two = Session.restore(checkpoint, 0, policy)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.session.checkpoint_codec import state_bytes
+from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Output, Policy
 from router import SECOND, Sensor
@@ -42,6 +42,21 @@ def test_any_order_inside_the_window_is_the_order(order: list[int]) -> None:
     expected, in_order, _ = ends(range(9))
     assert state == expected
     assert merged == in_order
+
+
+def test_late_frames_and_a_restore_keep_the_counts_of_scores() -> None:
+    """A profile that calibrates scores itself ends with the bytes of the order of the stamps, through a crash too."""
+    in_order = Session(SENSOR.stream, optipmb.load_profile("generic"))
+    feed(in_order, range(40), SENSOR)
+    one = Session(SENSOR.stream, optipmb.load_profile("generic"))
+    feed(one, [0, 3, 1, 2, *range(4, 18), 20, 19, 18], SENSOR)
+    one = Session.restore(decode_checkpoint(encode_checkpoint(one.snapshot())), 0)
+    feed(one, [22, 21, *range(24, 40), 23], SENSOR)
+    one.flush()
+    density = one.density
+    assert density.self_calibration is not None
+    assert density.self_calibration.classes.sum() > 0.0
+    assert state_bytes(one.snapshot()) == state_bytes(in_order.snapshot())
 
 
 def test_corrected_tracks_have_a_higher_revision() -> None:

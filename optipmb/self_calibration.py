@@ -1,0 +1,332 @@
+"""Scores of an unknown detector, calibrated while the tracker runs (not in the paper).
+
+A score of 0.4 is a sure object for one detector and a doubtful one for another. Where a profile has `self_calibration`,
+every score becomes the share of the detections with such a score that were of a lasting object, before thresholds,
+births and the evidence of tracks use it. The scores that tracks publish remain those of the detector.
+
+Without a truth, a detection counts as one of an object when its track is detected again and again. Each object has
+three slots of about a second: one is being filled, the one before it is evaluated when that ends. Its detections are
+lasting if, together with the slot before or after, the object was detected in a share s of the looks at it, and at
+least three times:
+
+    s = 1 - 3 (1 - rho), from 0.4 to 0.87
+
+rho is the share of looks in which the objects with the best scores are detected, so that a detector that misses many
+objects is not taken for one that imagines them. A detection that no object uses, and that announces none within
+`poisson_steps`, does not last.
+
+The curve of a class is the isotonic regression of the shares over the log odds of the scores, with `PRIOR` detections
+in each bin whose scores mean what they say. Its largest value is `MOST`. It depends on frames of the past alone, and
+the state is part of the density. Counts fade from `MASS` detections on.
+
+A threshold never excludes the upper half of the scores of a class. Detections that are filtered out teach nothing, so
+that otherwise a detector of low scores would remain silent for ever.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from optipmb.calibration import log_odds
+from optipmb.compiled import kernel
+from optipmb.density import BINS, COUNTS, NO_FRAME, SLOT, SLOTS, SelfCalibration
+from optipmb.predict import rows_within
+from optipmb.undetected import AGED
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from optipmb.density import Density
+    from optipmb.table import ClassRow, ClassTable
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+
+BIN: Final = 0.4
+LOWEST: Final = -0.5 * BIN * BINS
+"""Width of a bin of log odds, and the lower edge of the first."""
+
+DETECTIONS, LASTING, GIVEN, HITS, LOOKS = range(5)
+"""Counts of a class by bin: evaluated detections, those that lasted, all scores of the detector, and hits and looks of
+inner slots by the mean bin of the slot."""
+SLOT_S: Final = 0.99
+"""Shortest time of a slot, s: a second, less the jitter of stamps."""
+OF_LOOKS, SECONDS = BINS, BINS + 1
+"""Columns of a slot behind the detections by bin."""
+
+PRIOR: Final = 5.0
+MASS: Final = 3000.0
+MOST: Final = 0.985
+LEAST: Final = 0.001
+RISE: Final = 5e-5
+"""Least slope of a curve, per unit of log odds: the order of detections stays."""
+LEAST_HITS: Final = 3.0
+FULL_SLOT: Final = 10.0
+"""Detections of a slot, and of a second, that count in full: a fast stream does not forget sooner."""
+LEAST_SHARE, MOST_SHARE, PRIOR_RECALL = 0.4, 0.87, 0.95
+BEST: Final = 0.2
+"""Share of the detections of a class whose scores are the best."""
+
+
+@kernel
+def bin_of(score: float) -> int:
+    """Return the bin of a score in (0, 1]."""
+    return min(max(math.floor((log_odds(score) - LOWEST) / BIN), 0), BINS - 1)
+
+
+@kernel
+def curves(classes: Array) -> Array:
+    """Return the curve of each class at the middles of the bins, (C, `BINS`): isotonic, by pooling neighbours."""
+    out = np.empty((classes.shape[0], BINS))
+    share, weight, size = np.empty(BINS), np.empty(BINS), np.empty(BINS, np.int64)
+    for c in range(classes.shape[0]):
+        blocks = 0
+        for b in range(BINS):
+            meant = 1.0 / (1.0 + math.exp(-(LOWEST + (b + 0.5) * BIN)))
+            weight[blocks] = classes[c, DETECTIONS, b] + PRIOR
+            share[blocks] = (classes[c, LASTING, b] + PRIOR * meant) / weight[blocks]
+            size[blocks] = 1
+            blocks += 1
+            while blocks > 1 and share[blocks - 2] >= share[blocks - 1]:
+                blocks -= 1
+                total = weight[blocks - 1] + weight[blocks]
+                share[blocks - 1] += (share[blocks] - share[blocks - 1]) * weight[blocks] / total
+                weight[blocks - 1] = total
+                size[blocks - 1] += size[blocks]
+        b = 0
+        for k in range(blocks):
+            for _ in range(size[k]):
+                out[c, b] = min(max(share[k] * MOST / share[blocks - 1], LEAST), MOST)
+                b += 1
+    return out
+
+
+@kernel
+def on_curve(odds: float, curve: Array) -> float:
+    """Return a curve at log odds: straight between the middles of the bins, level outside, and rising everywhere."""
+    place = min(max((odds - LOWEST) / BIN - 0.5, 0.0), BINS - 1.0)
+    low = min(int(place), BINS - 2)
+    value: float = curve[low] + (place - low) * (curve[low + 1] - curve[low]) + RISE * odds
+    return value
+
+
+@kernel
+def calibrate(classes: Array, score: Array, label: Index, table: Sequence[ClassRow]) -> Array:
+    """Return the calibrated scores (M,), and bound the thresholds by the lower edge of the median of the scores.
+
+    Args:
+        classes: (C, `COUNTS`, `BINS`) counts of the classes.
+        score: (M,) of the detector.
+        label: (M,) classes.
+        table: (C,) parameters; thresholds on scores are written.
+    """
+    curve, out = curves(classes), np.empty(score.shape[0])
+    for m in range(score.shape[0]):
+        out[m] = on_curve(log_odds(score[m]), curve[label[m]])
+    for c in range(classes.shape[0]):
+        given = classes[c, GIVEN]
+        half, below, median = 0.5 * given.sum(), 0.0, 0
+        while median < BINS - 1 and below + given[median] < half:
+            below += given[median]
+            median += 1
+        if half > 0.0:
+            edge = on_curve(LOWEST + median * BIN, curve[c]) if median > 0 else 0.0
+            own = table[c]
+            own.score_filter = min(own.score_filter, edge)
+            own.announce_score = min(own.announce_score, edge)
+            own.birth_score = min(own.birth_score, edge)
+    return out
+
+
+@kernel
+def needed_shares(classes: Array) -> Array:
+    """Return the share s of looks, for each class, in which a lasting object is detected."""
+    needed = np.empty(classes.shape[0])
+    for c in range(classes.shape[0]):
+        mass = classes[c, DETECTIONS].sum()
+        taken, hits, looks, b = 0.0, PRIOR_RECALL * PRIOR, PRIOR, BINS - 1
+        while b >= 0 and taken < BEST * mass:
+            taken += classes[c, DETECTIONS, b]
+            hits, looks = hits + classes[c, HITS, b], looks + classes[c, LOOKS, b]
+            b -= 1
+        needed[c] = min(max(1.0 - 3.0 * (1.0 - hits / looks), LEAST_SHARE), MOST_SHARE)
+    return needed
+
+
+@kernel
+def next_slot(slots: Array, counts: Array, needed: float) -> None:
+    """Evaluate the middle slot of an object, and begin a new one.
+
+    Args:
+        slots: (`SLOTS`, `SLOT`) is written.
+        counts: (`COUNTS`, `BINS`) of the class; is written.
+        needed: share of looks in which a lasting object is detected.
+    """
+    hits, looks = slots[:, :BINS].sum(axis=1), slots[:, OF_LOOKS]
+    lasting = False
+    for other in (0, 2):
+        lasting |= hits[1] + hits[other] >= max(LEAST_HITS, needed * (looks[1] + looks[other]))
+    if hits[1] > 0.0:
+        share, mean = min(FULL_SLOT / looks[1], 1.0), 0.0
+        for b in range(BINS):
+            counts[DETECTIONS, b] += share * slots[1, b]
+            counts[LASTING, b] += share * slots[1, b] * lasting
+            mean += slots[1, b] * b
+        if hits[0] > 0.0 and hits[2] > 0.0:
+            middle = min(max(int(mean / hits[1] + 0.5), 0), BINS - 1)
+            counts[HITS, middle] += share * hits[1]
+            counts[LOOKS, middle] += share * looks[1]
+    slots[0], slots[1], slots[2] = slots[1].copy(), slots[2].copy(), 0.0
+
+
+@kernel
+def learn(
+    classes: Array,
+    before: Array,
+    before_id: Index,
+    before_label: Index,
+    objects_id: Index,
+    objects_label: Index,
+    hit: Index,
+    looked: NDArray[np.bool_],
+    bins: Index,
+    components_label: Index,
+    fate: Index,
+    score: Array,
+    label: Index,
+    rows: Index,
+    dt: float,
+) -> tuple[Array, Array, Index]:
+    """Return the counts after a frame.
+
+    Args:
+        classes: (C, `COUNTS`, `BINS`) of the classes; is written.
+        before: (N, `SLOTS`, `SLOT`) of the objects of the frame before.
+        before_id: (N,) their ids, ascending.
+        before_label: (N,) their classes.
+        objects_id: (K,) ids of the objects of the posterior, ascending.
+        objects_label: (K,) their classes.
+        hit: (K,) measurement of each, negative where missed.
+        looked: (K,) whether it was in view.
+        bins: (J,) of the predicted components.
+        components_label: (J,) their classes.
+        fate: (J + M,) row of each component, and of that of each measurement, in the posterior; below zero where it
+            has none.
+        score: (D,) scores of the detector, of all detections.
+        label: (D,) their classes.
+        rows: (M,) detection of each measurement.
+        dt: s since the frame before.
+    """
+    for d in range(score.shape[0]):
+        classes[label[d], GIVEN, bin_of(score[d])] += 1.0
+    used, share = np.zeros(rows.shape[0], np.bool_), min(FULL_SLOT * dt, 1.0)
+    lasting = needed_shares(classes)
+
+    # Objects: those that are gone are evaluated at once
+    after = np.zeros((objects_id.shape[0], SLOTS, SLOT))
+    n = 0
+    for k in range(objects_id.shape[0] + 1):
+        last = k == objects_id.shape[0]
+        while n < before_id.shape[0] and (last or before_id[n] < objects_id[k]):
+            own = before[n].copy()
+            for _ in range(SLOTS - 1):
+                next_slot(own, classes[before_label[n]], lasting[before_label[n]])
+            n += 1
+        if last:
+            break
+        own = after[k]
+        if n < before_id.shape[0] and before_id[n] == objects_id[k]:
+            own[:] = before[n]
+            own[SLOTS - 1, SECONDS] += dt
+            n += 1
+        if own[SLOTS - 1, SECONDS] >= SLOT_S and own[SLOTS - 1, OF_LOOKS] > 1.0:
+            next_slot(own, classes[objects_label[k]], lasting[objects_label[k]])
+        own[SLOTS - 1, OF_LOOKS] += looked[k]
+        if hit[k] >= 0:
+            used[hit[k]] = True
+            own[SLOTS - 1, bin_of(score[rows[hit[k]]])] += 1.0
+
+    # Components, and detections that no object uses
+    kept = 0
+    for j in range(fate.shape[0]):
+        kept = max(kept, fate[j] + 1)
+    bins_after, components = np.empty(kept, np.int64), bins.shape[0]
+    for j in range(components):
+        b = min(bins[j], BINS - 1)
+        if fate[j] >= 0:
+            bins_after[fate[j]] = b
+        elif fate[j] == AGED and b >= 0:
+            classes[components_label[j], DETECTIONS, b] += share
+    for m in range(rows.shape[0]):
+        d, j = rows[m], fate[components + m]
+        if j >= 0:
+            bins_after[j] = bin_of(score[d])
+        elif not used[m]:
+            classes[label[d], DETECTIONS, bin_of(score[d])] += share
+
+    for c in range(classes.shape[0]):
+        for first, end in ((DETECTIONS, GIVEN), (GIVEN, HITS), (HITS, COUNTS)):
+            mass = classes[c, first].sum()
+            if mass > MASS:
+                classes[c, first:end] *= MASS / mass
+    return classes, after, bins_after
+
+
+def followed(
+    own: SelfCalibration,
+    density: Density,
+    predicted: Density,
+    posterior: Density,
+    hit: Index,
+    fate: Index,
+    score: Array,
+    label: Index,
+    rows: Index,
+    table: ClassTable,
+) -> SelfCalibration:
+    """Return the counts of the posterior.
+
+    Args:
+        own: those of the density.
+        density: posterior of the frame before.
+        predicted: the prediction.
+        posterior: of this frame.
+        hit: (K,) measurement of each object of the posterior, negative where missed.
+        fate: of components and measurements, as `learn` takes it.
+        score: (D,) scores of the detector.
+        label: (D,) their classes.
+        rows: (M,) detection of each measurement.
+        table: parameters as a table.
+    """
+    first, now = density.stamp_ns == NO_FRAME, posterior.stamp_ns
+    dt = table.period if first else (now - density.stamp_ns) * 1e-9
+    old, new, poisson, bins = density.bernoulli, posterior.bernoulli, density.poisson, own.components
+    if len(predicted.poisson) < len(bins):
+        bins = bins[
+            rows_within(poisson.label, poisson.born_ns, density.stamp_ns, True, now, table.period, table.classes)
+        ]
+    looked = np.ones(len(new), np.bool_) if posterior.misses is None else posterior.misses.looked_ns == now
+    return SelfCalibration(
+        *learn(
+            own.classes.copy(),
+            own.objects,
+            old.id,
+            old.label,
+            new.id,
+            new.label,
+            hit,
+            looked,
+            bins,
+            predicted.poisson.label,
+            fate,
+            score,
+            label,
+            rows,
+            dt,
+        )
+    )

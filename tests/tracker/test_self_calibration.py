@@ -1,0 +1,301 @@
+"""Scores that are calibrated while the tracker runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from class_rows import class_rows
+
+import optipmb
+from optipmb.density import BINS, COUNTS, NO_BIN, SLOT, SLOTS
+from optipmb.self_calibration import (
+    BIN,
+    DETECTIONS,
+    GIVEN,
+    HITS,
+    LASTING,
+    LOOKS,
+    LOWEST,
+    MASS,
+    OF_LOOKS,
+    PRIOR,
+    RISE,
+    SECONDS,
+    bin_of,
+    calibrate,
+    learn,
+    needed_shares,
+)
+from optipmb.undetected import AGED, MARKED
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+SEEDS = pytest.mark.parametrize("seed", range(6))
+MIDDLES = LOWEST + (np.arange(BINS) + 0.5) * BIN
+THRESHOLDS = ("score_filter", "announce_score", "birth_score")
+
+
+def logit(score: Array) -> Array:
+    """Log odds."""
+    return np.log(score) - np.log1p(-score)
+
+
+def bins(score: Array) -> NDArray[np.int64]:
+    """Bins of scores."""
+    return np.clip(np.floor((logit(score) - LOWEST) / BIN), 0, BINS - 1).astype(np.int64)
+
+
+def test_a_bin_is_that_of_the_log_odds() -> None:
+    """Equal widths of log odds, and the outermost without an end."""
+    scores = np.r_[1e-12, np.random.default_rng(0).uniform(0, 1, 200), 1 - 1e-12]
+    assert [bin_of(one) for one in scores] == bins(scores).tolist()
+    assert bin_of(1.0) == BINS - 1
+
+
+def counts(rng: np.random.Generator, classes: int = 2) -> Array:
+    """Counts of classes: about half of the detections lasted, more of those with good scores."""
+    out = np.zeros((classes, COUNTS, BINS))
+    out[:, [DETECTIONS, GIVEN, LOOKS]] = rng.integers(0, 40, (classes, 3, BINS))
+    out[:, LASTING] = out[:, DETECTIONS] * np.clip(rng.normal(np.linspace(0, 1, BINS), 0.2), 0, 1)
+    out[:, HITS] = out[:, LOOKS] * rng.uniform(0.8, 1, (classes, BINS))
+    return out
+
+
+@SEEDS
+def test_scores_go_through_the_isotonic_curve(seed: int) -> None:
+    """The curve is the largest of the least weighted means; thresholds do not pass the median of all scores."""
+    rng = np.random.default_rng(seed)
+    state, label, score = counts(rng), rng.integers(0, 2, 50), rng.uniform(0.001, 0.999, 50)
+    rows = class_rows(2, score_filter=0.1, announce_score=0.3, birth_score=0.9)
+    found = calibrate(state, score, label, rows)
+    for c in range(2):
+        weight = state[c, DETECTIONS] + PRIOR
+        share = (state[c, LASTING] + PRIOR / (1 + np.exp(-MIDDLES))) / weight
+        means = [
+            [np.average(share[i : j + 1], weights=weight[i : j + 1]) if j >= i else np.inf for j in range(BINS)]
+            for i in range(BINS)
+        ]
+        curve = np.array([max(min(means[i][b:]) for i in range(b + 1)) for b in range(BINS)])
+        curve = np.clip(curve * 0.985 / curve[-1], 0.001, 0.985)
+        odds = logit(score[label == c])
+        np.testing.assert_allclose(found[label == c], np.interp(odds, MIDDLES, curve) + RISE * odds, rtol=1e-12)
+        median = int(np.searchsorted(np.cumsum(state[c, GIVEN]), 0.5 * state[c, GIVEN].sum()))
+        edge = LOWEST + median * BIN
+        bound = np.interp(edge, MIDDLES, curve) + RISE * edge
+        np.testing.assert_allclose([rows[name][c] for name in THRESHOLDS], np.minimum([0.1, 0.3, 0.9], bound))
+    order = np.argsort(score[label == 0])
+    assert (np.diff(found[label == 0][order]) > 0).all()
+
+
+@pytest.mark.parametrize("recall", [0.7, 0.85, 0.99])
+def test_the_share_of_looks_follows_the_recall_of_the_best(recall: float) -> None:
+    """Rho is that of the bins with the best fifth of the detections, and 0.95 over five looks before there are any."""
+    state = np.zeros((2, COUNTS, BINS))
+    state[0, DETECTIONS, [5, 20, 25]] = [80.0, 10.0, 10.0]
+    state[0, LOOKS, [5, 20, 25]] = 1000.0
+    state[0, HITS, [5, 20, 25]] = [100.0, 1000 * recall, 1000 * recall]
+    rho = (2000 * recall + 0.95 * PRIOR) / (2000 + PRIOR)
+    np.testing.assert_allclose(needed_shares(state), [np.clip(1 - 3 * (1 - rho), 0.4, 0.87), 1 - 3 * 0.05])
+
+
+class Counting:
+    """The counts of a stream in plain Python: slots by id as lists of bins and numbers of looks."""
+
+    def __init__(self, state: Array) -> None:
+        self.state = state
+        self.slots: dict[int, list[list[Any]]] = {}
+        self.seconds: dict[int, float] = {}
+
+    def end_slot(self, one: int, c: int, needed: float) -> None:
+        """Evaluate the middle slot of an object."""
+        before, own, after = self.slots[one]
+        sums = [(len(own[0] + other[0]), own[1] + other[1]) for other in (before, after)]
+        lasting = any(hits >= max(3, needed * looks) for hits, looks in sums)
+        share = min(1.0, 10 / own[1]) if own[0] else 0.0
+        for b in own[0]:
+            self.state[c, DETECTIONS, b] += share
+            self.state[c, LASTING, b] += share * lasting
+        if own[0] and before[0] and after[0]:
+            mean = int(np.floor(np.mean(own[0]) + 0.5))
+            self.state[c, HITS, mean] += share * len(own[0])
+            self.state[c, LOOKS, mean] += share * own[1]
+        self.slots[one] = [own, after, [[], 0]]
+        self.seconds[one] = 0.0
+
+    def follow(self, before: dict[int, int], objects: dict[int, tuple[int, int | None, bool]], dt: float) -> None:
+        """Count objects by id: their class, the bin of their detection, and whether they were in view."""
+        needed = needed_shares(self.state)
+        for one in before.keys() - objects.keys():
+            for _ in range(2):
+                self.end_slot(one, before[one], needed[before[one]])
+            del self.slots[one]
+        for one, (c, b, looked) in objects.items():
+            self.seconds[one] = self.seconds[one] + dt if one in self.slots else 0.0
+            slots = self.slots.setdefault(one, [[[], 0], [[], 0], [[], 0]])
+            if self.seconds[one] >= 0.99 and slots[2][1] > 1:
+                self.end_slot(one, c, needed[c])
+            self.slots[one][2][1] += looked
+            self.slots[one][2][0] += [] if b is None else [b]
+
+    def forget(self) -> None:
+        """Bound the counts."""
+        for c in range(2):
+            for first, end in ((DETECTIONS, GIVEN), (GIVEN, HITS), (HITS, COUNTS)):
+                self.state[c, first:end] *= min(1.0, MASS / self.state[c, first].sum())
+
+
+@SEEDS
+def test_frames_are_counted_as_plain_python_counts(seed: int) -> None:
+    """Slots of objects that stay, come and go; components that age; detections that nobody uses; forgetting."""
+    rng = np.random.default_rng(seed)
+    state = 2.0 * counts(rng)
+    plain = Counting(state.copy())
+    before, known = np.zeros((0, SLOTS, SLOT)), dict[int, int]()
+    announced, announced_label = np.zeros(0, np.int64), np.zeros(0, np.int64)
+    for k in range(120):
+        dt, count = float(rng.choice([0.1, 0.3])), int(rng.integers(4, 12))
+        score, label = rng.uniform(0.01, 0.99, count + 3), rng.integers(0, 2, count + 3)
+        rows, own_bin = rng.permutation(count + 3)[:count], bins(score)
+        now = {one: c for one, c in known.items() if rng.random() < 0.97} | {3 * k: 0, 3 * k + 1: 1}
+        hit = np.r_[rng.permutation(count), np.full(len(now), -1)][: len(now)]
+        looked = (rng.random(len(now)) < 0.9) | (hit >= 0)
+        free = ~np.isin(np.arange(count), hit)
+        fate = np.r_[rng.choice([AGED, MARKED, 0], len(announced)), np.where(free & (rng.random(count) < 0.5), 0, AGED)]
+        fate[fate == 0] = np.arange((fate == 0).sum())
+        of_old, of_new = np.split(fate, [len(announced)])
+
+        np.add.at(plain.state, (label, GIVEN, own_bin), 1.0)
+        found = [None if m < 0 else int(own_bin[rows[m]]) for m in hit]
+        plain.follow(known, dict(zip(now, zip(now.values(), found, looked, strict=True), strict=True)), dt)
+        gone = (of_old == AGED) & (announced != NO_BIN)
+        np.add.at(plain.state, (announced_label[gone], DETECTIONS, announced[gone]), min(1, 10 * dt))
+        gone = rows[free & (of_new == AGED)]
+        np.add.at(plain.state, (label[gone], DETECTIONS, own_bin[gone]), min(1, 10 * dt))
+        plain.forget()
+
+        identity = np.array([*known], np.int64), np.array([*known.values()], np.int64)
+        after = np.array([*now], np.int64), np.array([*now.values()], np.int64)
+        given = announced, announced_label, fate, score, label, rows, dt
+        state, before, kept = learn(state, before, *identity, *after, hit, looked, *given)
+        announced = np.r_[announced[of_old >= 0], own_bin[rows[of_new >= 0]]]
+        announced_label = np.r_[announced_label[of_old >= 0], label[rows[of_new >= 0]]]
+        known = now
+        np.testing.assert_allclose(state, plain.state, rtol=1e-9)
+        np.testing.assert_array_equal(kept, announced)
+        for own, one in zip(before, now, strict=True):
+            for slot, (hits, looks) in zip(own, plain.slots[one], strict=True):
+                np.testing.assert_array_equal(slot[:BINS], np.bincount(hits, minlength=BINS))
+                assert slot[OF_LOOKS] == looks
+            assert own[-1, SECONDS] == pytest.approx(plain.seconds[one])
+
+
+CLASSES = ("car", "pedestrian")
+PARAMETERS = optipmb.generic_parameters(CLASSES, 0.1)
+
+
+def street(frames: int, scale: float = 1.0, seed: int = 0, clutter: int = 8) -> Iterator[dict[str, Any]]:
+    """Ten parked cars, seen in nine frames of ten with scores about 0.8, and false detections with scores about 0.3."""
+    rng = np.random.default_rng(seed)
+    places = np.column_stack((20.0 * np.arange(10), np.zeros(10)))
+    for k in range(frames):
+        seen = rng.random(10) < 0.9
+        false = rng.uniform((0, 20), (200, 100), (clutter, 2))
+        center = np.vstack((places[seen] + rng.normal(0, 0.1, (seen.sum(), 2)), false))
+        score = scale * np.r_[rng.uniform(0.7, 0.9, seen.sum()), rng.uniform(0.2, 0.4, clutter)]
+        yield {
+            "stamp_ns": k * 100_000_000,
+            "labels": CLASSES,
+            "label": np.zeros(len(score), np.int64),
+            "center": np.column_stack((center, np.ones(len(score)))),
+            "size": np.tile([4.0, 1.8, 1.6], (len(score), 1)),
+            "yaw": np.zeros(len(score)),
+            "score": score,
+        }
+
+
+def run(parameters: optipmb.Parameters, frames: Iterator[dict[str, Any]]) -> list[optipmb.StepResult]:
+    """Track frames."""
+    tracker = optipmb.Tracker(parameters)
+    density, results = tracker.initial(), []
+    for one in frames:
+        results.append(tracker.step(density, optipmb.make_frame(parameters, **one)[0]))
+        density = results[-1].density
+    return results
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.4, 0.1])
+def test_confirmed_tracks_are_the_objects_whatever_the_scale_of_the_scores(scale: float) -> None:
+    """After five seconds all cars are confirmed and nothing else is; published scores remain those of the detector."""
+    last = run(PARAMETERS, street(60, scale))[-1].tracks
+    assert last.confirmed.sum() == 10
+    assert (last.center[last.confirmed, 1] < 5.0).all()
+    assert (last.existence[last.confirmed] > 0.7).all()
+    assert last.score.max() <= 0.9 * scale
+
+
+def test_a_profile_that_does_not_calibrate_counts_nothing() -> None:
+    """Neither the density nor its bytes have counts; a density that has some goes on without."""
+    plain = PARAMETERS.model_copy(update={"self_calibration": False})
+    results = run(plain, street(3))
+    assert results[-1].density.self_calibration is None
+    assert set(optipmb.bytes_of(results[-1].density)) == {"bernoulli", "poisson"}
+    counted = run(PARAMETERS, street(3))[-1].density
+    frame, _ = optipmb.make_frame(plain, **list(street(4))[-1])
+    assert optipmb.Tracker(plain).step(counted, frame).density.self_calibration is None
+
+
+def test_a_stored_density_goes_on_to_the_last_bit() -> None:
+    """Bytes make the same density again, and the next frames give the same bytes."""
+    frames = list(street(40))
+    wanted = run(PARAMETERS, iter(frames))
+    density = wanted[24].density
+    columns = optipmb.columns_in(optipmb.bytes_of(density), len(CLASSES))
+    for name, column in optipmb.columns_of(density).items():
+        np.testing.assert_array_equal(columns[name], column, err_msg=name)
+    density, tracker = (
+        optipmb.density_of(density.stamp_ns, density.next_id, columns, CLASSES),
+        optipmb.Tracker(PARAMETERS),
+    )
+    for one in frames[25:]:
+        density = tracker.step(density, optipmb.make_frame(PARAMETERS, **one)[0]).density
+    assert optipmb.bytes_of(density) == optipmb.bytes_of(wanted[-1].density)
+
+
+def test_wrong_counts_are_refused_by_name() -> None:
+    """Another shape or type, negative or endless counts, bins that there are not; the tracker refuses misfits too."""
+    density = run(PARAMETERS, street(5))[-1].density
+    columns = optipmb.columns_of(density)
+    for part in ("classes", "objects", "components"):
+        name = f"calibration.{part}"
+        good = columns[name]
+        endless = np.full_like(good, 10**12)
+        for wrong in (good[:-1], good.astype(np.float32), -2 - good, endless, None):
+            with pytest.raises(optipmb.DensityError, match=name.replace(".", r"\.")):
+                optipmb.density_of(density.stamp_ns, density.next_id, columns | {name: wrong}, CLASSES)
+        assert density.self_calibration is not None
+        other = replace(density, self_calibration=replace(density.self_calibration, **{part: good[:-1]}))
+        frame, _ = optipmb.make_frame(PARAMETERS, **list(street(6))[-1])
+        with pytest.raises(optipmb.DensityError):
+            optipmb.Tracker(PARAMETERS).step(other, frame)
+
+
+def test_the_order_of_detections_changes_nothing() -> None:
+    """Counts are sums over bins: a detector may list its boxes in any order."""
+    rng = np.random.default_rng(1)
+
+    def shuffled() -> Iterator[dict[str, Any]]:
+        for one in street(30):
+            order = rng.permutation(len(one["score"]))
+            columns = ("label", "center", "size", "yaw", "score")
+            yield one | {name: one[name][order] for name in columns}
+
+    found, wanted = run(PARAMETERS, shuffled())[-1].density, run(PARAMETERS, street(30))[-1].density
+    assert optipmb.bytes_of(found) == optipmb.bytes_of(wanted)
