@@ -57,11 +57,12 @@ def _nodes(count: int) -> tuple[Array, Array]:
 def ctra(x: Array, dt: float, tau: float = math.inf) -> Array:
     """Gamma_CTRA: the integral of constant omega and of a, or of a exp(-t / tau), by Gauss-Legendre quadrature.
 
-    Where a decays, it counts up to |v| / tau in braking, up to five times as much otherwise.
+    Where a decays, it brakes with at most 3 |v| / tau and to a standstill, and speeds up with at most 5 |v| / tau.
     """
     px, py, v, phi, omega, a = x
     if tau < math.inf:
-        a = math.copysign(min(abs(a), abs(v) / tau * (1 if v * a < 0 else 5)), a)
+        most = min(3.0, 1 / (1 - math.exp(-dt / tau))) if v * a < 0 else 5.0
+        a = math.copysign(min(abs(a), most * abs(v) / tau), a)
     nodes, weights = _nodes(24 + math.ceil((abs(omega) + 1 / tau) * dt))
     t = 0.5 * dt * (nodes + 1.0)
 
