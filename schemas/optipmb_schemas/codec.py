@@ -94,9 +94,8 @@ def decode(payload: bytes, expected: type[T], *, encoding: str = "", limits: Lim
         raise MessageError("too_large", "", f"at most {most} bytes of {form}", f"{len(payload)} bytes")
     if form == "msgpack" and (message := read(payload, expected, limits)) is not None:
         return message
-    fields = _parse_json(payload, limits) if form == "json" else _parse_msgpack(payload, limits)
-    if not isinstance(fields, dict):
-        raise MessageError("malformed", "", f"one map with the fields of {expected.__name__}", show(fields))
+    what = f"one map with the fields of {expected.__name__}"
+    fields = _map_of(_parse_json(payload, limits), what) if form == "json" else read_map(payload, limits, what)
     return build(fields, expected, limits)
 
 
@@ -127,10 +126,15 @@ def _form(encoding: str, expected: type[Message]) -> str:
     return str(form)
 
 
-def _parse_msgpack(payload: bytes, limits: Limits) -> Any:
+def read_map(payload: bytes, limits: Limits, what: str = "one map") -> dict[str, Any]:
+    """Return the map that msgpack holds; `what` names it in errors.
+
+    Raises:
+        MessageError: it holds none, or one above a limit.
+    """
     check_msgpack(payload, limits)
     try:
-        return _msgpack.unpackb(payload, object_pairs_hook=_unique, strict_map_key=True, max_str_len=limits.max_text)
+        return _map_of(_msgpack.unpackb(payload, object_pairs_hook=_unique, max_str_len=limits.max_text), what)
     except MessageError:
         raise
     except ValueError as error:
@@ -146,6 +150,12 @@ def _parse_json(payload: bytes, limits: Limits) -> Any:
         raise
     except ValueError as error:
         raise MessageError("malformed", "", "JSON in UTF-8", show(str(error))) from None
+
+
+def _map_of(fields: Any, what: str) -> dict[str, Any]:
+    if not isinstance(fields, dict):
+        raise MessageError("malformed", "", what, show(fields))
+    return fields
 
 
 def _unique(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:

@@ -1,10 +1,11 @@
-"""Messages from bytes that are what `encode` writes: msgspec decodes them by the types that the models define.
+"""Decode messages with columns by msgspec, by types that come from the pydantic models.
 
-Nothing is refused here. Bytes that are no valid message in this form give None; `codec` reads other forms and names
-errors. So there is one set of rules and one set of errors. Tests hold the messages of both ways equal.
+Nothing is refused here. A payload that is not plainly a valid message gives None; `codec` then reads it by the models
+or names the error. So there is one set of rules and one set of errors. Tests hold the messages of both ways equal.
 
-msgspec builds what the types allow and no more, so the memory for a payload is bounded by its size. Of a map with a
-field twice it takes the last one and it skips fields that are not known: `is_encoding` finds that the bytes are others.
+Memory is bounded: msgspec builds what the types allow, lists of a few elements and views of the payload. Of a map with
+a field twice it takes the last one, and it skips unknown fields. So the fields are encoded again, and the payload must
+be those bytes: by msgspec in the order in which they came, or, where that would copy a large payload, by `is_encoding`.
 """
 
 import sys

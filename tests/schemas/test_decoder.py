@@ -33,9 +33,7 @@ NAMES = sorted(kind.__name__ for kind in KINDS)
 
 def by_models(payload: bytes, kind: type[Message], limits: Limits = DEFAULT) -> Message:
     """Return what the walk and the models make of a payload, however it is written."""
-    fields = codec._parse_msgpack(payload, limits)
-    if not isinstance(fields, dict):
-        raise MessageError("malformed", "", "", "")
+    fields = codec.read_map(payload, limits)
     return codec.build(fields, kind, limits)
 
 

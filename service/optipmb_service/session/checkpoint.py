@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import msgpack
 import optipmb_schemas as schemas
+from optipmb_schemas.codec import read_map
 from optipmb_schemas.model import first_error
-from optipmb_schemas.structure import check_msgpack
 from pydantic import BaseModel, Field, ValidationError
 
 import optipmb
@@ -291,11 +291,11 @@ def _read(data: bytes) -> Checkpoint:
         OptipmbError: its profile or a density is not valid.
     """
     try:
-        body = _Body.model_validate(_map_in(data))
+        body = _Body.model_validate(read_map(data, schemas.STORED))
     except ValidationError as error:
         raise first_error(error) from None
     stream, fused = body.stream, body.fused
-    parameters = optipmb.parse_parameters(_map_in(body.parameters))
+    parameters = optipmb.parse_parameters(read_map(body.parameters, schemas.STORED))
     schemas.SessionParameters(profile=parameters.name)  # as messages take it
     base = _state_of(body.base, stream, parameters)
     window = tuple(_frame_of(one, None if fused else stream, parameters) for one in body.window)
@@ -323,17 +323,6 @@ def _read(data: bytes) -> Checkpoint:
         run=body.run,
         software=body.software,
     )
-
-
-def _map_in(data: bytes) -> dict[str, Any]:
-    check_msgpack(data, schemas.STORED)
-    try:
-        fields = _msgpack.unpackb(data, strict_map_key=True)
-    except ValueError as error:
-        raise schemas.MessageError("malformed", "", "msgpack", type(error).__name__) from None
-    if not isinstance(fields, dict):
-        raise schemas.MessageError("malformed", "", "a map", type(fields).__name__)
-    return fields
 
 
 def _seen_of(epochs: tuple[_Seen, ...]) -> tuple[SeenNumbers, ...]:

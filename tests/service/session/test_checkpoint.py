@@ -61,6 +61,14 @@ def test_equal_sessions_give_equal_bytes() -> None:
     assert (restored.run, encode_checkpoint(replace(restored, run=0))) == (1, data)
 
 
+def test_classes_keep_their_order() -> None:
+    """The classes of a profile are numbered by their order in it, whatever their names."""
+    kitti = optipmb.load_profile("kitti")
+    one = Session(SENSOR.stream, kitti)
+    assert sorted(kitti.labels) != list(kitti.labels)
+    assert decode_checkpoint(encode_checkpoint(one.snapshot())).parameters.labels == kitti.labels
+
+
 def test_a_snapshot_does_not_change_any_more() -> None:
     """It is a value: what the session does later is not in it, though it is encoded later."""
     one = example()
