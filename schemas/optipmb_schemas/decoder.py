@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from math import prod
+from struct import unpack
 from typing import Annotated, Any, Final, TypeVar, get_type_hints
 
 import msgspec
@@ -46,6 +47,7 @@ _MOST_DEPTH: Final = 4
 
 _TypedDict: Any = TypedDict  # made of types that are not known before
 _PARTS: Final[frozenset[type[Message]]] = frozenset({Pose, FieldOfView})
+"""Messages inside others that have required float64 arrays of fixed lengths and closed ranges alone."""
 _LITTLE: Final = sys.byteorder == "little"
 REFUSED: Final = (msgspec.MsgspecError, ValueError, TypeError, LookupError, RecursionError)
 """Errors of `checked`, and of msgspec."""
@@ -132,17 +134,19 @@ def read(payload: bytes, kind: type[T], limits: Limits) -> T | None:
     is_small = len(payload) <= MOST_BYTES and _encode(fields) == payload
     if not is_small and not is_encoding(payload, message):
         return None
-    if isinstance(message, Detections) and (not is_small or _is_in_order(fields, kind)):
+    if isinstance(message, Detections) and (not is_small or _is_in_order(fields, kind, len(payload))):
         object.__setattr__(message, "encoded", payload)
     return message
 
 
-def _is_in_order(fields: dict[str, Any], kind: type[Message]) -> bool:
+def _is_in_order(fields: dict[str, Any], kind: type[Message], size: int) -> bool:
     """Return whether `encode` gives these fields in this order, and the blocks among them without padding."""
     form = _form_of(kind, tuple(fields))
-    if not form.in_order or None in fields.values() or max([len(fields[name].data) for name in form.arrays]) >= LARGE:
+    if not form.in_order or None in [fields[name] for name in form.scalars]:
         return False
-    return all(_is_in_order(fields[name], kind.nested[name]) for name in form.nested)
+    if size >= LARGE and any(len(fields[name].data) >= LARGE for name in form.arrays):
+        return False
+    return not form.nested or all(tuple(fields[name]) == kind.nested[name].names for name in form.nested)
 
 
 def checked(fields: dict[str, Any], kind: type[T], limits: Limits) -> T:
@@ -156,7 +160,8 @@ def checked(fields: dict[str, Any], kind: type[T], limits: Limits) -> T:
     values = kind.optional | _checker_of(kind)({name: fields[name] for name in form.scalars})
     for name in form.nested:
         inner = kind.nested[name]
-        values[name] = _part(inner, _key(fields[name])) if inner in _PARTS else checked(fields[name], inner, limits)
+        part = fields[name]
+        values[name] = _part(inner, *_data_of(part, inner)) if inner in _PARTS else checked(part, inner, limits)
     if form.arrays:
         key = tuple([(name, (one := fields[name]).dtype, tuple(one.shape), len(one.data)) for name in form.arrays])
         values |= _plan_of(kind, key, limits)(fields)
@@ -167,15 +172,27 @@ def checked(fields: dict[str, Any], kind: type[T], limits: Limits) -> T:
     return message
 
 
-def _key(blocks: dict[str, Block]) -> tuple[tuple[str, str, tuple[int, ...], bytes], ...]:
-    return tuple([(name, one.dtype, tuple(one.shape), bytes(one.data)) for name, one in blocks.items()])
+def _data_of(fields: dict[str, Block], kind: type[Message]) -> list[bytes]:
+    """Return the bytes of the few arrays of a message inside another. Raises ValueError: they are of another form."""
+    _need(len(fields) == len(kind.arrays))
+    blocks = [(fields[name], described) for name, described in kind.arrays.items()]
+    _need(all(block.dtype == described.dtype and block.shape == [*described.shape] for block, described in blocks))
+    return [bytes(block.data) for block, _ in blocks]
 
 
 @lru_cache(1024)
-def _part(kind: type[Message], key: tuple[tuple[str, str, tuple[int, ...], bytes], ...]) -> Message:
-    """Return a message of a few arrays: most sensors send the same ones over and over."""
-    blocks = {name: Block(dtype, list(shape), memoryview(data)) for name, dtype, shape, data in key}
-    return checked(blocks, kind, DEFAULT)
+def _part(kind: type[Message], *data: bytes) -> Message:
+    """Return a message of a few arrays of their bytes: most sensors send the same ones over and over."""
+    arrays = {}
+    for (name, described), numbers in zip(kind.arrays.items(), data, strict=True):
+        _need(len(numbers) == 8 * int(described.shape[0]))
+        _need(all(described.low <= one <= described.high for one in unpack(f"<{described.shape[0]}d", numbers)))
+        arrays[name] = np.frombuffer(numbers)
+    for name, check in _form_of(kind, tuple(arrays)).checks:
+        check(arrays[name])
+    message = kind.trusted(arrays)
+    message.check()
+    return message
 
 
 def _is_generous(limits: Limits) -> bool:
