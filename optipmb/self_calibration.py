@@ -289,7 +289,7 @@ def followed(
     rows: Index,
     table: ClassTable,
 ) -> SelfCalibration:
-    """Return the counts of the posterior.
+    """Return the counts of the posterior, which go on from those of the density and of its prediction.
 
     Args:
         own: those of the density.
@@ -297,9 +297,9 @@ def followed(
         predicted: the prediction.
         posterior: of this frame.
         hit: (K,) measurement of each object of the posterior, negative where missed.
-        fate: of components and measurements, as `learn` takes it.
-        score: (D,) scores of the detector.
-        label: (D,) their classes.
+        fate: of components and measurements, as `learn` takes it, as the next three.
+        score: (D,) of the detector.
+        label: (D,) classes.
         rows: (M,) detection of each measurement.
         table: parameters as a table.
     """
@@ -307,26 +307,9 @@ def followed(
     dt = table.period if first else (now - density.stamp_ns) * 1e-9
     old, new, poisson, bins = density.bernoulli, posterior.bernoulli, density.poisson, own.components
     if len(predicted.poisson) < len(bins):
-        bins = bins[
-            rows_within(poisson.label, poisson.born_ns, density.stamp_ns, True, now, table.period, table.classes)
-        ]
+        stamps = density.stamp_ns, True, now, table.period
+        bins = bins[rows_within(poisson.label, poisson.born_ns, *stamps, table.classes)]
     looked = np.ones(len(new), np.bool_) if posterior.misses is None else posterior.misses.looked_ns == now
-    return SelfCalibration(
-        *learn(
-            own.classes.copy(),
-            own.objects,
-            old.id,
-            old.label,
-            new.id,
-            new.label,
-            hit,
-            looked,
-            bins,
-            predicted.poisson.label,
-            fate,
-            score,
-            label,
-            rows,
-            dt,
-        )
-    )
+    objects = own.objects, old.id, old.label, new.id, new.label, hit, looked
+    others = bins, predicted.poisson.label, fate, score, label, rows, dt
+    return SelfCalibration(*learn(own.classes.copy(), *objects, *others))

@@ -54,7 +54,7 @@ def view_of(message: schemas.Detections, pose: optipmb.Pose | None) -> optipmb.F
     """Return the field of view of a frame in the axes of its sensor, None when the sensor sees everything.
 
     Args:
-        message: whose it is.
+        message: the message of the frame.
         pose: `pose_of` the message.
 
     Raises:

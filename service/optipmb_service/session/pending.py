@@ -35,7 +35,7 @@ MAX_HELD: Final = 1024
 Beyond it the oldest goes on without its cloud, and behind a gap.
 """
 
-FRAMES: Final = 20
+CHECKED_FRAMES: Final = 20
 """Frames after which the advance of their stamps is looked at."""
 
 SHORTEST_STEP_NS: Final = SECOND // 1000
@@ -56,7 +56,7 @@ class PendingFrame:
 
     Attributes:
         frame_id: its identity.
-        detections: what `schemas.encode` gives for its detections.
+        detections: its detections as `schemas.encode` gives them.
         inputs: its detections as the tracker reads them.
         deadline_ns: until when it waits for its cloud (monotonic); None: it does not.
         ticket: value that the caller gave with it.
@@ -147,7 +147,7 @@ class SensorQueue:
         return arrived_ns + policy.cloud_wait_ns if has_points and policy.cloud_wait_ns > 0 else None
 
     def is_alive(self, frame_id: FrameId, decision: Decision) -> bool:
-        """Whether a frame shows that a publisher is the one to track, though another one has succeeded it.
+        """Return whether a frame shows that a publisher is the one to track, though another one has succeeded it.
 
         It has sent several frames in a row since the other one's last: for as long as a late frame may take, where the
         other one has sent fewer; else for as long as stamps may be apart.
@@ -161,7 +161,7 @@ class SensorQueue:
         return self._claim.add(frame_id, frames=JUMP_FRAMES, span_ns=span_ns)
 
     def reuses_number(self, frame_id: FrameId, detections: bytes, decision: Decision) -> bool:
-        """Whether a frame that is refused has the number of another frame."""
+        """Return whether a frame that is refused has the number of another frame."""
         if decision.verdict is Verdict.DUPLICATE:
             same = self.checksums.same(frame_id.epoch, frame_id.seq, detections)
             if same is not None:
@@ -297,7 +297,7 @@ class CloudBuffer:
         return next(others, None)
 
     def full_behind(self, stamp_ns: int) -> bool:
-        """Whether the shelf is full of clouds for frames later than a stamp: the next would push one of them off."""
+        """Return whether it is full of clouds for frames later than a stamp: the next would push one of them off."""
         full = len(self._kept) >= self._most or self.bytes >= self._most_bytes
         return full and all(stamp > stamp_ns for _, stamp in self._kept)
 
@@ -335,17 +335,19 @@ class StampCheck:
         self._count += 1
         first_ns, first_arrived_ns = self._first
         self._constant &= stamp_ns == first_ns
-        if self._count < FRAMES:
+        if self._count < CHECKED_FRAMES:
             return ""
         self._count = 0
         if self._constant:
-            return f"{FRAMES} frames with the stamp {stamp_ns}: the clock does not advance"
+            return f"{CHECKED_FRAMES} frames with the stamp {stamp_ns}: the clock does not advance"
         advance_ns, took_ns = stamp_ns - first_ns, arrived_ns - first_arrived_ns
-        if not 0 < advance_ns < (FRAMES - 1) * SHORTEST_STEP_NS or took_ns < SHORTEST_ARRIVAL_NS:
+        if not 0 < advance_ns < (CHECKED_FRAMES - 1) * SHORTEST_STEP_NS or took_ns < SHORTEST_ARRIVAL_NS:
             return ""
         for unit, factor in UNITS.items():
             if 1 / CERTAIN < advance_ns * factor / took_ns < CERTAIN:
-                return f"{FRAMES} frames in {took_ns / SECOND:.1f} s, {advance_ns} apart: stamps look like {unit}"
+                return (
+                    f"{CHECKED_FRAMES} frames in {took_ns / SECOND:.1f} s, {advance_ns} apart: stamps look like {unit}"
+                )
         return ""
 
 

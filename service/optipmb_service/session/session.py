@@ -37,7 +37,7 @@ from optipmb_service.session.values import (
     Begun,
     Counters,
     Deliveries,
-    Lineage,
+    Incarnation,
     Output,
     Policy,
     Quarantined,
@@ -70,7 +70,7 @@ class Session:
         policy: waiting, restarting, going back.
         fused: whether frames are those of several sensors, by the streams of the messages.
         instance: name of the service, for problems.
-        life: ids that an earlier session of the stream used.
+        incarnation: ids that an earlier session of the stream used.
         tracker: makes the tracker; tests put their own here.
         clock: measures how long a step takes, ns.
     """
@@ -83,13 +83,13 @@ class Session:
         *,
         fused: bool = False,
         instance: str = "session",
-        life: Lineage | None = None,
+        incarnation: Incarnation | None = None,
         tracker: Callable[[optipmb.Parameters], Steps] = optipmb.Tracker,
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> None:
-        life = life or Lineage()
+        incarnation = incarnation or Incarnation()
         self.stream = stream
-        self.run = life.run
+        self.run = incarnation.run
         """Number that grows whenever a session of the stream begins or is restored, by whichever process.
 
         A frame that was tracked before a crash may be tracked again after it, with others that were missing then, and
@@ -108,16 +108,20 @@ class Session:
         self._limit_wait(self._policy.cloud_wait_ns)
         limits, transition = self._policy.jump_limits, self._transition(parameters)
         self._timeline: Timeline = FusedTimeline(limits) if fused else StreamTimeline(limits, {"": ()})
-        start = FilterState(transition.no_objects(life.next_id), transition.name(None, life.starts), life.starts)
+        name = transition.name(None, incarnation.starts)
+        start = FilterState(transition.no_objects(incarnation.next_id), name, incarnation.starts)
         self._window = ReorderWindow(start, transition)
-        # Recovery: until when it lasts, the stamp and the arrival of the first frame of a fused session that waits for
-        # its other sensors, whether frames come faster than time passes, and the first stamp of one restored so early.
-        self._recovery_ns: int | None = None
-        self._began: tuple[int, int] | None = None
-        self._backlog = False
-        self._young_ns: int | None = None
-        self._now_ns = 0
         self._restored = False
+        self._recovery_ns: int | None = None
+        """Monotonic end of the recovery; None: there is none."""
+        self._began: tuple[int, int] | None = None
+        """Stamp and arrival of the first frame, while a fused session waits for its other sensors."""
+        self._from_cache = False
+        """Whether its frames come faster than time passes."""
+        self._young_ns: int | None = None
+        """First stamp of a fused session that was restored before it may have known all its sensors."""
+        self._now_ns = 0
+        """When frames became ready last (monotonic)."""
         if not fused:
             self._queue("")
 
@@ -211,7 +215,6 @@ class Session:
         head, transition = self._window.head, self._window.transition
         session = transition.name(head.last, head.starts + 1)
         self._begin(head.begun_anew(transition.no_objects(head.density.next_id), session))
-        self._follow_anew()
         return [*outputs, Begun(self.session, reason)]
 
     def configure(
@@ -259,7 +262,6 @@ class Session:
             head, transition = self._window.head, self._window.transition
             density = transition.no_objects(head.density.next_id)
             self._begin(replace(head, session=transition.name(None, head.starts), density=density))
-            self._follow_anew()
         return outputs
 
     # Checkpoints and recovery
@@ -387,7 +389,7 @@ class Session:
 
     @property
     def session(self) -> str:
-        """The id of the present life of the density."""
+        """Id of the present incarnation of the density."""
         return self._window.head.session
 
     @property
@@ -440,10 +442,10 @@ class Session:
         return self._policy.cloud_wait_ns / SECOND
 
     @property
-    def life(self) -> Lineage:
+    def incarnation(self) -> Incarnation:
         """The ids that it used, for a later session of the stream."""
         head = self._window.head
-        return Lineage(head.starts, head.density.next_id, self.run)
+        return Incarnation(head.starts, head.density.next_id, self.run)
 
     def state(self, *, shed: int = 0, queue: int = 0, closed: bool = False) -> schemas.SessionState:
         """Return the state as the message that answers a query.
@@ -517,11 +519,6 @@ class Session:
         for one in self._sensors.values():
             one.follow(self._timeline, self._window.base, gone)
 
-    def _follow_anew(self) -> None:
-        """Give the queues a timeline without a way back."""
-        for one in self._sensors.values():
-            one.timeline = self._timeline
-
     def _end_quarantine(self, sensor: str) -> list[Output]:
         """End the quarantine of a sensor whose publisher was restarted; the density of others goes on."""
         if not self._fused:
@@ -532,10 +529,10 @@ class Session:
     # Recovery
 
     def _end_recovery(self) -> None:
-        self._recovery_ns, self._began, self._backlog, self._young_ns = None, None, False, None
+        self._recovery_ns, self._began, self._from_cache, self._young_ns = None, None, False, None
 
     def _is_behind_gap(self, frame_id: FrameId) -> bool:
-        """Whether a frame waits for others that caches may hold: of its sensor, and of those that were live.
+        """Return whether a frame waits for others that caches may hold: of its sensor, and of those that were live.
 
         After a restore the frames between the checkpoint and the crash come from the caches. When a fused session
         begins, the caches come one after the other: until it is known which sensors there are, none goes ahead of the
@@ -549,8 +546,8 @@ class Session:
             first_ns, began_ns = self._began
             ahead_ns = stamp_ns - first_ns - margin_ns
             # Stamps that pass faster than time come from a cache, and the other caches begin as early.
-            self._backlog |= ahead_ns > self._now_ns - began_ns
-            return ahead_ns > (0 if self._backlog else self._now_ns - began_ns)
+            self._from_cache |= ahead_ns > self._now_ns - began_ns
+            return ahead_ns > (0 if self._from_cache else self._now_ns - began_ns)
         if self._young_ns is not None and stamp_ns - self._young_ns > margin_ns:
             return True
         for name, newest_ns in self._timeline.live().items():
@@ -617,7 +614,7 @@ class Session:
         if not self._fused:
             self._begin(self._window.head)  # in the window the order of publishers is that of their first frames
         self._timeline = self._timeline.reinstated(frame_id)
-        self._follow_anew()
+        self._follow()
         return outputs
 
     def _advance(self, now_ns: int | None) -> list[Output]:
@@ -634,7 +631,7 @@ class Session:
         outputs: list[Output] = []
         self._has_ready, taken, policy = False, 0, self._policy
         ends_ns = self._clock() + FLUSH_NS if now_ns is None else None
-        while pending := self._take(now_ns):
+        while pending := self._next_ready(now_ns):
             outputs += self._process(pending)
             taken += 1
             if ends_ns is not None and self._clock() >= ends_ns:
@@ -645,7 +642,7 @@ class Session:
                 break
         return outputs
 
-    def _take(self, now_ns: int | None) -> PendingFrame | None:
+    def _next_ready(self, now_ns: int | None) -> PendingFrame | None:
         """Take the earliest of the frames that are ready; None while none is."""
         queues = [one for one in self._sensors.values() if one.held]
         if len(queues) > 1:
@@ -666,8 +663,8 @@ class Session:
                 return self._refused(frame_id, decision)
         frame = ProcessedFrame(frame_id, pending.detections, pending.points, pending.missed, 0, [], decision.place)
         if decision.last:
-            return self._go([frame], timeline, frame_id, pending.ticket, began_ns, pending.inputs)
-        return self._go(self._window.inserted(frame, timeline.places()), timeline, frame_id, pending.ticket, began_ns)
+            return self._step([frame], timeline, frame_id, pending.ticket, began_ns, pending.inputs)
+        return self._step(self._window.inserted(frame, timeline.places()), timeline, frame_id, pending.ticket, began_ns)
 
     def _amend(self, message: schemas.Points, frame_id: FrameId, ticket: Any) -> list[Output]:
         """Put a cloud that came after its frame into the window."""
@@ -675,9 +672,9 @@ class Session:
         placed = self._window.amended(message, frame_id, published=self._timeline.knows(frame_id))
         if all(new is old for new, old in zip(placed, frames, strict=True)):
             return []
-        return self._go(placed, self._timeline, frame_id, ticket, began_ns)
+        return self._step(placed, self._timeline, frame_id, ticket, began_ns)
 
-    def _go(
+    def _step(
         self,
         placed: list[ProcessedFrame],
         timeline: Timeline,
@@ -730,9 +727,10 @@ class Session:
         return [problem, Quarantined(reason, dump)]
 
     def _begin(self, state: FilterState, transition: Transition | None = None) -> None:
-        """Go on from a state without a way back behind it, with another transition when the profile changes."""
+        """Begin the window with a state when no frame is pending, with another transition when the profile changes."""
         self._window = ReorderWindow(state, transition or self._window.transition)
         self._timeline = self._timeline.settle(state, self._timeline.frame_ids)
+        self._follow()
 
     # Problems
 

@@ -28,7 +28,7 @@ Position = tuple[_Metres, _Metres, _Metres]
 
 @record
 class FrameCounts:
-    """What became of the frames that were processed.
+    """Counts of the frames that were processed.
 
     Attributes:
         frames: tracked.
@@ -55,7 +55,7 @@ class FrameCounts:
 
 @record
 class PoseHistory:
-    """Where the sensor was, for judging where it can be.
+    """Last pose of a sensor, and those that were refused since.
 
     Attributes:
         stamp_ns: when; None before the first frame with a pose.
@@ -74,12 +74,12 @@ class PoseHistory:
 
 @record
 class SensorState:
-    """What the frames of one sensor so far mean for its next.
+    """State of one sensor after its frames so far.
 
     Attributes:
         cursor: its course; see `timeline`.
         tracked: epoch and highest sequence number of its frames tracked, for counting gaps.
-        reported: its unknown classes that were reported in this life.
+        reported: its unknown classes that were reported in this incarnation.
         pose_history: where it was.
     """
 
@@ -98,12 +98,12 @@ class FilterState:
 
     Attributes:
         density: after the last frame.
-        session: id of the present life of the density.
-        starts: lives so far.
+        session: id of the present incarnation of the density.
+        starts: incarnations so far.
         generation: see `timeline`; of the last frame tracked.
         last: the last frame processed, tracked or not.
         tracks: number of tracks at the last frame tracked.
-        counts: what became of the frames.
+        counts: of the frames.
         sensors: each sensor by its stream; the only one of a stream's own session by an empty name.
     """
 
@@ -126,7 +126,7 @@ class FilterState:
         return {name: one.cursor for name, one in self.sensors.items()}
 
     def begun_anew(self, density: optipmb.Density, session: str) -> FilterState:
-        """Return the state of the next life of the density, in which no classes were reported yet."""
+        """Return the state in which the next incarnation of the density begins: no classes were reported yet."""
         sensors = {
             name: replace(one, reported=frozenset(), pose_history=PoseHistory()) for name, one in self.sensors.items()
         }
@@ -151,7 +151,7 @@ class ProcessedFrame:
 
     Attributes:
         frame_id: its identity.
-        detections: what `schemas.encode` gives for its detections.
+        detections: its detections as `schemas.encode` gives them.
         points: its cloud.
         missed: whether it waited for a cloud in vain.
         revision: of the tracks that were published last for it.

@@ -55,7 +55,7 @@ JUMP_FRAMES: Final = 3
 
 @unique
 class Verdict(StrEnum):
-    """What becomes of a frame."""
+    """Decision on a frame that arrived."""
 
     FIRST = "first"
     """The first frame of the stream: a session begins."""
@@ -80,7 +80,7 @@ class Verdict(StrEnum):
 
     @property
     def admitted(self) -> bool:
-        """Whether the frame is to be processed."""
+        """Return whether the frame is to be processed."""
         return self not in _REFUSED
 
 
@@ -88,7 +88,7 @@ _REFUSED: Final = frozenset({Verdict.DUPLICATE, Verdict.JUMPED, Verdict.LATE, Ve
 
 
 class FrameId(NamedTuple):
-    """What identifies and orders a frame.
+    """Identity of a frame.
 
     Attributes:
         epoch: 16 bytes, new at every start of the publisher.
@@ -109,7 +109,7 @@ Order = tuple[int, int, str, int, int]
 
 @record
 class Placement:
-    """Where a frame belongs among the others.
+    """Place of a frame among the others.
 
     Attributes:
         era: the era that it belongs to.
@@ -135,7 +135,7 @@ class Placement:
 
 @record
 class Cursor:
-    """What frames up to some point mean for the one that follows them.
+    """State of a publisher's order after some frame, from which the place of the next follows.
 
     Attributes:
         epoch: publisher epoch of the last one, None before the first.
@@ -174,7 +174,7 @@ class Cursor:
         return Placement(self.era + 1, self.generation + 1, None, Verdict.RESTART, jump_ns, stamp_ns)
 
     def after(self, frame_id: FrameId, place: Placement) -> Cursor:
-        """Return the course after a frame at its place."""
+        """Return the cursor after a frame at its place."""
         if place.opens is Verdict.UNCONFIRMED:
             jumped = self._agreeing(frame_id)
             return replace(self, seq=max(self.seq, frame_id.seq), jumped=jumped, jumped_ns=frame_id.stamp_ns)
@@ -197,7 +197,7 @@ class Decision:
     """The verdict on one frame.
 
     Attributes:
-        verdict: what becomes of it.
+        verdict: whether it is processed, and how.
         place: where it belongs when it is admitted; for the others only how far it lay from the newest means something.
         last: whether it is admitted behind all others and moves none of them.
     """
@@ -209,10 +209,10 @@ class Decision:
 
 @record
 class SeenNumbers:
-    """Which frames of an epoch came.
+    """Sequence numbers of an epoch that came.
 
     Attributes:
-        epoch: whose.
+        epoch: the epoch.
         highest: highest sequence number.
         mask: bit i says whether `highest - i` came, for i below `WINDOW`.
     """
@@ -222,7 +222,7 @@ class SeenNumbers:
     mask: int
 
     def has(self, seq: int) -> bool:
-        """Whether a sequence number came, as far as that is remembered."""
+        """Return whether a sequence number came, as far as that is remembered."""
         return 0 <= self.highest - seq < WINDOW and bool(self.mask >> (self.highest - seq) & 1)
 
     def add(self, seq: int) -> SeenNumbers:
@@ -276,7 +276,7 @@ class Timeline:
         raise NotImplementedError
 
     def knows(self, frame_id: FrameId) -> bool:
-        """Whether frames of its sensor came in an epoch."""
+        """Return whether frames of its sensor came in an epoch."""
         return number_of(self.seen.get(frame_id.sensor, ()), frame_id.epoch) >= 0
 
     def note(self, frame_id: FrameId) -> Timeline:
@@ -299,7 +299,7 @@ class Timeline:
         return replace(self, seen={**self.seen, frame_id.sensor: epochs})
 
     def complete_until(self, frame_id: FrameId, processed: tuple[bytes, int] | None) -> bool:
-        """Whether no frame of its sensor is missing between the last one processed of its epoch and this one."""
+        """Return whether no frame of its sensor is missing between the last one processed of its epoch and this one."""
         epochs = self.seen.get(frame_id.sensor, ())
         number = number_of(epochs, frame_id.epoch)
         first = processed[1] + 1 if processed is not None and processed[0] == frame_id.epoch else 0
@@ -418,7 +418,7 @@ class StreamTimeline(Timeline):
         return Decision(place.opens if last else Verdict.INSERTED, place, last=last), timeline
 
     def _before_successor(self, at: int, places: tuple[Placement, ...]) -> bool:
-        """Whether the last frame of a stopped publisher was only overtaken by its successor's first, and fits."""
+        """Return whether a stopped publisher's last frame was only overtaken by its successor's first, and fits."""
         follows = at + 1 < len(places) and places[at + 1].opens is Verdict.NEW_EPOCH
         before = self._arrange(self.frame_ids)[0]
         others = (*places[:at], *places[at + 1 :])
@@ -433,7 +433,7 @@ class StreamTimeline(Timeline):
         return tuple(places), cursor
 
     def _free(self, frame_id: FrameId, place: Placement) -> bool:
-        """Whether a place lies behind the window's beginning and behind what its era continues."""
+        """Return whether a place lies behind the window's beginning and behind what its era continues."""
         if place.floor_ns is not None and frame_id.stamp_ns <= place.floor_ns:
             return False
         if self.floor is None:

@@ -3,10 +3,10 @@
 It is a pure function of state, frame and parameters, so frames can be processed again when one is inserted before them.
 When a step raises, nothing has changed.
 
-A session id names one life of the density. It is derived from the stream, the frame at which that life began and the
-parameters, so that a repeated run gives it again, and a service that was restarted without its checkpoints and went on
-with another frame does not. When a late frame turns out to be the first of a life, the life gets the id that it would
-have had in order; the tracks that were published under the other are corrected like all others behind that frame.
+A session id names one incarnation of the density. It is derived from the stream, the first frame of the incarnation and
+the parameters: a repeated run gives it again, and a service that was restarted without its checkpoints and went on with
+another frame does not. When a late frame turns out to be the first one, the incarnation gets the id that it would have
+had in order; tracks that were published under the other id are corrected like all others behind that frame.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Transition:
         self._digest = hashlib.blake2b(values.encode(), digest_size=16).digest()
 
     def name(self, frame_id: FrameId | None, starts: int) -> str:
-        """Return the id of a life that begins with or after a frame."""
+        """Return the id of an incarnation that begins with or after a frame."""
         digest = hashlib.blake2b(self._digest, digest_size=16, person=b"optipmb-session")
         where = [frame_id.epoch.hex(), frame_id.seq, frame_id.stamp_ns] if frame_id else []
         if frame_id and frame_id.sensor:
@@ -148,10 +148,10 @@ class Transition:
     def on_new_clock(
         self, before: FilterState, frame: ProcessedFrame, message: schemas.Detections | None = None
     ) -> FilterState | None:
-        """Return the state with its stamps set back, where a frame begins a life because the clock stepped back.
+        """Return the state with its stamps set back, if a frame starts an incarnation because the clock stepped back.
 
         The objects are where they were: for as long as the frames that agreed on the step took, they go on. None where
-        the frame begins no life, or its stamps or its sensor are too far from those before to say so.
+        the frame starts none, or its stamps or its sensor are too far from those before to say so.
         """
         sensor = before.sensor(frame.frame_id.sensor)
         cursor, last, history = sensor.cursor, before.last, sensor.pose_history
@@ -221,7 +221,7 @@ class Transition:
         return self._begin(before, frame, "publisher" if frame_id.epoch != last.epoch else "jump")
 
     def _others_stayed(self, before: FilterState, frame_id: FrameId) -> bool:
-        """Whether another sensor of the session is where it was, as far as was heard lately."""
+        """Return whether another sensor of the session is where it was, as far as was heard lately."""
         return any(
             one.pose_history.stamp_ns is not None
             and not one.pose_history.astray
@@ -297,7 +297,7 @@ def check_pose(
 
     A pose that jumps by a hundred metres (a lost localisation, poses of another vehicle) would leave every track behind
     and give birth to as many: the frame is refused. When several frames in a row agree with each other about the new
-    place, the sensor is there, whatever brought it: the next of them begins a new life of the session.
+    place, the sensor is there, whatever brought it: the next of them starts a new incarnation of the session.
 
     Args:
         before: poses of the frames before it.
@@ -372,5 +372,5 @@ def set_clock(density: optipmb.Density, stamp_ns: int) -> optipmb.Density:
 
 
 def begins_with(before: FilterState, frame: ProcessedFrame) -> bool:
-    """Whether the place of a frame makes it begin with an empty density."""
+    """Return whether the place of a frame makes it begin with an empty density."""
     return before.last is not None and frame.place.generation != before.generation

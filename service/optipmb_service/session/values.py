@@ -1,4 +1,4 @@
-"""What goes into a session and what comes out of it, as plain values; times in nanoseconds."""
+"""Settings, outputs and counts of sessions as plain values; times in nanoseconds."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class JumpLimits(NamedTuple):
     """Steps of the stamps, in the order of a publisher, beyond which they jumped.
 
     Attributes:
-        back_ns: largest step back: what a late frame is put in its place for.
+        back_ns: largest step back: within it a late frame is inserted.
         ahead_ns: largest step ahead.
     """
 
@@ -70,7 +70,7 @@ def total(*counts: int) -> int:
 
 
 class Steps(Protocol):
-    """What a session needs of a tracker; `optipmb.Tracker` has it."""
+    """Tracker of a session; `optipmb.Tracker` is one."""
 
     def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
         """Return the density after the frame, and its tracks."""
@@ -125,11 +125,11 @@ class Policy:
 
 
 @dataclass(frozen=True, slots=True)
-class Lineage:
-    """What outlives a session, so that neither its id nor its track ids come again.
+class Incarnation:
+    """Numbers that the next session of a stream continues, so that neither its id nor its track ids come again.
 
     Attributes:
-        starts: how many lives the stream has had.
+        starts: incarnations of the density so far.
         next_id: the next track id.
         run: see `Session.run`; of the next session, higher than that of any which may have published before.
     """
@@ -216,7 +216,7 @@ Output = Tracked | schemas.Problem | Begun | Quarantined
 
 @dataclass(slots=True)
 class Deliveries:
-    """What was not tracked, and what was corrected: all of it depends on how messages were delivered.
+    """Counts of frames that were not tracked, and of corrections: they depend on how messages were delivered.
 
     Attributes:
         duplicates: frames that came again.
@@ -235,7 +235,7 @@ class Deliveries:
 
 @dataclass(slots=True)
 class Counters:
-    """What happened to the messages of a session so far; see `Deliveries` and `state.FrameCounts`."""
+    """Counts of the messages of a session so far; see `Deliveries` and `state.FrameCounts`."""
 
     frames: int = 0
     duplicates: int = 0

@@ -2,7 +2,7 @@
 
 A late frame is inserted where it belongs, and those behind it are processed again; so they are when a cloud comes late.
 The state is then byte-equal to processing in order, because a step is a pure function and nothing else leads from one
-state to the next. That holds across the cuts between lives of the density too, and for the first frame of one.
+state to the next. That holds across the cuts between incarnations of the density too, and for the first frame of one.
 
 The window has the newest frames within a span of sensor time, a number of frames and a number of bytes: a function of
 the frames alone, so that sessions that took the same frames have the same window. States take memory and are easily

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from optipmb_service.session import convert
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.timeline import FrameId
 from router import Sensor

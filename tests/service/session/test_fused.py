@@ -11,7 +11,7 @@ from fusing import FRONT, FUSED, REAR, SIDE, drive
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_schemas import Pose
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.pending import SensorQueue
 from optipmb_service.session.session import Session
 from optipmb_service.session.timeline import FusedTimeline
