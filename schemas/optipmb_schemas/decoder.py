@@ -12,8 +12,8 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from itertools import chain
 from math import prod
+from struct import unpack
 from typing import Annotated, Any, Final, TypeVar, get_type_hints
 
 import msgspec
@@ -47,6 +47,7 @@ _MOST_DEPTH: Final = 4
 
 _TypedDict: Any = TypedDict  # made of types that are not known before
 _PARTS: Final[frozenset[type[Message]]] = frozenset({Pose, FieldOfView})
+"""Messages inside others that have required float64 arrays of fixed lengths and closed ranges alone."""
 _LITTLE: Final = sys.byteorder == "little"
 REFUSED: Final = (msgspec.MsgspecError, ValueError, TypeError, LookupError, RecursionError)
 """Errors of `checked`, and of msgspec."""
@@ -130,24 +131,22 @@ def read(payload: bytes, kind: type[T], limits: Limits) -> T | None:
         message = checked(fields, kind, limits)
     except REFUSED:
         return None
-    if len(payload) <= MOST_BYTES and _encode(fields) == payload:
-        kept = _is_in_order(fields, kind)
-    elif is_encoding(payload, message):
-        kept = True
-    else:
+    is_small = len(payload) <= MOST_BYTES and _encode(fields) == payload
+    if not is_small and not is_encoding(payload, message):
         return None
-    if kept and isinstance(message, Detections):
+    if isinstance(message, Detections) and (not is_small or _is_in_order(fields, kind, len(payload))):
         object.__setattr__(message, "encoded", payload)
     return message
 
 
-def _is_in_order(fields: dict[str, Any], kind: type[Message]) -> bool:
+def _is_in_order(fields: dict[str, Any], kind: type[Message], size: int) -> bool:
     """Return whether `encode` gives these fields in this order, and the blocks among them without padding."""
     form = _form_of(kind, tuple(fields))
-    if None in fields.values():
+    if not form.in_order or None in [fields[name] for name in form.scalars]:
         return False
-    inner = (_is_in_order(fields[name], kind.nested[name]) for name in form.nested)
-    return form.in_order and all(inner) and all(len(fields[name].data) < LARGE for name in form.arrays)
+    if size >= LARGE and any(len(fields[name].data) >= LARGE for name in form.arrays):
+        return False
+    return not form.nested or all(tuple(fields[name]) == kind.nested[name].names for name in form.nested)
 
 
 def checked(fields: dict[str, Any], kind: type[T], limits: Limits) -> T:
@@ -161,7 +160,8 @@ def checked(fields: dict[str, Any], kind: type[T], limits: Limits) -> T:
     values = kind.optional | _checker_of(kind)({name: fields[name] for name in form.scalars})
     for name in form.nested:
         inner = kind.nested[name]
-        values[name] = _part(inner, _key(fields[name])) if inner in _PARTS else checked(fields[name], inner, limits)
+        part = fields[name]
+        values[name] = _part(inner, *_data_of(part, inner)) if inner in _PARTS else checked(part, inner, limits)
     if form.arrays:
         key = tuple([(name, (one := fields[name]).dtype, tuple(one.shape), len(one.data)) for name in form.arrays])
         values |= _plan_of(kind, key, limits)(fields)
@@ -172,15 +172,27 @@ def checked(fields: dict[str, Any], kind: type[T], limits: Limits) -> T:
     return message
 
 
-def _key(blocks: dict[str, Block]) -> tuple[tuple[str, str, tuple[int, ...], bytes], ...]:
-    return tuple([(name, one.dtype, tuple(one.shape), bytes(one.data)) for name, one in blocks.items()])
+def _data_of(fields: dict[str, Block], kind: type[Message]) -> list[bytes]:
+    """Return the bytes of the few arrays of a message inside another. Raises ValueError: they are of another form."""
+    _need(len(fields) == len(kind.arrays))
+    blocks = [(fields[name], described) for name, described in kind.arrays.items()]
+    _need(all(block.dtype == described.dtype and block.shape == [*described.shape] for block, described in blocks))
+    return [bytes(block.data) for block, _ in blocks]
 
 
 @lru_cache(1024)
-def _part(kind: type[Message], key: tuple[tuple[str, str, tuple[int, ...], bytes], ...]) -> Message:
-    """Return a message of a few arrays: most sensors send the same ones over and over."""
-    blocks = {name: Block(dtype, list(shape), memoryview(data)) for name, dtype, shape, data in key}
-    return checked(blocks, kind, DEFAULT)
+def _part(kind: type[Message], *data: bytes) -> Message:
+    """Return a message of a few arrays of their bytes: most sensors send the same ones over and over."""
+    arrays = {}
+    for (name, described), numbers in zip(kind.arrays.items(), data, strict=True):
+        _need(len(numbers) == 8 * int(described.shape[0]))
+        _need(all(described.low <= one <= described.high for one in unpack(f"<{described.shape[0]}d", numbers)))
+        arrays[name] = np.frombuffer(numbers)
+    for name, check in _form_of(kind, tuple(arrays)).checks:
+        check(arrays[name])
+    message = kind.trusted(arrays)
+    message.check()
+    return message
 
 
 def _is_generous(limits: Limits) -> bool:
@@ -219,7 +231,14 @@ def _plan_of(kind: type[Message], key: _Key, limits: Limits) -> _Plan:
     for name, shape in shapes.items():
         by_type.setdefault(kind.arrays[name].dtype, {})[name] = shape
     groups = [_Group.of(kind, dtype, members) for dtype, members in by_type.items()]
-    return lambda blocks: dict(chain.from_iterable(group.arrays(blocks).items() for group in groups))
+
+    def arrays_of(blocks: dict[str, Block]) -> dict[str, Any]:
+        arrays: dict[str, Any] = {}
+        for group in groups:
+            group.read(blocks, arrays)
+        return arrays
+
+    return arrays_of
 
 
 def _column(data: memoryview, described: Array, shape: tuple[int, ...]) -> NDArray[Any]:
@@ -235,13 +254,13 @@ class _Group:
 
     Attributes:
         dtype: their number type.
-        columns: name, place and shape of each, and whether rows of it may be unknown.
+        columns: name, place and shape of each, None for one dimension, and whether rows of it may be unknown.
         known: how many numbers must be within their bounds.
         low, high: bounds of each number.
     """
 
     dtype: str
-    columns: tuple[tuple[str, slice, tuple[int, ...], bool], ...]
+    columns: tuple[tuple[str, slice, tuple[int, ...] | None, bool], ...]
     known: int
     low: NDArray[Any]
     high: NDArray[Any]
@@ -254,24 +273,25 @@ class _Group:
             described, begin, size = kind.arrays[name], end, prod(shapes[name])
             end += size
             known = known if described.unknown else end
-            columns.append((name, slice(begin, end), shapes[name], described.unknown))
+            shape = shapes[name] if len(shapes[name]) > 1 else None
+            columns.append((name, slice(begin, end), shape, described.unknown))
             least = np.asarray(described.low, dtype)
             low.append(np.full(size, np.nextafter(least, np.inf, dtype=dtype) if described.above else least))
-            high.append(np.full(size, np.asarray(described.high, dtype)))
+            high.append(np.full(size, described.high, dtype))
         return cls(dtype, tuple(columns), known, np.concatenate(low), np.concatenate(high))
 
-    def arrays(self, blocks: dict[str, Block]) -> dict[str, NDArray[Any]]:
-        """Return the columns. Raises ValueError: a number is out of its range."""
+    def read(self, blocks: dict[str, Block], arrays: dict[str, Any]) -> None:
+        """Add the columns to the arrays. Raises ValueError: a number is out of its range."""
         numbers = np.frombuffer(b"".join([blocks[name].data for name, *_ in self.columns]), self.dtype)
         good = (numbers >= self.low) & (numbers <= self.high)
-        arrays = {name: numbers[place].reshape(shape) for name, place, shape, _ in self.columns}
+        for name, place, shape, _ in self.columns:
+            arrays[name] = numbers[place] if shape is None else numbers[place].reshape(shape)
         if not good[good.argmin()]:
             _need(bool(good[: self.known].all()))
-            for name, place, shape, unknown in self.columns:
+            for name, place, _, unknown in self.columns:
                 if unknown:
-                    unknown_rows = np.isnan(arrays[name]).all(axis=-1, keepdims=True)
-                    _need(bool((good[place].reshape(shape) | unknown_rows).all()))
-        return arrays
+                    unknown_rows = np.isnan(array := arrays[name]).all(axis=-1, keepdims=True)
+                    _need(bool((good[place].reshape(array.shape) | unknown_rows).all()))
 
 
 def _need(fact: bool) -> None:  # noqa: FBT001 - one condition, as after assert
