@@ -1,8 +1,8 @@
 """Parameters for detectors that nobody tuned: careful values from the classes, the rate and the scores.
 
 Everything that counts frames follows from durations and the period. Noise is that of an average LiDAR detector, rather
-too wide than too narrow. Thresholds on scores follow the scores, so that a detector whose scores are low is not
-silenced; existence probabilities are not calibrated.
+too wide than too narrow. The tracker calibrates scores itself (`optipmb.self_calibration`), so that thresholds and the
+curve of existence hold for any detector.
 """
 
 from __future__ import annotations
