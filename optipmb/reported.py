@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-DOUBTED: Final = 8.0
+DOUBTED: Final = 4.0
 """Factor of R_x for objects that stand: more lies stiller, and farther from detections whose errors last."""
 
 STANDING: Final = 0.6

@@ -35,9 +35,9 @@ def test_hard_braking_is_followed() -> None:
 
 
 def test_boxes_of_a_standing_car_lie_still() -> None:
-    """Detections that jitter by 0.05 m in x and y are published 0.07 m apart from frame to frame, not 0.1 m."""
+    """Detections that jitter by 0.05 m in x and y are published 0.08 m apart at most, not 0.09 m."""
     steps = []
     for seed in range(3):
         centre = np.array([one.center[0, :2] for one in followed(np.zeros(60), 0.05, seed)[20:]])
         steps.append(np.hypot(*np.diff(centre, axis=0).T))
-    assert np.sqrt(np.mean(np.square(steps))) < 0.07
+    assert np.sqrt(np.mean(np.square(steps))) < 0.08
