@@ -27,6 +27,7 @@ from optipmb.density import (
     objects_in,
 )
 from optipmb.errors import DensityError
+from optipmb.frame import MAX_SPEED
 from optipmb.rows import Rows, shown
 
 if TYPE_CHECKING:
@@ -41,6 +42,9 @@ CLASSES: Final = "classes.probability"
 
 COUNTED: Final = "calibration"
 """Part of the names of `Density.self_calibration` among the columns."""
+
+SENSOR: Final = "sensor.motion"
+"""Name of `Density.sensor_motion` among the columns."""
 
 MOST_COUNTED: Final = 1e9
 """Bound of the counts of scores; those of the tracker are far below."""
@@ -106,6 +110,8 @@ def columns_of(density: Density) -> dict[str, NDArray[Any]]:
     }
     if density.self_calibration is not None:
         columns |= {f"{COUNTED}.{name}": getattr(density.self_calibration, name) for name in _shapes(0, 0, 0)}
+    if density.sensor_motion is not None:
+        columns |= {SENSOR: density.sensor_motion}
     return columns if density.class_probability is None else columns | {CLASSES: density.class_probability}
 
 
@@ -134,6 +140,8 @@ def bytes_of(density: Density) -> dict[str, bytes]:
         parts |= {
             f"{COUNTED}.{name}": getattr(density.self_calibration, name).view(np.float64) for name in _shapes(0, 0, 0)
         }
+    if density.sensor_motion is not None:
+        parts[SENSOR] = density.sensor_motion
     return {part: words.astype("<f8", copy=False).tobytes() for part, words in parts.items()}
 
 
@@ -158,6 +166,8 @@ def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[An
                     raise DensityError(f"{kind.part}.{name}", "flags, 0 or 1", "another number")
     if "classes" in parts:
         columns[CLASSES] = _words(parts, "classes", classes).reshape(-1, classes)
+    if SENSOR in parts:
+        columns[SENSOR] = _words(parts, SENSOR, 3)
     if f"{COUNTED}.classes" in parts:
         for name, (shape, kind) in _shapes(0, 0, 0).items():
             width = prod(shape[1:]) * np.dtype(kind).itemsize // 8
@@ -230,7 +240,12 @@ def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: 
     own = None
     if f"{COUNTED}.classes" in columns:
         own = _self_calibration(columns, _shapes(len(labels), len(bernoulli), len(poisson)))
-    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses, pi, own)
+    motion = columns.get(SENSOR)
+    if motion is not None:
+        if not (isinstance(motion, np.ndarray) and motion.shape == (3,) and (np.abs(motion) <= MAX_SPEED).all()):
+            raise DensityError(SENSOR, f"(3,) finite numbers up to {MAX_SPEED:g}", shown(motion))
+        motion = np.array(motion, np.float64)
+    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses, pi, own, motion)
 
 
 def _self_calibration(columns: Mapping[str, Any], shapes: Mapping[str, tuple[tuple[int, ...], Any]]) -> SelfCalibration:

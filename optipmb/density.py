@@ -222,6 +222,8 @@ class Density:
         class_probability: (N, C) posterior of each detected object over the classes (`optipmb.class_posterior`); None
             where the profile has no groups.
         self_calibration: counts of scores; None where the profile does not calibrate them itself.
+        sensor_motion: (3,) velocity, m/s, and turn rate, rad/s, with which what stands passes a sensor whose motion is
+            estimated (`optipmb.sensor_motion`); None where it is not: frames have poses, or the sensor stands.
     """
 
     stamp_ns: int
@@ -232,6 +234,7 @@ class Density:
     misses: Misses | None = None
     class_probability: NDArray[np.float64] | None = None
     self_calibration: SelfCalibration | None = None
+    sensor_motion: NDArray[np.float64] | None = None
 
     @property
     def missed_from_ns(self) -> NDArray[np.int64]:

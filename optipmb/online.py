@@ -56,6 +56,8 @@ class OnlineTracks:
         left_out: detections of classes that the profile lacks.
         paths: where the tracks will be at the `horizons` of the profile; None where it has none.
         class_probability: (N, C) probability of each class of the profile; None where it has no groups of classes.
+        sensor_motion: (3,) velocity, m/s, and turn rate, rad/s, with which what stands passes the sensor, where the
+            motion of the sensor is estimated; None elsewhere.
     """
 
     stamp_ns: int
@@ -65,6 +67,7 @@ class OnlineTracks:
     left_out: int
     paths: PredictedPaths | None = None
     class_probability: Array | None = None
+    sensor_motion: Array | None = None
 
     def __len__(self) -> int:
         return len(self.tracks)
@@ -214,6 +217,7 @@ class OnlineTracker:
             left_out=max(left_out, missing),
             paths=result.paths,
             class_probability=result.class_probability,
+            sensor_motion=result.density.sensor_motion,
         )
 
     def _classes(self, values: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.int64], int]:

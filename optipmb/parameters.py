@@ -302,6 +302,11 @@ class Parameters(_Table):
     self_calibration: bool = Field(
         default=False, exclude_if=not_, description="true: scores are calibrated by `optipmb.self_calibration`"
     )
+    sensor_motion: bool = Field(
+        default=False,
+        exclude_if=not_,
+        description="true: the motion of a sensor without poses is estimated (`optipmb.sensor_motion`)",
+    )
     horizons: Annotated[tuple[float, ...], AfterValidator(_ascending)] = Field(
         default=(),
         exclude_if=not_,  # a profile without is the document that it was before there were horizons

@@ -36,6 +36,7 @@ from optipmb.preprocess import Measurements, preprocess
 from optipmb.prune import Survivors, surviving_objects
 from optipmb.records import read_only, record
 from optipmb.self_calibration import calibrate, followed
+from optipmb.sensor_motion import follow_sensor
 from optipmb.table import ClassTable
 from optipmb.undetected import update_undetected, with_measurement_births
 from optipmb.update import ukf_updates
@@ -262,6 +263,8 @@ class Tracker:
         self._check(density, frame)
         now, table, modules = frame.stamp_ns, self._table, self.modules
         dt = table.period if density.stamp_ns == NO_FRAME else (now - density.stamp_ns) * 1e-9
+        if self.parameters.sensor_motion:
+            density = follow_sensor(density, frame)
 
         # PMB prediction
         predicted, repaired = predict(density, now, table)
@@ -315,6 +318,8 @@ class Tracker:
             given = frame.score, frame.label, chosen
             own = followed(own, density, predicted, posterior, hits, fate, *given, table)
             posterior = replace(posterior, self_calibration=own)
+        if density.sensor_motion is not None:
+            posterior = replace(posterior, sensor_motion=density.sensor_motion)
 
         # Track extraction
         tracks = extract(objects, posterior.missed_from_ns, hits, measurements, now, table, two_thresholds=modules.ote)

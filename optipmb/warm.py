@@ -16,6 +16,7 @@ from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
 from optipmb.parameters import load_profile, parse_parameters
 from optipmb.paths import predict_tracks
+from optipmb.sensor_motion import common_motion
 from optipmb.soundness import sound
 from optipmb.tracker import Modules, Tracker
 
@@ -53,6 +54,8 @@ def warm_up() -> int:
     try:
         _run()
         bev_iou(np.zeros((1, 5)), np.zeros((1, 5)))
+        place, label = np.zeros((1, 2)), np.zeros(1, np.int64)
+        common_motion(place, label, place, label, np.zeros(3), 0.0, 0.0, 0.0)
     finally:
         gc.set_threshold(*thresholds)
     return compilations() - before

@@ -81,6 +81,8 @@ class Tracked:
     detections: int
     left_out: dict[str, int]
     """Number of detections of each class that the profile lacks, or that are below its score filter."""
+    estimated: int
+    """Frames in which the motion of the sensor was estimated."""
     steps_ns: tuple[int, ...]
     seconds: float
 
@@ -242,12 +244,13 @@ def track_whole(
     begun = time.monotonic()
     found: dict[int, Tracks] = {}
     steps: list[int] = []
-    clouds = detections = 0
+    clouds = detections = estimated = 0
     left_out: Counter[str] = Counter()
     least = np.array([one.score_filter for one in parameters.classes.values()])
     given, low = np.zeros(len(least), np.int64), np.zeros(len(least), np.int64)
     smoother = Smoother(parameters) if smooth else None
-    tracker = Tracker(parameters, modules)
+    # A smoother joins the frames of a track, which an estimated motion has in axes of their own.
+    tracker = Tracker(parameters.model_copy(update={"sensor_motion": False}) if smooth else parameters, modules)
     density = tracker.initial()
     for frame in selected_frames(sequence, classes):
         taken = tracker_frame(parameters, sequence.name, frame)
@@ -259,6 +262,7 @@ def track_whole(
         if smoother is not None:
             smoother.add(frame.index, density, result.tracks)
         clouds += frame.cloud is not None
+        estimated += density.sensor_motion is not None
         detections += len(frame)
         if len(taken.source) < len(frame):
             left_out.update(frame.labels[i] for i in np.delete(frame.label, taken.source).tolist())
@@ -274,7 +278,7 @@ def track_whole(
         for index, one in smoother.tracks():
             paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None
             found[index] = found[index].model_copy(update=track_fields(one, paths))
-    return Tracked(found, clouds, detections, dict(left_out), tuple(steps), time.monotonic() - begun)
+    return Tracked(found, clouds, detections, dict(left_out), estimated, tuple(steps), time.monotonic() - begun)
 
 
 def track_fields(

@@ -34,6 +34,8 @@ class TrackedSequence:
     detections: int
     left_out: dict[str, int]
     """Number of detections of each class that the profile lacks, or that are below its score filter."""
+    estimated: int
+    """Frames in which the motion of the sensor was estimated."""
     cut: tuple[int, int]
     """Number of boxes beyond those that a benchmark accepts in a sample, and of the samples."""
     tracks: int
@@ -118,6 +120,7 @@ def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Col
         found.clouds,
         found.detections,
         found.left_out,
+        found.estimated,
         (sum(beyond), len(beyond)),
         len({int(number) for one in found.tracks.values() for number in one.id}),
         len({int(number) for one in found.tracks.values() for number in one.id[one.confirmed == 1]}),

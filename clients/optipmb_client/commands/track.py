@@ -142,6 +142,9 @@ def _complain(results: "list[TrackedSequence]", profile: str) -> None:
     if left_out:
         named = ", ".join(f"{count} {name}" for name, count in sorted(left_out.items()))
         warn(f"{left_out.total()} of {detections} detections are left out with profile {profile}: {named}")
+    if estimated := sum(one.estimated for one in results):
+        frames = sum(one.frames for one in results)
+        warn(f"the motion of the sensor is estimated in {estimated} of {frames} frames: boxes have no poses")
     cut, samples = map(sum, zip(*(one.cut for one in results), strict=True))
     if cut:
         warn(f"{cut} boxes in {samples} samples are not written: a sample of nuScenes has {NUSCENES_MAX_BOXES} at most")

@@ -1,0 +1,327 @@
+"""Motion of a sensor whose frames have no pose, from what most detections have in common (not in the paper).
+
+Boxes in the axes of a moving sensor all move from frame to frame. A profile with `sensor_motion` finds the rigid motion
+of the plane that takes most objects of the last frame to detections of this one, q = R(theta) p + t, and carries the
+density into the axes of the new frame: what stands stays where it was, and speeds are those over ground. Tracks are in
+the axes of the sensor, as the boxes are. Frames with a pose, and a sensor that stands, change nothing.
+
+The motion is found by votes of pairs of one class for t, for each of some angles theta around a guess, and refined by
+least squares over the pairs that it brings together. The guess is the motion of the frame before.
+
+Traffic in one direction looks like a sensor that drives the other way. Objects that move along their own headings are
+therefore taken for traffic, and a sensor is taken to drive forwards, along its x or y axis, as vehicles can. Once the
+sensor is known to move, objects that drive are predicted before they are compared.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from optipmb.compiled import kernel
+from optipmb.density import NO_FRAME, PHI, V
+from optipmb.records import read_only
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from optipmb.density import Density
+    from optipmb.frame import Frame
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
+    Pairs = tuple[Array, Index, Array, Index]
+
+MOST: Final = 64
+"""Objects nearest to the sensor, and detections of the highest scores, that are compared: the work is bounded."""
+CREW: Final = 5
+"""Objects that a motion has to bring together with detections, and"""
+SHARE: Final = 0.5
+"""their share of all, before a sensor is taken to move; half of both while it moves."""
+NEAR: Final = 0.6
+"""Distance, m, up to which an object and a detection are together."""
+CELL: Final = 0.75
+"""Side of a cell that collects votes, m."""
+ANGLE: Final = 0.0125
+"""Distance of the angles that are tried, rad."""
+MOST_CELLS: Final = 64
+MOST_ANGLES: Final = 32
+"""Cells along an axis and angles to either side: what is beyond them is not found."""
+STILL: Final = 0.15
+"""Mean distance of the objects to detections, from 0 to 1, below which a sensor stands: nothing is looked for."""
+LEAST_MOTION: Final = (0.25, 1.0)
+"""Mean motion of the objects, m and m/s, from which a sensor may be taken to move."""
+FASTEST: Final = (30.0, 0.6)
+"""Speed, m/s, and turn rate, rad/s, that a motion is looked for up to."""
+CHANGE: Final = (6.0, 1.5)
+"""Acceleration, m/s^2, and that of the turn, rad/s^2, by which a motion may differ from the guess."""
+TWO: Final = 2.0
+"""Weight, in points, from which a motion is fitted."""
+SHORTEST_S: Final = 0.005
+"""Time between frames below which a sensor does not move."""
+LONGEST_S: Final = 2.0
+"""Time between frames from which a motion is no guess of the next."""
+AHEAD: Final = 0.94
+"""Cosine of the angle to its heading up to which an object moves along it."""
+TRAFFIC: Final = 0.7
+"""Share of the objects that move along their headings from which the motion is theirs."""
+FORWARDS: Final = 0.96
+"""Cosine of the angle to an axis of the sensor up to which it drives along it."""
+CORNERING: Final = 5.0
+"""Largest acceleration across the way, m/s^2."""
+FARTHEST: Final = 80.0
+"""Largest mean distance of objects from the origin, m, where that is the sensor and not the origin of a world."""
+MOVING: Final = 2.0
+"""Speed, m/s, from which an object is predicted: slower ones are taken to stand, or all could drift with the sensor."""
+STANDING: Final = (0.3, 0.01)
+"""Speed, m/s, and turn rate, rad/s, below which a sensor may be taken to stand again."""
+
+
+def follow_sensor(density: Density, frame: Frame) -> Density:
+    """Carry a density into the axes of a frame without a pose, with the motion of the sensor found on the way.
+
+    Args:
+        density: posterior of the last frame, in the axes of that.
+        frame: with boxes in the axes of the sensor; a frame with a pose ends what was known of the motion.
+
+    Returns:
+        The density, the same where the sensor stands.
+    """
+    before, dt = density.sensor_motion, (frame.stamp_ns - density.stamp_ns) * 1e-9
+    if density.stamp_ns == NO_FRAME or dt < SHORTEST_S:
+        return density
+    standing = density if before is None else replace(density, sensor_motion=None)
+    if dt > LONGEST_S or (frame.pose is not None and not frame.pose.is_identity):
+        return standing
+    objects = density.bernoulli
+    recent = np.flatnonzero((objects.seen_ns == density.stamp_ns) & (objects.existence >= SHARE))
+    rows = recent[np.argsort(np.hypot(*objects.mean[recent, :2].T), kind="stable")[:MOST]]
+    best = np.argsort(-frame.score, kind="stable")[:MOST]
+    pairs = (
+        np.ascontiguousarray(objects.mean[rows, :2]),
+        objects.label[rows],
+        np.ascontiguousarray(frame.center[best, :2]),
+        frame.label[best],
+    )
+    ahead = np.column_stack((np.cos(objects.mean[rows, PHI]), np.sin(objects.mean[rows, PHI])))
+    if before is not None:
+        found = _continued(pairs, objects.mean[rows, V, None] * dt * ahead, before * dt, dt)
+        if found is not None:
+            still = math.hypot(found[0], found[1]) < STANDING[0] * dt and abs(found[2]) < STANDING[1] * dt
+            return standing if still else _carried(density, found, dt)
+    found = _begun(pairs, ahead, dt)
+    if found is None:
+        return standing
+    return _carried(density if before is not None else _over_ground(density, found, dt, frame), found, dt)
+
+
+def _continued(pairs: Pairs, driven: Array, guess: Array, dt: float) -> Array | None:
+    """Return the motion near that of the frame before, which stays where there are few objects; None if it is gone."""
+    start, label, target, target_label = pairs
+    start = start + np.where(np.hypot(*driven.T)[:, None] > MOVING * dt, driven, 0.0)
+    reach, turn, trust = 1.0 + CHANGE[0] * dt * dt, 0.02 + CHANGE[1] * dt * dt, (0.15 / (0.05 + 2.0 * dt * dt)) ** 2
+    found, count, _ = common_motion(start, label, target, target_label, guess, reach, turn, trust)
+    if count >= max(CREW // 2, 0.5 * SHARE * len(start)):
+        return found
+    return guess if len(start) < CREW else None
+
+
+def _begun(pairs: Pairs, ahead: Array, dt: float) -> Array | None:
+    """Return the motion of a sensor that was not known to move; None where it stands, for all that can be told."""
+    start, few = pairs[0], len(pairs[0]) < CREW
+    apart = 1.0 - together(*pairs, np.zeros(3))
+    if few or apart.sum() < STILL * len(start) or np.hypot(*start.T).mean() > FARTHEST:
+        return None
+    found, count, cost = common_motion(*pairs, np.zeros(3), FASTEST[0] * dt, FASTEST[1] * dt, 0.0)
+    joined = together(*pairs, found) > 0.0
+    if count < max(CREW, SHARE * len(start)) or cost > 0.5 * apart.sum():
+        return None
+    moved = (taken(start, found) - start)[joined]
+    size = np.hypot(*moved.T)
+    traffic = ((moved * ahead[joined]).sum(axis=1) > AHEAD * size).mean() > TRAFFIC
+    clear = size.mean() >= max(LEAST_MOTION[0], LEAST_MOTION[1] * dt)
+    return found if clear and not traffic and _drives(found, dt) else None
+
+
+def _drives(motion: Array, dt: float) -> bool:
+    """Tell whether a vehicle can have made a motion: forwards along an axis of the sensor, not too fast for a bend."""
+    way, half = math.hypot(motion[0], motion[1]), 0.5 * motion[2]
+    x = math.cos(half) * motion[0] + math.sin(half) * motion[1]
+    y = math.cos(half) * motion[1] - math.sin(half) * motion[0]
+    return bool(-min(x, y) >= FORWARDS * way and way * abs(motion[2]) <= CORNERING * dt * dt)
+
+
+def _over_ground(density: Density, motion: Array, dt: float, frame: Frame) -> Density:
+    """Return a density whose speeds, learnt as those in the axes of the sensor, are those over ground."""
+    objects = density.bernoulli
+    if np.isfinite(frame.velocity).any():
+        return density
+    mean = objects.mean.copy()
+    apparent = (taken(mean[:, :2], motion) - mean[:, :2]) / dt
+    along = apparent[:, 0] * np.cos(mean[:, PHI]) + apparent[:, 1] * np.sin(mean[:, PHI])
+    mean[:, V] -= np.where(objects.seen_ns > objects.born_ns, along, 0.0)
+    return replace(density, bernoulli=objects.replaced(mean=mean))
+
+
+def _carried(density: Density, motion: Array, dt: float) -> Density:
+    """Return a density in the axes of a sensor that made a motion."""
+    parts = {}
+    cos, sin = math.cos(motion[2]), math.sin(motion[2])
+    turn = np.eye(6)
+    turn[:2, :2] = (cos, -sin), (sin, cos)
+    for name in ("bernoulli", "poisson"):
+        rows = getattr(density, name)
+        mean = rows.mean.copy()
+        mean[:, :2] = taken(mean[:, :2], motion)
+        heading = mean[:, PHI] + motion[2]
+        mean[:, PHI] = heading - 2.0 * math.pi * np.ceil((heading - math.pi) / (2.0 * math.pi))
+        parts[name] = rows.replaced(mean=mean, covariance=turn @ rows.covariance @ turn.T)
+    return replace(density, **parts, sensor_motion=read_only(motion / dt))
+
+
+def taken(points: Array, motion: Array) -> Array:
+    """Return points (N, 2) where a motion (3,), t and theta, takes them."""
+    cos, sin = math.cos(motion[2]), math.sin(motion[2])
+    x, y = points[:, 0], points[:, 1]
+    return np.column_stack((cos * x - sin * y + motion[0], sin * x + cos * y + motion[1]))
+
+
+@kernel
+def nearest(x: float, y: float, label: int, target: Array, target_label: Index, most: float) -> tuple[int, float]:
+    """Return the nearest target of a class and its squared distance, -1 and `most` where none is nearer than that."""
+    best, least = -1, most
+    for m in range(target.shape[0]):
+        dx, dy = target[m, 0] - x, target[m, 1] - y
+        squared = dx * dx + dy * dy
+        if target_label[m] == label and squared < least:
+            best, least = m, squared
+    return best, least
+
+
+@kernel
+def together(start: Array, label: Index, target: Array, target_label: Index, motion: Array) -> Array:
+    """Return how near each point (N,) comes to a target of its class: 1 in its place, 0 from `NEAR` on."""
+    held = np.zeros(start.shape[0])
+    cos, sin = math.cos(motion[2]), math.sin(motion[2])
+    for n in range(start.shape[0]):
+        x = cos * start[n, 0] - sin * start[n, 1] + motion[0]
+        y = sin * start[n, 0] + cos * start[n, 1] + motion[1]
+        held[n] = 1.0 - nearest(x, y, label[n], target, target_label, NEAR * NEAR)[1] / (NEAR * NEAR)
+    return held
+
+
+@kernel
+def common_motion(
+    start: Array,
+    label: Index,
+    target: Array,
+    target_label: Index,
+    guess: Array,
+    reach: float,
+    turn: float,
+    trust: float,
+) -> tuple[Array, int, float]:
+    """Find the motion that most points have in common.
+
+    Args:
+        start: (N, 2) points.
+        label: (N,) their classes.
+        target: (M, 2) where they may have come to.
+        target_label: (M,) classes.
+        guess: (3,) t and theta around which it is looked for.
+        reach: how far t may be from the guess along each axis, m.
+        turn: how far theta may be, rad.
+        trust: weight of the guess in the least squares, in points.
+
+    Returns:
+        The motion (3,), how many points it brings to targets, and the sum of their distances, each from 0 to 1.
+    """
+    motion, votes_best, far_best = guess.copy(), 0, math.inf
+    side = min(MOST_CELLS, 2 * math.ceil(reach / CELL) + 2)
+    low = -0.5 * CELL * side
+    votes, voters = np.zeros((side + 2, side + 2), np.int64), np.empty((start.shape[0] * target.shape[0], 2), np.int64)
+    angles = min(MOST_ANGLES, math.ceil(turn / ANGLE))
+    for a in range(-angles, angles + 1):
+        theta = guess[2] + a * ANGLE
+        cos, sin = math.cos(theta), math.sin(theta)
+        count = 0
+        for n in range(start.shape[0]):
+            x = cos * start[n, 0] - sin * start[n, 1] + guess[0]
+            y = sin * start[n, 0] + cos * start[n, 1] + guess[1]
+            for m in range(target.shape[0]):
+                i, j = math.floor((target[m, 0] - x - low) / CELL), math.floor((target[m, 1] - y - low) / CELL)
+                if target_label[m] == label[n] and 0 <= i < side and 0 <= j < side:
+                    votes[i + 1, j + 1] += 1
+                    voters[count, 0], voters[count, 1] = i, j
+                    count += 1
+        for k in range(4 * count):  # squares of four cells, which meet in a corner of the cell of a pair
+            i, j = voters[k // 4, 0] + k % 2, voters[k // 4, 1] + k // 2 % 2
+            found = votes[i, j] + votes[i + 1, j] + votes[i, j + 1] + votes[i + 1, j + 1]
+            dx, dy = low + CELL * i, low + CELL * j
+            far = dx * dx + dy * dy + (20.0 * a * ANGLE) ** 2
+            if found > votes_best or (found == votes_best and far < far_best):
+                votes_best, far_best = found, far
+                motion[0], motion[1], motion[2] = guess[0] + dx, guess[1] + dy, theta
+        for k in range(count):
+            votes[voters[k, 0] + 1, voters[k, 1] + 1] = 0
+    for limit in (2.0 * CELL, 1.5 * CELL, NEAR, NEAR, NEAR):
+        _refine(start, label, target, target_label, limit, guess, trust, motion)
+    held = together(start, label, target, target_label, motion)
+    count = 0
+    for n in range(held.shape[0]):
+        count += held[n] > 0.0
+    return motion, count, held.shape[0] - held.sum()
+
+
+@kernel
+def _refine(
+    start: Array,
+    label: Index,
+    target: Array,
+    target_label: Index,
+    limit: float,
+    guess: Array,
+    trust: float,
+    motion: Array,
+) -> None:
+    """Fit `motion` to the pairs that it brings within a limit, and to the guess at four places, by least squares."""
+    cos, sin = math.cos(motion[2]), math.sin(motion[2])
+    total = p_x = p_y = q_x = q_y = 0.0
+    pairs, weights = np.empty((start.shape[0] + 4, 4)), np.empty(start.shape[0] + 4)
+    count = 0
+    for n in range(start.shape[0]):
+        x = cos * start[n, 0] - sin * start[n, 1] + motion[0]
+        y = sin * start[n, 0] + cos * start[n, 1] + motion[1]
+        m = nearest(x, y, label[n], target, target_label, limit * limit)[0]
+        if m >= 0:
+            pairs[count, 0], pairs[count, 1] = start[n, 0], start[n, 1]
+            pairs[count, 2], pairs[count, 3] = target[m, 0], target[m, 1]
+            weights[count] = 1.0
+            count += 1
+    cos, sin = math.cos(guess[2]), math.sin(guess[2])
+    for x, y in ((15.0, 0.0), (-15.0, 0.0), (0.0, 15.0), (0.0, -15.0)):
+        pairs[count, 0], pairs[count, 1] = x, y
+        pairs[count, 2], pairs[count, 3] = cos * x - sin * y + guess[0], sin * x + cos * y + guess[1]
+        weights[count] = 0.25 * trust
+        count += 1
+    for k in range(count):
+        w = weights[k]
+        total += w
+        p_x += w * pairs[k, 0]
+        p_y += w * pairs[k, 1]
+        q_x += w * pairs[k, 2]
+        q_y += w * pairs[k, 3]
+    if total < TWO:
+        return
+    p_x, p_y, q_x, q_y = p_x / total, p_y / total, q_x / total, q_y / total
+    dot = cross = 0.0
+    for k in range(count):
+        x, y, u, v = pairs[k, 0] - p_x, pairs[k, 1] - p_y, pairs[k, 2] - q_x, pairs[k, 3] - q_y
+        dot += weights[k] * (x * u + y * v)
+        cross += weights[k] * (x * v - y * u)
+    theta = math.atan2(cross, dot) if dot != 0.0 or cross != 0.0 else motion[2]
+    cos, sin = math.cos(theta), math.sin(theta)
+    motion[0], motion[1], motion[2] = q_x - (cos * p_x - sin * p_y), q_y - (sin * p_x + cos * p_y), theta

@@ -1,0 +1,190 @@
+"""The motion of a sensor without poses: found, used and reported where it moves, and nothing where it stands."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+import optipmb
+from optipmb.density import NO_FRAME
+from optipmb.sensor_motion import NEAR, common_motion, nearest, taken, together
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+GENERIC = optipmb.load_profile("generic")
+FIXED = GENERIC.model_copy(update={"sensor_motion": False})
+PLACES = np.random.default_rng(5).uniform((0.0, -25.0), (300.0, 25.0), (60, 2))
+"""Parked cars along a way of 300 m."""
+HEADINGS = np.random.default_rng(6).choice([0.0, math.pi], 60)
+
+
+def street(speed: float, rate: float, *, turn: float = 0.0, moving: float = 0.0) -> list[tuple[float, Array, Array]]:
+    """Times, boxes (x, y, yaw) and numbers of the cars within 50 m of a sensor that drives past them, in its axes.
+
+    With `moving` all cars drive along x at that speed.
+    """
+    rng, frames = np.random.default_rng(0), []
+    for k in range(int(6.0 * rate)):
+        t = k / rate
+        heading = turn * t
+        along, across = (math.sin(heading) / heading, (1.0 - math.cos(heading)) / heading) if heading else (1.0, 0.0)
+        cars = PLACES + np.array([moving * t - along * speed * t, -across * speed * t])
+        yaw = np.zeros(60) if moving else HEADINGS
+        cos, sin = math.cos(heading), math.sin(heading)
+        local = np.column_stack((cos * cars[:, 0] + sin * cars[:, 1], cos * cars[:, 1] - sin * cars[:, 0]))
+        seen = np.flatnonzero(np.hypot(*local.T) < 50.0)
+        noisy = local[seen] + rng.normal(0.0, 0.1, (len(seen), 2))
+        frames.append((t, np.column_stack((noisy, yaw[seen] - heading)), seen))
+    return frames
+
+
+def tracked(
+    parameters: optipmb.Parameters, frames: list[tuple[float, Array, Array]]
+) -> tuple[list[optipmb.OnlineTracks], dict[int, set[int]]]:
+    """The tracks of each frame, and the ids of each car."""
+    tracker, found, ids = optipmb.OnlineTracker(parameters), [], dict[int, set[int]]()
+    for t, boxes, cars in frames:
+        count = len(boxes)
+        tracks = tracker.update(
+            t=t,
+            center=np.column_stack((boxes[:, :2], np.zeros(count))),
+            size=np.tile([4.5, 1.9, 1.6], (count, 1)),
+            yaw=boxes[:, 2],
+            score=np.full(count, 0.9),
+            label=["car"] * count,
+        )
+        for identity, row in zip(tracks.id.tolist(), tracks.detection.tolist(), strict=True):
+            if row >= 0:
+                ids.setdefault(int(cars[row]), set()).add(identity)
+        found.append(tracks)
+    return found, ids
+
+
+@pytest.mark.parametrize(("speed", "turn", "rate"), [(15.0, 0.0, 10.0), (15.0, 0.0, 2.0), (10.0, 0.3, 5.0)])
+def test_parked_cars_keep_their_ids_and_stand(speed: float, turn: float, rate: float) -> None:
+    """Past a sensor that drives straight or round a bend: one id each, and no speed; without the estimate more ids where the way is long."""
+    frames = street(speed, rate, turn=turn)
+    found, ids = tracked(GENERIC, frames)
+    assert all(len(one) == 1 for one in ids.values())
+    for tracks in found[3:]:
+        assert tracks.sensor_motion is not None
+        np.testing.assert_allclose(tracks.sensor_motion, [-speed, 0.0, -turn], atol=1.5)
+    old = found[-1].age > 1.0
+    assert np.abs(found[-1].velocity[old]).max() < 1.0
+    _, without = tracked(FIXED, frames)
+    assert sum(map(len, without.values())) > len(ids) or speed / rate < 2.0
+
+
+@pytest.mark.parametrize("moving", [0.0, 12.0], ids=["parked", "traffic"])
+def test_a_sensor_that_stands_changes_no_byte(moving: float) -> None:
+    """Neither beside parked cars nor beside traffic that all drives one way, along its headings."""
+    frames = street(0.0, 10.0, moving=moving)
+    found, fixed = tracked(GENERIC, frames)[0], tracked(FIXED, frames)[0]
+    assert all(one.sensor_motion is None for one in found)
+    assert [one.tracks.words.tobytes() for one in found] == [one.tracks.words.tobytes() for one in fixed]
+
+
+def test_a_sensor_that_stops_stands() -> None:
+    """The estimate ends where the sensor does."""
+    moving = street(5.0, 10.0)
+    t, boxes, cars = moving[-1]
+    rng = np.random.default_rng(1)
+    still = [(t + 0.1 * k, boxes + rng.normal(0.0, [0.1, 0.1, 0.0], boxes.shape), cars) for k in range(1, 15)]
+    found, _ = tracked(GENERIC, moving + still)
+    assert found[len(moving) - 1].sensor_motion is not None
+    assert found[-1].sensor_motion is None
+
+
+def test_frames_with_a_pose_are_not_estimated() -> None:
+    """A pose that is given is used, and ends what was estimated before."""
+    tracker = optipmb.Tracker(GENERIC)
+    density = tracker.initial()
+    for t, boxes, _ in street(15.0, 10.0)[:10]:
+        density = tracker.step(density, frame_of(t, boxes)).density
+    assert density.sensor_motion is not None
+    pose = optipmb.Pose(np.array([15.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0]))
+    t, boxes, _ = street(15.0, 10.0)[10]
+    assert tracker.step(density, frame_of(t, boxes, pose)).density.sensor_motion is None
+
+
+def test_the_estimate_is_stored_with_the_density() -> None:
+    """Bytes make the same density again, which goes on with the same bytes; what no motion is, is refused by name."""
+    tracker, frames = optipmb.Tracker(GENERIC), street(15.0, 10.0)
+    density = tracker.initial()
+    for t, boxes, _ in frames[:10]:
+        density = tracker.step(density, frame_of(t, boxes)).density
+    columns = optipmb.columns_in(optipmb.bytes_of(density), len(density.labels))
+    again = optipmb.density_of(density.stamp_ns, density.next_id, columns, density.labels)
+    following = frame_of(*frames[10][:2])
+    first, second = (tracker.step(one, following).density for one in (density, again))
+    assert first.stamp_ns != NO_FRAME
+    assert optipmb.bytes_of(first) == optipmb.bytes_of(second)
+    with pytest.raises(optipmb.DensityError, match=r"sensor\.motion"):
+        optipmb.density_of(
+            density.stamp_ns, density.next_id, {**columns, "sensor.motion": np.full(3, np.nan)}, density.labels
+        )
+
+
+def frame_of(t: float, boxes: Array, pose: optipmb.Pose | None = None) -> optipmb.Frame:
+    """A frame of cars."""
+    count = len(boxes)
+    return optipmb.make_frame(
+        GENERIC,
+        stamp_ns=round(t * 1e9),
+        labels=("car",),
+        label=np.zeros(count, np.int64),
+        center=np.column_stack((boxes[:, :2], np.zeros(count))),
+        size=np.tile([4.5, 1.9, 1.6], (count, 1)),
+        yaw=boxes[:, 2],
+        score=np.full(count, 0.9),
+        pose=pose,
+    )[0]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins(seed: int) -> None:
+    """Found among outliers of its class and others, for any guess; it is numpy's least squares over these pairs."""
+    rng = np.random.default_rng(seed)
+    start, label = rng.uniform(-40.0, 40.0, (20, 2)), rng.integers(0, 2, 20)
+    true = np.array([-6.0, 0.8, 0.06]) + rng.normal(0.0, [0.5, 0.2, 0.01])
+    target = np.vstack((taken(start, true)[:14] + rng.normal(0.0, 0.05, (14, 2)), rng.uniform(-40.0, 40.0, (8, 2))))
+    target_label = np.r_[label[:14], rng.integers(0, 2, 8)]
+    motion, count, cost = common_motion(start, label, target, target_label, np.zeros(3), 10.0, 0.15, 0.0)
+    np.testing.assert_allclose(motion, true, atol=0.1)
+    assert count >= 14
+
+    moved = taken(start, motion)
+    distance = np.hypot(*(moved[:, None] - target[None]).transpose(2, 0, 1))
+    distance[label[:, None] != target_label[None]] = np.inf
+    rows = np.flatnonzero(distance.min(axis=1) < NEAR)
+    held = np.maximum(0.0, 1.0 - distance.min(axis=1) ** 2 / NEAR**2)
+    np.testing.assert_allclose(together(start, label, target, target_label, motion), held, atol=1e-12)
+    np.testing.assert_allclose(cost, 20.0 - held.sum())
+    assert count == len(rows)
+    assert [nearest(*moved[n], label[n], target, target_label, NEAR**2)[0] for n in rows] == distance[rows].argmin(
+        axis=1
+    ).tolist()
+
+    # The fit of complex numbers: q = e^{i theta} p + t
+    p, q = start[rows] @ [1, 1j], target[distance[rows].argmin(axis=1)] @ [1, 1j]
+    theta = np.angle(((p - p.mean()).conj() * (q - q.mean())).sum())
+    shift = q.mean() - np.exp(1j * theta) * p.mean()
+    np.testing.assert_allclose(motion, [shift.real, shift.imag, theta], atol=1e-9)
+
+
+def test_few_points_follow_the_guess() -> None:
+    """A guess that is trusted weighs in the fit as so many points; without points it is the motion."""
+    guess, label = np.array([-1.0, 0.1, 0.02]), np.zeros(1, np.int64)
+    start = np.array([[20.0, 5.0]])
+    alone = common_motion(start, label, start + 500.0, label, guess, 1.0, 0.05, 4.0)
+    np.testing.assert_allclose(alone[0], guess, atol=1e-12)
+    assert (alone[1], alone[2]) == (0, 1.0)
+    off = taken(start, guess) + np.array([0.5, 0.0])
+    drawn = common_motion(start, label, off, label, guess, 1.0, 0.0, 4.0)[0]
+    assert 0.0 < math.hypot(*(taken(start, drawn) - taken(start, guess))[0]) < 0.5
