@@ -18,7 +18,6 @@ from optipmb_service.app.kernels import warm_up
 from optipmb_service.app.loops import settle
 from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session import convert
-from optipmb_service.session.frame_tracks import tracks_of
 from optipmb_service.session.timeline import FrameId
 from optipmb_service.settings.model import Settings
 from optipmb_service.zenoh.connection import opened
@@ -70,7 +69,7 @@ class Frames:
         frame, ignored = convert.frame_of(self._parameters, message)
         result = self._tracker.step(self._densities[stream], frame)
         self._densities[stream] = result.density
-        tracks = tracks_of(
+        tracks = convert.tracks_of(
             result.tracks,
             None,
             stream=stream,

@@ -119,7 +119,7 @@ def _shapes(classes: int, objects: int, components: int) -> dict[str, tuple[tupl
     """Return shape and type of the arrays of `SelfCalibration`."""
     return {
         "classes": ((classes, COUNTS, BINS), np.float64),
-        "objects": ((objects, SLOTS, SLOT), np.float64),
+        "objects": ((objects, SLOTS, SLOT), np.uint16),
         "components": ((components,), np.int64),
     }
 
@@ -127,8 +127,9 @@ def _shapes(classes: int, objects: int, components: int) -> dict[str, tuple[tupl
 def bytes_of(density: Density) -> dict[str, bytes]:
     """Return the arrays of a density as bytes, one string for each part; `columns_in` reads them.
 
-    A number takes 8 bytes, the least significant first. The columns of a part lie one behind the other in the order of
-    `columns_of`, and a flag is the integer 0 or 1. Equal densities give equal bytes.
+    A number takes 8 bytes, one of the slots of `SelfCalibration` 2, the least significant first. The columns of a part
+    lie one behind the other in the order of `columns_of`, and a flag is the integer 0 or 1. Equal densities give equal
+    bytes.
     """
     parts = {"bernoulli": density.bernoulli.words, "poisson": density.poisson.words}
     if density.misses is not None:
@@ -169,7 +170,8 @@ def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[An
         columns[SENSOR] = _words(parts, SENSOR, 3)
     if f"{COUNTED}.classes" in parts:
         for name, (shape, kind) in _shapes(0, 0, 0).items():
-            words = _words(parts, f"{COUNTED}.{name}", prod(shape[1:]))
+            width = prod(shape[1:]) * np.dtype(kind).itemsize // 8
+            words = _words(parts, f"{COUNTED}.{name}", width)
             columns[f"{COUNTED}.{name}"] = words.view(kind).reshape(-1, *shape[1:])
     return columns
 

@@ -177,7 +177,7 @@ BINS: Final = 26
 COUNTS: Final = 5
 SLOTS: Final = 3
 SLOT: Final = BINS + 2
-"""Shapes of `SelfCalibration`; a slot has looks and seconds behind the bins."""
+"""Shapes of `SelfCalibration`; a slot has looks and ticks of 0.1 ms behind the bins."""
 NO_BIN: Final = -1
 
 
@@ -187,13 +187,13 @@ class SelfCalibration:
 
     Attributes:
         classes: (C, `COUNTS`, `BINS`) of the classes.
-        objects: (N, `SLOTS`, `SLOT`) of each detected object: detections by bin, looks and seconds of its slots, the
-            oldest first.
+        objects: (N, `SLOTS`, `SLOT`) uint16 of each detected object: detections by bin, looks and ticks of its slots,
+            the oldest first.
         components: (J,) int64 bin of the detection of each Poisson component, `NO_BIN` where it is not known.
     """
 
     classes: Array
-    objects: Array
+    objects: NDArray[np.uint16]
     components: NDArray[np.int64]
 
     @classmethod
@@ -203,7 +203,7 @@ class SelfCalibration:
             return density.self_calibration
         return cls(
             np.zeros((len(density.labels), COUNTS, BINS)),
-            np.zeros((len(density.bernoulli), SLOTS, SLOT)),
+            np.zeros((len(density.bernoulli), SLOTS, SLOT), np.uint16),
             np.full(len(density.poisson), NO_BIN, np.int64),
         )
 

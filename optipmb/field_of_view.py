@@ -2,8 +2,8 @@
 
 The detection probability of an object is ``p_d E[view]``: the share of the object that lies in the field of view, in
 the mean over its uncertain position. Outside it is zero, so the object keeps its existence probability (but for
-survival), its counters stand still, and another sensor may find it again. Several sensors can so feed one density by
-turns. A frame without a field of view looks at everything.
+survival), its counters stand still for some seconds, and another sensor may find it again. Several sensors can so feed
+one density by turns. A frame without a field of view looks at everything.
 
 Azimuth is counter-clockwise from x in the xy plane of the sensor (x forward, y left, z up), elevation is from that
 plane upwards, range is the distance from the sensor.
@@ -45,6 +45,9 @@ FARTHEST: Final = 1e9
 
 ROUNDING: Final = 1e-9
 """By how much an interval may be wider than the full turn, rad."""
+
+LONGEST_UNSEEN_S: Final = 6.0
+"""Time since the last detection, s, from which an object out of view is missed."""
 
 _NO_LIMIT: Final = 2.0
 """No sine and no cosine is larger."""
@@ -203,6 +206,10 @@ def look(
     most a nominal period (or the time since the last frame): an object that nobody could see for long has not been
     missed for long. A Poisson component that is out of view ages no further.
 
+    They stand still for a while only. Of an object that was not detected for `LONGEST_UNSEEN_S` all time counts as
+    missed, and of a component whose gate no longer holds one standard deviation of its position. With p_s = 1 nothing
+    else would end them.
+
     Args:
         view: of the frame, with its pose; None: it looks at everything.
         density: the prediction.
@@ -228,8 +235,13 @@ def look(
     time, missed_from_ns = np.empty(len(bernoulli)), np.empty(len(bernoulli), INDEX)
     stamps = before_ns, now_ns, table.period
     count_looks(in_view, misses.looked_ns, misses.missed_from_ns, *stamps, time, missed_from_ns)
+    lost = now_ns - bernoulli.seen_ns > LONGEST_UNSEEN_S * 1e9
+    missed_from_ns[lost] = misses.missed_from_ns[lost]
     if len(poisson):
-        hidden_ns = np.rint((1.0 - poisson_in_view) * max(0, now_ns - before_ns)).astype(np.int64)
+        xx, xy, yy = poisson.covariance[:, X, X], poisson.covariance[:, X, Y], poisson.covariance[:, Y, Y]
+        largest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
+        hidden = np.where(largest > table["gate"][poisson.label] ** 2, 0.0, 1.0 - poisson_in_view)
+        hidden_ns = np.rint(hidden * max(0, now_ns - before_ns)).astype(np.int64)
         poisson = poisson.replaced(born_ns=np.minimum(poisson.born_ns + hidden_ns, now_ns))
     looked_ns = np.where(in_view > 0.0, now_ns, misses.looked_ns)
     return Looks(in_view, poisson_in_view, time, Misses(missed_from_ns=missed_from_ns, looked_ns=looked_ns)), poisson

@@ -1,8 +1,8 @@
 """Parameters for detectors that nobody tuned: careful values from the classes, the rate and the scores.
 
 Everything that counts frames follows from durations and the period. Noise is that of an average LiDAR detector, rather
-too wide than too narrow. Thresholds on scores follow the scores, so that a detector whose scores are low is not
-silenced; existence probabilities are not calibrated.
+too wide than too narrow. The tracker calibrates scores itself (`optipmb.self_calibration`), so that thresholds and the
+curve of existence hold for any detector.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "score_filter": 0.05,
         "announce_score": 0.15,
         "birth_score": 0.5,
-        "nms_iou": 0.1,
+        "nms_iou": 0.05,
         "survival": 1.0,
         "gate": gate,
         "gate_deviations": GATE_DEVIATIONS,
@@ -83,7 +83,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "detection_floor": 0.6,
         "adaptive_birth_rate": 0.2,
         "undetected_birth_rate": 0.5,
-        "clutter_rate": 2.0,
+        "clutter_rate": 10.0,
         "area": 10_000.0,
         "poisson_steps": 2,
         "extract_new": 0.7,

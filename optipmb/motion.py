@@ -50,6 +50,9 @@ square."""
 START = 5.0
 """Where the acceleration decays, it carries a speed to at most so many times its own beyond it (`travel`)."""
 
+BRAKING = 3.0
+"""And braking that would end at minus so many times the speed, less one, ends at a standstill."""
+
 TINY_PIVOT = 1e-12
 """A pivot of the square root is lifted to this: a covariance that lost rank in rounding is repaired, and counted."""
 
@@ -117,8 +120,8 @@ def travel(
     ``v(t) = v + a tau (1 - e^(-t/tau))``; the way is the integral of ``v(t) [cos(omega t), sin(omega t)]``, with
     ``int e^(-t/tau) e^(i omega t) dt = (1 - e^(-dt/tau) e^(i omega dt)) / (1/tau - i omega)``.
 
-    Braking counts up to ``|v| / tau``, which ends at a standstill. So that the motion is continuous in v, an
-    acceleration counts up to `START` times as much: from a standstill objects start under the process noise.
+    Braking counts up to ``BRAKING |v| / tau``, and to a standstill at the end of dt. So that the motion is continuous
+    in v, an acceleration counts up to ``START |v| / tau``: from a standstill objects start under the process noise.
 
     Args:
         v: speed, m/s.
@@ -132,7 +135,7 @@ def travel(
     Returns:
         The way along the starting heading and across it, m, the speed and the acceleration afterwards.
     """
-    limit = abs(v) / tau if v * a < 0.0 else START * abs(v) / tau
+    limit = (min(BRAKING, 1.0 / (1.0 - kept)) if v * a < 0.0 else START) * abs(v) / tau
     a = min(max(a, -limit), limit)
     cos_u, sin_u, sinc, cosc = turn
     final, beta = v + a * tau, 1.0 / tau  # the speed that it comes to in the end
@@ -142,6 +145,28 @@ def travel(
     along -= scale * (real * beta - imaginary * omega)
     across -= scale * (real * omega + imaginary * beta)
     return along, across, v + a * tau * (1.0 - kept), a * kept
+
+
+@kernel
+def decay_and_turn(omega: float, dt: float, tau: float) -> tuple[float, Turn]:
+    """Return `kept` and `turn` of `travel`; of an acceleration that does not decay, values that nothing reads."""
+    if tau == math.inf:
+        return 1.0, (1.0, 0.0, 1.0, 0.0)
+    return math.exp(-dt / tau), turn_integrals(omega * dt)
+
+
+@kernel
+def displacement(
+    v: float, phi: float, omega: float, a: float, dt: float, tau: float, kept: float, turn: Turn
+) -> tuple[float, float, float, float]:
+    """Move one state, arguments as in `travel`: return the ways along x and y, the speed and the acceleration."""
+    if tau == math.inf:
+        along, across = ctra_displacement(v, omega, a, dt)
+        v += a * dt
+    else:
+        along, across, v, a = travel(v, omega, a, dt, tau, kept, turn)
+    cos_phi, sin_phi = math.cos(phi), math.sin(phi)
+    return cos_phi * along - sin_phi * across, sin_phi * along + cos_phi * across, v, a
 
 
 @kernel
@@ -196,16 +221,9 @@ def predict_state(
     repaired = square_root(covariance, root)
     v, phi = mean[V], mean[PHI]
     omega, a = (0.0, 0.0) if straight else (mean[OMEGA], mean[A])
-    kept, turn0 = 1.0, (1.0, 0.0, 1.0, 0.0)  # replaced where the acceleration decays, and not read elsewhere
-    if tau == math.inf:
-        along0, across0 = ctra_displacement(v, omega, a, dt)
-        v0, a0 = v + a * dt, a
-    else:
-        kept, turn0 = math.exp(-dt / tau), turn_integrals(omega * dt)
-        along0, across0, v0, a0 = travel(v, omega, a, dt, tau, kept, turn0)
+    kept, turn0 = decay_and_turn(omega, dt, tau)
+    dx0, dy0, v0, a0 = displacement(v, phi, omega, a, dt, tau, kept, turn0)
     cos_phi, sin_phi = math.cos(phi), math.sin(phi)
-    dx0 = cos_phi * along0 - sin_phi * across0
-    dy0 = sin_phi * along0 + cos_phi * across0
     for column in range(STATE):
         for side in range(2):
             step = SPREAD if side == 0 else -SPREAD

@@ -1,8 +1,10 @@
 """Where tracks are going: their states at times ahead, by the motion model of their class (eq. Motion Predict).
 
-A path is what the filter itself would hold of an object that it does not see again in a stream at the nominal rate of
-the profile: between two horizons the state is predicted in equal steps of at most one nominal period, each as in
-`optipmb.motion`. One long step would be another motion: its noise of speed and heading would reach no position.
+Between two horizons the state is predicted in equal steps of at most one nominal period, each as in `optipmb.motion`.
+One long step would be another motion: its noise of speed and heading would reach no position. The covariance is that of
+the filter. The mean is the motion of the state itself and not the mean of the sigma points: where the heading may turn
+far in the time ahead, the latter hardly moves at all, and no object goes that way. A turn rate and an acceleration of
+which little is known move it little: each counts by ``x^2 / (x^2 + P_xx)``, the weight of least mean square error.
 """
 
 from __future__ import annotations
@@ -14,10 +16,10 @@ import numpy as np
 
 from optipmb.columns import check_fitting
 from optipmb.compiled import kernel
-from optipmb.density import PHI, STATE, Density, copy_state
+from optipmb.density import OMEGA, PHI, STATE, A, Density, V, X, Y, copy_state
 from optipmb.errors import DensityError, FrameError
 from optipmb.heading import doubt
-from optipmb.motion import predict_state
+from optipmb.motion import decay_and_turn, displacement, predict_state, wrap
 from optipmb.parameters import HORIZONS, MAX_HORIZON_S, MAX_HORIZONS
 from optipmb.records import record
 from optipmb.soundness import sound, unsound
@@ -192,12 +194,25 @@ def predict_paths(
     for n in range(mean.shape[0]):
         own = classes[label[n]]
         copy_state(mean, covariance, n, state, spread, 0)
+        for s in (OMEGA, A):
+            squared = state[0, s] * state[0, s]
+            state[0, s] *= 0.0 if own.constant_velocity or squared == 0.0 else squared / (squared + spread[0, s, s])
         before = 0.0
         for h in range(horizons.shape[0]):
             ahead = horizons[h] - before
             steps = max(1, math.ceil(min(ahead / period - ROUNDING, MAX_STEPS * ahead / horizons[-1])))
             for _ in range(steps):
                 predict_state(state[0], spread[0], ahead / steps, own, root, points, state[1], spread[1])
+                move(state[0], ahead / steps, own.acceleration_time, state[1])
                 copy_state(state, spread, 1, state, spread, 0)
             copy_state(state, spread, 0, mean_out[n], covariance_out[n], h)
             before = horizons[h]
+
+
+@kernel
+def move(mean: Array, dt: float, tau: float, mean_out: Array) -> None:
+    """Move a state (6,) over dt, s, under an acceleration with time constant tau, s, and write where it is then."""
+    kept, turn = decay_and_turn(mean[OMEGA], dt, tau)
+    dx, dy, v, a = displacement(mean[V], mean[PHI], mean[OMEGA], mean[A], dt, tau, kept, turn)
+    mean_out[X], mean_out[Y], mean_out[V], mean_out[A] = mean[X] + dx, mean[Y] + dy, v, a
+    mean_out[PHI], mean_out[OMEGA] = wrap(mean[PHI] + mean[OMEGA] * dt), mean[OMEGA]

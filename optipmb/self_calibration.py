@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
     Index = NDArray[np.int64]
+    Slots = NDArray[np.uint16]
 
 BIN: Final = 0.4
 LOWEST: Final = -0.5 * BIN * BINS
@@ -54,10 +55,13 @@ LOWEST: Final = -0.5 * BIN * BINS
 DETECTIONS, LASTING, GIVEN, HITS, LOOKS = range(5)
 """Counts of a class by bin: evaluated detections, those that lasted, all scores of the detector, and hits and looks of
 inner slots by the mean bin of the slot."""
-SLOT_S: Final = 0.99
-"""Shortest time of a slot, s: a second, less the jitter of stamps."""
-OF_LOOKS, SECONDS = BINS, BINS + 1
+SLOT_TICKS: Final = 9900
+"""Shortest time of a slot: a second, less the jitter of stamps, in ticks of 0.1 ms."""
+OF_LOOKS, TICKS = BINS, BINS + 1
 """Columns of a slot behind the detections by bin."""
+MOST_TICKS: Final = 60_000
+MOST_LOOKS: Final = 60_000
+"""Where the counts of a slot end."""
 
 PRIOR: Final = 5.0
 MASS: Final = 3000.0
@@ -159,7 +163,7 @@ def needed_shares(classes: Array) -> Array:
 
 
 @kernel
-def next_slot(slots: Array, counts: Array, needed: float) -> None:
+def next_slot(slots: Slots, counts: Array, needed: float) -> None:
     """Evaluate the middle slot of an object, and begin a new one.
 
     Args:
@@ -167,7 +171,7 @@ def next_slot(slots: Array, counts: Array, needed: float) -> None:
         counts: (`COUNTS`, `BINS`) of the class; is written.
         needed: share of looks in which a lasting object is detected.
     """
-    hits, looks = slots[:, :BINS].sum(axis=1), slots[:, OF_LOOKS]
+    hits, looks = slots[:, :BINS].sum(axis=1).astype(np.float64), slots[:, OF_LOOKS].astype(np.float64)
     lasting = False
     for other in (0, 2):
         lasting |= hits[1] + hits[other] >= max(LEAST_HITS, needed * (looks[1] + looks[other]))
@@ -181,13 +185,13 @@ def next_slot(slots: Array, counts: Array, needed: float) -> None:
             middle = min(max(int(mean / hits[1] + 0.5), 0), BINS - 1)
             counts[HITS, middle] += share * hits[1]
             counts[LOOKS, middle] += share * looks[1]
-    slots[0], slots[1], slots[2] = slots[1].copy(), slots[2].copy(), 0.0
+    slots[0], slots[1], slots[2] = slots[1].copy(), slots[2].copy(), 0
 
 
 @kernel
 def learn(
     classes: Array,
-    before: Array,
+    before: Slots,
     before_id: Index,
     before_label: Index,
     objects_id: Index,
@@ -201,7 +205,7 @@ def learn(
     label: Index,
     rows: Index,
     dt: float,
-) -> tuple[Array, Array, Index]:
+) -> tuple[Array, Slots, Index]:
     """Return the counts after a frame.
 
     Args:
@@ -228,7 +232,7 @@ def learn(
     lasting = needed_shares(classes)
 
     # Objects: those that are gone are evaluated at once
-    after = np.zeros((objects_id.shape[0], SLOTS, SLOT))
+    after = np.zeros((objects_id.shape[0], SLOTS, SLOT), np.uint16)
     n = 0
     for k in range(objects_id.shape[0] + 1):
         last = k == objects_id.shape[0]
@@ -242,14 +246,15 @@ def learn(
         own = after[k]
         if n < before_id.shape[0] and before_id[n] == objects_id[k]:
             own[:] = before[n]
-            own[SLOTS - 1, SECONDS] += dt
+            own[SLOTS - 1, TICKS] = min(own[SLOTS - 1, TICKS] + 1e4 * dt + 0.5, MOST_TICKS)
             n += 1
-        if own[SLOTS - 1, SECONDS] >= SLOT_S and own[SLOTS - 1, OF_LOOKS] > 1.0:
+        if own[SLOTS - 1, TICKS] >= SLOT_TICKS and own[SLOTS - 1, OF_LOOKS] > 1:
             next_slot(own, classes[objects_label[k]], lasting[objects_label[k]])
-        own[SLOTS - 1, OF_LOOKS] += looked[k]
+        counted = own[SLOTS - 1, OF_LOOKS] < MOST_LOOKS
+        own[SLOTS - 1, OF_LOOKS] += looked[k] and counted
         if hit[k] >= 0:
             used[hit[k]] = True
-            own[SLOTS - 1, bin_of(score[rows[hit[k]]])] += 1.0
+            own[SLOTS - 1, bin_of(score[rows[hit[k]]])] += counted
 
     # Components, and detections that no object uses
     kept = 0
@@ -289,7 +294,7 @@ def followed(
     rows: Index,
     table: ClassTable,
 ) -> SelfCalibration:
-    """Return the counts of the posterior.
+    """Return the counts of the posterior, which go on from those of the density and of its prediction.
 
     Args:
         own: those of the density.
@@ -297,9 +302,9 @@ def followed(
         predicted: the prediction.
         posterior: of this frame.
         hit: (K,) measurement of each object of the posterior, negative where missed.
-        fate: of components and measurements, as `learn` takes it.
-        score: (D,) scores of the detector.
-        label: (D,) their classes.
+        fate: of components and measurements, as `learn` takes it, as the next three.
+        score: (D,) of the detector.
+        label: (D,) classes.
         rows: (M,) detection of each measurement.
         table: parameters as a table.
     """
@@ -307,26 +312,9 @@ def followed(
     dt = table.period if first else (now - density.stamp_ns) * 1e-9
     old, new, poisson, bins = density.bernoulli, posterior.bernoulli, density.poisson, own.components
     if len(predicted.poisson) < len(bins):
-        bins = bins[
-            rows_within(poisson.label, poisson.born_ns, density.stamp_ns, True, now, table.period, table.classes)
-        ]
+        stamps = density.stamp_ns, True, now, table.period
+        bins = bins[rows_within(poisson.label, poisson.born_ns, *stamps, table.classes)]
     looked = np.ones(len(new), np.bool_) if posterior.misses is None else posterior.misses.looked_ns == now
-    return SelfCalibration(
-        *learn(
-            own.classes.copy(),
-            own.objects,
-            old.id,
-            old.label,
-            new.id,
-            new.label,
-            hit,
-            looked,
-            bins,
-            predicted.poisson.label,
-            fate,
-            score,
-            label,
-            rows,
-            dt,
-        )
-    )
+    objects = own.objects, old.id, old.label, new.id, new.label, hit, looked
+    others = bins, predicted.poisson.label, fate, score, label, rows, dt
+    return SelfCalibration(*learn(own.classes.copy(), *objects, *others))

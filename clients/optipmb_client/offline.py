@@ -247,7 +247,7 @@ def track_whole(
     clouds = detections = estimated = 0
     left_out: Counter[str] = Counter()
     least = np.array([one.score_filter for one in parameters.classes.values()])
-    names = tuple(parameters.classes)
+    given, low = np.zeros(len(least), np.int64), np.zeros(len(least), np.int64)
     smoother = Smoother(parameters) if smooth else None
     # A smoother joins the frames of a track, which an estimated motion has in axes of their own.
     tracker = Tracker(parameters.model_copy(update={"sensor_motion": False}) if smooth else parameters, modules)
@@ -266,9 +266,14 @@ def track_whole(
         detections += len(frame)
         if len(taken.source) < len(frame):
             left_out.update(frame.labels[i] for i in np.delete(frame.label, taken.source).tolist())
-        low = taken.label[taken.score < least[taken.label]].tolist()
-        left_out.update(f"{names[i]} below its score_filter" for i in low)
+        given += np.bincount(taken.label, minlength=len(least))
+        if not parameters.self_calibration:  # which never filters the upper half of a class
+            low += np.bincount(taken.label[taken.score < least[taken.label]], minlength=len(least))
         on_frame()
+    for name, count, total in zip(parameters.labels, low.tolist(), given.tolist(), strict=True):
+        if count:
+            most = ", most of the class" if count > total / 2 else ""
+            left_out[f"{name} below its score_filter{most}"] = count
     if smoother is not None:
         for index, one in smoother.tracks():
             paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None

@@ -22,7 +22,7 @@ DTYPES: Final = {name: int(name[1]) for name in ("f4", "f8", "i1", "i2", "i4", "
 """Number types that a block may have, and their bytes. Numpy's spelling (`<f8`, `|u1`) is understood as well."""
 
 LARGE: Final = 4096
-"""Bytes from which on a block's data are viewed instead of copied, in both directions."""
+"""Bytes from which on the encoder aligns a block's data."""
 
 ALIGNMENT: Final = 8
 """Large blocks start at a multiple of this many bytes from the start of the message."""

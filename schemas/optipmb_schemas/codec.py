@@ -26,15 +26,15 @@ from optipmb_schemas.errors import MessageError, show
 from optipmb_schemas.limits import DEFAULT, Limits
 from optipmb_schemas.messages import Density, Detections, Points, Tracks
 from optipmb_schemas.model import Message
-from optipmb_schemas.structure import Span, check_json, check_msgpack
+from optipmb_schemas.structure import check_json, check_msgpack
 
 try:
-    from optipmb_schemas.compact import read_detections
+    from optipmb_schemas.decoder import read
 except ModuleNotFoundError as missing:  # without numpy the models read every form
     if missing.name != "numpy":
         raise
 
-    def read_detections(payload: bytes, limits: Limits) -> Detections | None:  # noqa: ARG001, D103  the other one's
+    def read(payload: bytes, kind: type["T"], limits: Limits) -> "T | None":  # noqa: ARG001, D103  the other one's
         return None
 
 
@@ -92,12 +92,10 @@ def decode(payload: bytes, expected: type[T], *, encoding: str = "", limits: Lim
     most = limits.max_json_bytes if form == "json" else limits.max_bytes
     if len(payload) > most:
         raise MessageError("too_large", "", f"at most {most} bytes of {form}", f"{len(payload)} bytes")
-    message = read_detections(payload, limits) if expected is Detections and form == "msgpack" else None
-    if isinstance(message, expected):
+    if form == "msgpack" and (message := read(payload, expected, limits)) is not None:
         return message
-    fields = _parse_json(payload, limits) if form == "json" else _parse_msgpack(payload, limits)
-    if not isinstance(fields, dict):
-        raise MessageError("malformed", "", f"one map with the fields of {expected.__name__}", show(fields))
+    what = f"one map with the fields of {expected.__name__}"
+    fields = _map_of(_parse_json(payload, limits), what) if form == "json" else read_map(payload, limits, what)
     return build(fields, expected, limits)
 
 
@@ -128,36 +126,19 @@ def _form(encoding: str, expected: type[Message]) -> str:
     return str(form)
 
 
-def _parse_msgpack(payload: bytes, limits: Limits) -> Any:
-    large = check_msgpack(payload, limits)
-    views = [memoryview(payload)[start:end] for _, start, end in large]
+def read_map(payload: bytes, limits: Limits, what: str = "one map") -> dict[str, Any]:
+    """Return the map that msgpack holds; `what` names it in errors.
+
+    Raises:
+        MessageError: it holds none, or one above a limit.
+    """
+    check_msgpack(payload, limits)
     try:
-        return _msgpack.unpackb(
-            _without(payload, large) if large else payload,
-            object_pairs_hook=_unique,
-            ext_hook=lambda _code, number: views[int.from_bytes(number, "big")],
-            strict_map_key=True,
-            max_str_len=limits.max_text,
-            max_array_len=limits.max_values,
-            max_map_len=limits.max_values,
-        )
+        return _map_of(_msgpack.unpackb(payload, object_pairs_hook=_unique, max_str_len=limits.max_text), what)
     except MessageError:
         raise
     except ValueError as error:
         raise MessageError("malformed", "", "msgpack, its keys texts, its texts in UTF-8", show(str(error))) from None
-
-
-def _without(payload: bytes, large: list[Span]) -> bytes:
-    """Return the payload with a numbered extension in place of every large byte string.
-
-    So msgpack builds everything but the large strings. The payload itself holds no extensions: the check refuses them.
-    """
-    parts: list[bytes] = []
-    end = 0
-    for number, (header, _, after) in enumerate(large):
-        parts += (payload[end:header], b"\xd6\x00", number.to_bytes(4, "big"))
-        end = after
-    return b"".join((*parts, payload[end:]))
 
 
 def _parse_json(payload: bytes, limits: Limits) -> Any:
@@ -169,6 +150,12 @@ def _parse_json(payload: bytes, limits: Limits) -> Any:
         raise
     except ValueError as error:
         raise MessageError("malformed", "", "JSON in UTF-8", show(str(error))) from None
+
+
+def _map_of(fields: Any, what: str) -> dict[str, Any]:
+    if not isinstance(fields, dict):
+        raise MessageError("malformed", "", what, show(fields))
+    return fields
 
 
 def _unique(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:

@@ -5,16 +5,19 @@ which software it was. It is one msgpack map, and does not depend on the service
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final, TypeVar
 
 import msgpack
+from pydantic import BeforeValidator, StrictBool, StrictBytes, StrictInt, TypeAdapter, ValidationError
 
-from optipmb_schemas.codec import decode
+from optipmb_schemas.codec import decode, read_map
 from optipmb_schemas.encoder import encode
-from optipmb_schemas.errors import MessageError, invalid
+from optipmb_schemas.errors import MessageError, invalid, show
 from optipmb_schemas.limits import Limits
 from optipmb_schemas.messages import Detections, Points
-from optipmb_schemas.structure import check_msgpack
+from optipmb_schemas.model import Message, first_error
+
+T = TypeVar("T", bound=Message)
 
 FORMAT: Final = "optipmb-dump"
 VERSION: Final = 1
@@ -28,6 +31,12 @@ STORED: Final = Limits(
 _msgpack: Any = msgpack  # its type information is partial
 
 
+def _stored(data: object, kind: type[T]) -> T:
+    if not isinstance(data, bytes):
+        raise invalid("", "bytes", data)
+    return decode(data, kind, limits=STORED)
+
+
 @dataclass(frozen=True)
 class DumpedFrame:
     """One of the last frames.
@@ -38,9 +47,9 @@ class DumpedFrame:
         anew: whether the density is empty before it, but for the next track id.
     """
 
-    detections: Detections
-    points: Points | None
-    anew: bool
+    detections: Annotated[Detections, BeforeValidator(lambda data: _stored(data, Detections))]
+    points: Annotated[Points | None, BeforeValidator(lambda data: data if data is None else _stored(data, Points))]
+    anew: StrictBool
 
 
 @dataclass(frozen=True)
@@ -64,9 +73,9 @@ class Dump:
     trace: str
     versions: dict[str, str]
     parameters: dict[str, Any]
-    stamp_ns: int
-    next_id: int
-    density: dict[str, bytes]
+    stamp_ns: StrictInt
+    next_id: StrictInt
+    density: dict[str, StrictBytes]
     frames: tuple[DumpedFrame, ...]
 
 
@@ -95,36 +104,15 @@ def decode_dump(payload: bytes) -> Dump:
     Raises:
         MessageError: they hold none, or one of another version.
     """
-    check_msgpack(payload, STORED)
-    try:
-        fields = _msgpack.unpackb(payload, strict_map_key=True)
-    except ValueError as error:
-        raise MessageError("malformed", "", "a dump", type(error).__name__) from None
-    if not isinstance(fields, dict) or fields.get("format") != FORMAT:
+    fields = read_map(payload, STORED)
+    if fields.get("format") != FORMAT:
         raise MessageError("malformed", "format", FORMAT, "another file")
-    version = fields.get("version")
-    if version != VERSION:
-        raise MessageError("unsupported_version", "version", str(VERSION), str(version)[:20])
-    kinds: dict[str, type] = {"stream": str, "error": str, "trace": str, "versions": dict, "parameters": dict}
-    kinds |= {"density": dict, "stamp_ns": int, "next_id": int, "frames": list}
-    for name, kind in kinds.items():
-        if not isinstance(fields.get(name), kind):
-            raise invalid(name, f"a value of type {kind.__name__}", fields.get(name))
-    frames = tuple(_frame(index, value) for index, value in enumerate(fields["frames"]))
-    versions = {str(name): str(value) for name, value in fields["versions"].items()}
-    plain = {name: fields[name] for name in kinds if name not in {"frames", "versions"}}
-    return Dump(**plain, versions=versions, frames=frames)
-
-
-def _frame(index: int, value: object) -> DumpedFrame:
-    if not isinstance(value, dict) or not isinstance(value.get("detections"), bytes):
-        raise invalid(f"frames[{index}]", "a frame", value)
-    points = value.get("points")
-    if not isinstance(points, bytes | None):
-        raise invalid(f"frames[{index}].points", "bytes", points)
+    if (version := fields.get("version")) != VERSION:
+        raise MessageError("unsupported_version", "version", str(VERSION), show(version))
     try:
-        detections = decode(value["detections"], Detections, limits=STORED)
-        cloud = None if points is None else decode(points, Points, limits=STORED)
-        return DumpedFrame(detections, cloud, bool(value.get("anew")))
-    except MessageError as error:
-        raise error.under(f"frames[{index}]") from None
+        return _DUMP.validate_python(fields)
+    except ValidationError as error:
+        raise first_error(error) from None
+
+
+_DUMP: Final = TypeAdapter(Dump)

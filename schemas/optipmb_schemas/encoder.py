@@ -28,7 +28,24 @@ def encode(message: Message, **others: Any) -> bytes:
         message: what is encoded.
         others: values that are known to be valid, in place of those of the message.
     """
-    kind, values = type(message), message.__dict__ | others if others else message.__dict__
+    return numeric.joined(_parts(type(message), message.__dict__ | others if others else message.__dict__))
+
+
+def is_encoding(payload: bytes, message: Message) -> bool:
+    """Return whether `encode` gives a payload for a message whose arrays were read from it."""
+    at = 0
+    for part in _parts(type(message), message.__dict__):
+        if type(part) is not bytes:
+            at += part.nbytes
+        elif payload.startswith(part, at):
+            at += len(part)
+        else:
+            return False
+    return at == len(payload)
+
+
+def _parts(kind: type[Message], values: dict[str, Any]) -> list[Any]:
+    """Return the encoding in parts, bytes and arrays."""
     fields = [(name, value) for name in kind.names if (value := values[name]) is not None]
     packer = _msgpack.Packer(buf_size=_BUFFER)
     parts: list[Any] = [packer.pack_map_header(len(fields))]
@@ -49,7 +66,7 @@ def encode(message: Message, **others: Any) -> bytes:
         offset += length
     if plain:
         parts.append(_without_head(packer.pack(plain), len(plain)))
-    return numeric.joined(parts)
+    return parts
 
 
 def encode_columns(

@@ -5,6 +5,7 @@ Integers fit 64 bits with sign; numbers are finite.
 
 import math
 import re
+from functools import lru_cache
 from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, WithJsonSchema
@@ -36,6 +37,7 @@ def check_chunk(text: str) -> str:
     return text
 
 
+@lru_cache(4096)
 def check_stream(text: str) -> str:
     """Return `text` when it is the name of a stream: `site/node/sensor`."""
     if len(text) > MAX_NAME or not _STREAM.fullmatch(text):
@@ -75,6 +77,7 @@ def _inside(path: str, key: str) -> str:
     return cut(f"{path}.{ascii(key)[1:-1]}".removeprefix("."))
 
 
+@lru_cache(64)
 def check_labels(labels: tuple[str, ...]) -> tuple[str, ...]:
     """Return `labels` when all are printable and differ from each other."""
     for i, label in enumerate(labels):

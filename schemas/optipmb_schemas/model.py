@@ -23,6 +23,8 @@ class Message(BaseModel):
 
     names: ClassVar[tuple[str, ...]] = ()
     """Names of the fields, in the order of their description."""
+    names_required: ClassVar[frozenset[str]] = frozenset()
+    """Names of those without a default."""
     arrays: ClassVar[dict[str, Array]] = {}
     """Descriptions of the array fields, by name."""
     columns: ClassVar[tuple[tuple[str, int, str], ...]] = ()
@@ -43,15 +45,22 @@ class Message(BaseModel):
         """Collect the array fields once per class."""
         super().__pydantic_init_subclass__(**kwargs)
         cls.arrays, cls.nested = {}, {}
-        for name, info in cls.model_fields.items():
-            for part in (*info.metadata, *_parts(info.annotation)):
+        for name in cls.model_fields:
+            for part in cls.metadata_of(name):
                 if isinstance(part, Array):
                     cls.arrays[name] = part
                 elif isinstance(part, type) and issubclass(part, Message):
                     cls.nested[name] = part
         cls.optional = {name: one.default for name, one in cls.model_fields.items() if not one.is_required()}
         cls.names = tuple(cls.model_fields)
+        cls.names_required = frozenset(cls.names) - cls.optional.keys()
         cls.columns = tuple((name, axis, letter) for name, one in cls.arrays.items() for axis, letter in one.letters)
+
+    @classmethod
+    def metadata_of(cls, name: str) -> list[Any]:
+        """Return the alternatives of the type of a field, and what its description adds to each."""
+        info = cls.model_fields[name]
+        return [*info.metadata, *_parts(info.annotation)]
 
     @classmethod
     def trusted(cls, fields: dict[str, Any]) -> Self:

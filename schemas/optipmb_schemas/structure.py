@@ -7,12 +7,8 @@ deep, and there are not too many. What remains to be built afterwards is bounded
 
 from typing import Final
 
-from optipmb_schemas.blocks import LARGE
 from optipmb_schemas.errors import MessageError
 from optipmb_schemas.limits import Limits
-
-Span = tuple[int, int, int]
-"""A byte string inside a payload: offsets of its header, its first byte and the byte after its last."""
 
 _SCALAR, _LIST, _MAP, _TEXT, _BYTES, _BAD = range(6)
 
@@ -35,15 +31,14 @@ _FIRST: Final[list[tuple[int, int, int]]] = [
 ]
 
 
-def check_msgpack(payload: bytes, limits: Limits) -> list[Span]:
-    """Walk a msgpack payload and return where its large byte strings are.
+def check_msgpack(payload: bytes, limits: Limits) -> None:
+    """Walk a msgpack payload.
 
     Raises:
         MessageError: `malformed` when the payload is not exactly one value or holds an extension type; `too_large` when
             it is above a limit. Texts are not decoded and keys are not compared here.
     """
     size, position = len(payload), 0
-    large: list[Span] = []
     around: list[int] = []  # items to come in each list or map around the current one
     items = values = 1  # items to come in the current one; values declared so far in all
     while items or around:
@@ -70,11 +65,8 @@ def check_msgpack(payload: bytes, limits: Limits) -> list[Span]:
         else:
             if kind == _BAD or (kind == _TEXT and length > limits.max_text):
                 raise _refused(kind, length, start, limits)
-            if length >= LARGE and kind == _BYTES:
-                large.append((start, position, position + length))
             position += length
     _check_end(position, size)
-    return large
 
 
 def _check_end(position: int, size: int) -> None:

@@ -62,7 +62,7 @@ MISTAKES: list[tuple[str, Any, list[str], int, str]] = [
         boxes(score=np.full(ROWS, 0.01)),
         ["--profile", "kitti"],
         1,
-        " Car below its score_filter",
+        " Car below its score_filter, most of the class",
     ),
     ("a rate of another profile", boxes(), ["--profile", "nuscenes"], 0, "for 2 Hz"),
     ("not a number", broken("x", 7, np.nan), [], 2, "d.csv:9: expected finite x, y and z"),

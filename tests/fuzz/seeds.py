@@ -6,7 +6,7 @@ import numpy as np
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-from optipmb_service.session.checkpoint_codec import HEAD, encode_checkpoint
+from optipmb_service.session.checkpoint import HEAD, encode_checkpoint
 from optipmb_service.session.session import Session
 from router import Sensor
 from sessions import chained, feed

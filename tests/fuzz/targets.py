@@ -12,11 +12,10 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.transcode import transcode
 from optipmb_service.grpc.selection import Pace, Selection
-from optipmb_service.session.checkpoint import CheckpointError
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint, seal
+from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
 from optipmb_service.session.convert import density_of
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Lineage, Policy
+from optipmb_service.session.values import Incarnation, Policy
 from router import Sensor
 
 LIMITS = schemas.Limits(max_bytes=2**16, max_json_bytes=2**16, max_values=2**12)
@@ -49,7 +48,7 @@ def checkpoints(data: bytes) -> None:
     with contextlib.suppress(CheckpointError):
         decode_checkpoint(data)
     try:
-        session = Session.restore(decode_checkpoint(seal(data, Lineage())), 0, POLICY)
+        session = Session.restore(decode_checkpoint(seal(data, Incarnation())), 0, POLICY)
     except CheckpointError:
         return
     _answer(session)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from optipmb_service.session.checkpoint_codec import decode_checkpoint
+from optipmb_service.session.checkpoint import decode_checkpoint
 
 FOLDER = Path(__file__).parent
 
@@ -34,7 +34,7 @@ def test_known_bytes_are_read_or_refused(path: Path) -> None:
 @pytest.mark.parametrize("name", ["empty", "window"])
 def test_a_search_of_checkpoints_begins_with_some_that_are_taken_up(name: str) -> None:
     """A decoder that refuses every seed is not searched (`python tests/fuzz/seeds.py` writes them anew)."""
-    decode_checkpoint(targets.seal((FOLDER / "corpus" / "checkpoints" / name).read_bytes(), targets.Lineage()))
+    decode_checkpoint(targets.seal((FOLDER / "corpus" / "checkpoints" / name).read_bytes(), targets.Incarnation()))
 
 
 @pytest.mark.parametrize("name", ["messages/Detections.msgpack", "messages/Detections.json", "checkpoints/window"])

@@ -68,7 +68,7 @@ def test_every_log_event_is_described() -> None:
 def test_every_problem_is_described() -> None:
     """The codes that the code reports, with those of the schemas, are those of the table."""
     reported = set(get_args(Code))
-    for call in calls({"problem_of", "_problem", "_report", "report"}):
+    for call in calls({"problem_of", "_problem", "_refuse", "_report", "report"}):
         code = call.args[0] if call.args else None
         reported |= texts(code) if isinstance(code, ast.Constant) else set()
         reported |= {text for keyword in call.keywords if keyword.arg == "code" for text in texts(keyword.value)}

@@ -21,7 +21,7 @@ from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.stream_queries import StreamQueries
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy, Quarantined, RefusedError, Tracked
 from registries import Around, packet_of, registry_of
@@ -161,7 +161,9 @@ class SessionSeam:
             elif isinstance(output, Quarantined):
                 self._out.add("quarantined", output.error.encode())
             else:
-                self._out.add(f"begun {output.reason}", repr(output).encode())
+                self._out.add(
+                    f"begun {output.reason}", f"{self._out.session(output.session)} {output.jump_ns}".encode()
+                )
 
 
 class Process(Around):

@@ -57,11 +57,12 @@ def _nodes(count: int) -> tuple[Array, Array]:
 def ctra(x: Array, dt: float, tau: float = math.inf) -> Array:
     """Gamma_CTRA: the integral of constant omega and of a, or of a exp(-t / tau), by Gauss-Legendre quadrature.
 
-    Where a decays, it counts up to |v| / tau in braking, up to five times as much otherwise.
+    Where a decays, it brakes with at most 3 |v| / tau and to a standstill, and speeds up with at most 5 |v| / tau.
     """
     px, py, v, phi, omega, a = x
     if tau < math.inf:
-        a = math.copysign(min(abs(a), abs(v) / tau * (1 if v * a < 0 else 5)), a)
+        most = min(3.0, 1 / (1 - math.exp(-dt / tau))) if v * a < 0 else 5.0
+        a = math.copysign(min(abs(a), most * abs(v) / tau), a)
     nodes, weights = _nodes(24 + math.ceil((abs(omega) + 1 / tau) * dt))
     t = 0.5 * dt * (nodes + 1.0)
 
@@ -269,13 +270,17 @@ def confidence(c: Any, odds: float) -> tuple[float, float]:
 
 
 def report(c: Any, z: Measurement | None, m: Array, P: Array) -> tuple[Array, Array]:
-    """The state that is told: its box updated once more with the noise that is left between R and R'."""
+    """The state that is told: its box updated once more with the noise that is left between R and R'.
+
+    That of an object that stands, by the mean square of its speed, counts four times.
+    """
     if z is None or c.reported_noise is None:
         return m, P
     less, noise = c.reported_noise, c.measurement_noise
     names = ["position", "position", "heading"]
     used = [i for i, name in enumerate(names) if getattr(less, name) < getattr(noise, name)]
-    left = [1 / (getattr(less, names[i]) ** -2 - getattr(noise, names[i]) ** -2) for i in used]
+    doubted = 4.0 if m[2] ** 2 + P[2, 2] <= 0.6**2 else 1.0
+    left = [doubted / (getattr(less, names[i]) ** -2 - getattr(noise, names[i]) ** -2) for i in used]
     H = np.eye(6)[[[0, 1, 3][i] for i in used]]
     nu = np.array([z.xy[0] - m[0], z.xy[1] - m[1], fold(z.yaw - m[3])])[used]
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(left))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from optipmb_client.datasets import open_dataset
 from optipmb_schemas import Detections, Keys, Points, Pose, SessionState, Tracks, decode, encode, encoding_of
-from optipmb_service.session.checkpoint_codec import digest_of
+from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy, Tracked
 from router import plain

@@ -335,6 +335,7 @@ class Recorded:
     counts: Counter[str] = field(default_factory=Counter)
     digests: dict[str, Any] = field(default_factory=lambda: defaultdict(hashlib.sha256))
     final: Merged = field(default_factory=Merged)
+    sessions: dict[str | None, str] = field(default_factory=lambda: {None: ""})
 
     def add(self, kind: str, content: bytes) -> None:
         """Add an output."""
@@ -342,15 +343,23 @@ class Recorded:
         self.digests[kind].update(len(content).to_bytes(8, "big") + content)
 
     def message(self, message: Message) -> None:
-        """Add a message, without what depends on clocks and on the form of checkpoints."""
+        """Add a message, without what depends on clocks, on the form of checkpoints and on all fields of profiles."""
+        if isinstance(message, Tracks | SessionState | SessionParameters):
+            message = message.model_copy(update={"session": self.session(message.session)})
         if isinstance(message, Tracks):
             run = message.delivery.run if message.delivery else 0
             self.final.add(message, run)
             message = message.model_copy(update={"delivery": delivery(run)})
         elif isinstance(message, SessionState):
             message = message.model_copy(update={"digest": ""})
+        elif isinstance(message, SessionParameters):
+            message = message.model_copy(update={"values": None})
         kind = f"problem {message.code}" if isinstance(message, Problem) else type(message).__name__
         self.add(kind, encode(message))
+
+    def session(self, name: str | None) -> str:
+        """Return the number of a session in place of its id, which is a hash of the whole profile."""
+        return self.sessions.setdefault(name, f"{len(self.sessions):032x}")
 
     def summary(self) -> dict[str, str]:
         """Return what is compared."""

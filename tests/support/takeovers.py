@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from fleet import PROFILE
 from optipmb_schemas import Keys, SessionState, Tracks, decode
-from optipmb_service.session.checkpoint_codec import digest_of
+from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Tracked
 from router import Sensor, plain, until

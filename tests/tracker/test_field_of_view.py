@@ -274,6 +274,25 @@ def test_looks_weigh_by_the_time_since_the_last_one() -> None:
     assert len({lives(0.0), lives(0.01), lives(0.05), lives(0.09)}) == 1
 
 
+@pytest.mark.parametrize("profile", CARS)
+def test_what_left_the_view_ends(profile: str) -> None:
+    """Cars pass one after the other: no object is kept longer than 6 s and its misses, none published 7.5 s unseen."""
+    parameters, label = CARS[profile]
+    tracker, own = optipmb.Tracker(parameters), parameters.classes[label]
+    density, unseen, kept = tracker.initial(), 0.0, 0
+    for k in range(300):
+        x = 60.0 - 12.0 * (0.1 * k % 5.0)
+        frame = boxes(parameters, 0.1 * k, (x, 3.5), yaw=math.pi, label=label, field_of_view=FORWARD)
+        if x <= 4.0:
+            frame = boxes(parameters, 0.1 * k, field_of_view=FORWARD)
+        result = tracker.step(density, frame)
+        density = result.density
+        unseen = max(unseen, result.tracks.time_since_detection.max(initial=0.0))
+        kept = max(kept, len(density.bernoulli), len(density.poisson))
+    assert 5.0 < unseen < 6.0 + (own.extract_misses + 1) * parameters.nominal_period
+    assert kept <= 4
+
+
 def test_components_out_of_view_neither_age_nor_lose_weight() -> None:
     """A low score announces an object; when the sensor looks there again some periods later, it is still announced."""
     tracker = optipmb.Tracker(KITTI)

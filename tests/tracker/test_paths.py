@@ -1,4 +1,4 @@
-"""Predicted paths against the filter's own prediction, and against the textbook's step by step."""
+"""Predicted paths against the textbook's motion, step by step."""
 
 from __future__ import annotations
 
@@ -48,23 +48,9 @@ def followed() -> tuple[optipmb.Tracker, optipmb.StepResult]:
     return tracker, result
 
 
-def test_a_path_is_what_the_filter_predicts_of_an_object_that_it_does_not_see() -> None:
-    """Frames without detections lead to the states at the horizons."""
-    tracker, result = followed()
-    paths = optipmb.predict_tracks(result.density, [0.1, 0.3, 0.5], KITTI)
-    density = result.density
-    for k in range(1, 6):
-        density = tracker.step(density, frame(900_000_000 + k * 100_000_000, None)).density
-        if k % 2:
-            rows = np.searchsorted(paths.id, density.bernoulli.id)
-            assert len(rows) == 3
-            np.testing.assert_allclose(paths.mean[rows, k // 2], density.bernoulli.mean, rtol=1e-12, atol=1e-12)
-            np.testing.assert_allclose(paths.covariance[rows, k // 2], density.bernoulli.covariance, rtol=1e-9)
-
-
 @pytest.mark.parametrize("tau", [math.inf, 1.5])
 def test_states_are_predicted_as_numpy_does_step_by_step(tau: float) -> None:
-    """Equal steps of at most a period between horizons, each the textbook's, for both motion models."""
+    """In steps of at most a period the mean moves by itself, the turn rate and acceleration weighed by their doubt."""
     rng = np.random.default_rng(0)
     mean, root = rng.normal(0, [50, 50, 8, 1, 0.3, 1], (6, 6)), rng.normal(0, 0.2, (6, 6, 6))
     covariance = root @ root.transpose(0, 2, 1) + 0.01 * np.eye(6)
@@ -74,14 +60,32 @@ def test_states_are_predicted_as_numpy_does_step_by_step(tau: float) -> None:
     classes = class_rows(2, process_noise=noise, acceleration_time=tau, constant_velocity=straight)
     predict_paths(mean, covariance, label, horizons, 0.1, classes, means, covariances)
     for n in range(6):
-        c, m, spread = label[n], mean[n], covariance[n]
+        c, m, spread = label[n], mean[n].copy(), covariance[n]
+        doubt = np.diag(spread)[4:]
+        m[4:] *= 0.0 if straight[c] else m[4:] ** 2 / (m[4:] ** 2 + doubt)
         for h, (ahead, steps) in enumerate(((0.1, 1), (0.15, 2), (0.75, 8), (0.001, 1))):
             for _ in range(steps):
-                m, spread = textbook.predict(
+                moved = (
+                    textbook.constant_velocity(m, ahead / steps)
+                    if straight[c]
+                    else textbook.ctra(m, ahead / steps, tau)
+                )
+                _, spread = textbook.predict(
                     m, spread, np.diag(noise[c] ** 2), ahead / steps, tau, straight=bool(straight[c])
                 )
+                m = moved
+            m[3] = textbook.wrap(m[3])
             np.testing.assert_allclose(means[n, h], m, rtol=1e-9, atol=1e-9)
             np.testing.assert_allclose(covariances[n, h], spread, rtol=1e-8, atol=1e-9)
+
+
+def test_a_path_goes_where_an_object_of_unknown_turn_rate_does() -> None:
+    """A walker at 1.4 m/s whose heading may turn far in 3 s is still predicted to go 4.2 m, not half a metre."""
+    mean, covariance = np.array([[0.0, 0.0, 1.4, 0.3, 0.4, 0.0]]), np.diag([0.04, 0.04, 0.04, 0.1, 1.0, 0.1])[None]
+    classes = class_rows(1, process_noise=[[0.05, 0.05, 0.8, 1.6, 0.5, 0.3]], acceleration_time=math.inf)
+    found, spread = np.empty((1, 1, 6)), np.empty((1, 1, 6, 6))
+    predict_paths(mean, covariance, np.zeros(1, np.int64), np.array([3.0]), 0.5, classes, found, spread)
+    assert np.hypot(*found[0, 0, :2]) > 4.0
 
 
 def test_tracks_are_predicted_from_what_they_report() -> None:

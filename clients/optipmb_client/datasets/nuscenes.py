@@ -252,7 +252,7 @@ class NuScenesDataset:
     """A nuScenes root together with one detector's results."""
 
     name = "nuscenes"
-    profile = "nuscenes"
+    profile = "nuscenes-megvii"
 
     def __init__(
         self,

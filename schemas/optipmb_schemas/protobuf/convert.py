@@ -5,10 +5,10 @@ limits and the same errors. It is total: it returns a model or raises `MessageEr
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache
-from math import prod
 from struct import pack
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from google.protobuf import struct_pb2
@@ -19,10 +19,9 @@ from google.protobuf.message import Message as ProtoMessage
 from numpy.typing import NDArray
 
 from optipmb_schemas.codec import build
-from optipmb_schemas.compact import checked, checked_part
+from optipmb_schemas.decoder import KINDS, REFUSED, Block, checked
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import DEFAULT, Limits
-from optipmb_schemas.messages import Detections, FieldOfView, Pose
 from optipmb_schemas.model import Message
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
@@ -34,7 +33,6 @@ _DTYPE_NAMES: Final[dict[int, str]] = {
 }
 _DTYPES: Final = {code: np.dtype(f"<{name}") for code, name in _DTYPE_NAMES.items()}
 DTYPE_CODES: Final[dict[str, Any]] = {name: code for code, name in _DTYPE_NAMES.items()}
-_USUAL: Final = {"i8": pb.DATA_TYPE_I8, "f8": pb.DATA_TYPE_F8}
 _FRAMES: Final[dict[int, str]] = {pb.FRAME_WORLD: "world", pb.FRAME_SENSOR: "sensor"}
 _FRAME_CODES: Final = {name: code for code, name in _FRAMES.items()}
 
@@ -74,8 +72,9 @@ def from_proto(proto: ProtoMessage, kind: type[T], limits: Limits = DEFAULT) -> 
     Raises:
         MessageError: whenever it is not a valid message within the limits.
     """
-    if kind is Detections and (message := _usual_detections(proto, limits)) is not None:
-        return cast("T", message)
+    if kind in KINDS:
+        with suppress(*REFUSED):
+            return checked(_usual_fields(proto), kind, limits)
     return build(_fields(proto), kind, limits)
 
 
@@ -92,56 +91,39 @@ def select(array: pb.Array, rows: NDArray[np.bool_]) -> None:
     array.data = left.tobytes()
 
 
-def _usual_detections(proto: Any, limits: Limits) -> Detections | None:
-    """Return detections in their usual form; None when they are in another, or not valid."""
-    try:
-        fields = {field.name: value for field, value in proto.ListFields()}
-        fields["labels"], fields["frame"] = list(proto.labels), _FRAMES[proto.frame]
-        if "pose" in fields:
-            fields["pose"] = checked_part(Pose, lambda name, length: _doubles(getattr(proto.pose, name), length))
-        if "field_of_view" in fields:
-            view = proto.field_of_view
-            fields["field_of_view"] = checked_part(
-                FieldOfView, lambda name, length: _doubles(getattr(view, name), length)
-            )
-        return checked(fields, proto.label.shape[0], _usual_data, limits)
-    except (ValueError, TypeError, LookupError):
-        return None
-
-
-def _usual_data(array: pb.Array, dtype: str, shape: list[int]) -> bytes:
-    """Return the bytes of an array of a type and shape."""
-    data = array.data
-    if array.dtype != _USUAL[dtype] or array.shape != shape or len(data) != 8 * prod(shape):
-        raise ValueError
-    return data
-
-
-def _doubles(values: Sequence[float], length: int) -> bytes:
-    if len(values) != length:
-        raise ValueError
-    return pack(f"<{length}d", *values)
-
-
 def _array(array: NDArray[Any], dtype: str) -> pb.Array:
     data = np.ascontiguousarray(array, f"<{dtype}").tobytes()
     return pb.Array(dtype=DTYPE_CODES[dtype], shape=array.shape, data=data)
 
 
+def _usual_fields(proto: ProtoMessage) -> dict[str, Any]:
+    """Return the fields as `checked` takes them. One that has its default value is left out."""
+    readers = _readers(proto.DESCRIPTOR.full_name, _usual_reader)
+    return {(name := field.name): readers[name](value) for field, value in proto.ListFields()}
+
+
 def _fields(proto: ProtoMessage) -> dict[str, Any]:
     """Return the fields as `build` takes them. An absent one that can tell so is left out."""
+    presence = _presence(proto.DESCRIPTOR.full_name)
     return {
         name: read(value)
-        for name, presence, read in _readers(proto.DESCRIPTOR.full_name)
-        if (not presence or proto.HasField(name)) and (value := getattr(proto, name)) is not None
+        for name, read in _readers(proto.DESCRIPTOR.full_name, _reader).items()
+        if (name not in presence or proto.HasField(name)) and (value := getattr(proto, name)) is not None
     }
 
 
 @cache
-def _readers(name: str) -> tuple[tuple[str, bool, Callable[[Any], Any]], ...]:
-    """Return name, whether it can be absent, and how to read it, of every field of a message type."""
-    descriptor = pb.DESCRIPTOR.message_types_by_name[name.rpartition(".")[2]]
-    return tuple((field.name, field.has_presence, _reader(field)) for field in descriptor.fields)
+def _presence(name: str) -> frozenset[str]:
+    """Return the fields of a message type that can be absent."""
+    fields = pb.DESCRIPTOR.message_types_by_name[name.rpartition(".")[2]].fields
+    return frozenset(field.name for field in fields if field.has_presence)
+
+
+@cache
+def _readers(name: str, reader: Callable[[FieldDescriptor], Callable[[Any], Any]]) -> dict[str, Callable[[Any], Any]]:
+    """Return how to read every field of a message type."""
+    fields = pb.DESCRIPTOR.message_types_by_name[name.rpartition(".")[2]].fields
+    return {field.name: reader(field) for field in fields}
 
 
 def _reader(field: FieldDescriptor) -> Callable[[Any], Any]:
@@ -158,6 +140,13 @@ def _reader(field: FieldDescriptor) -> Callable[[Any], Any]:
     return _fields
 
 
+def _usual_reader(field: FieldDescriptor) -> Callable[[Any], Any]:
+    if field.is_repeated and field.type == FieldDescriptor.TYPE_DOUBLE:
+        return _doubles
+    read = _reader(field)
+    return {_block: _usual_block, _fields: _usual_fields}.get(read, read)
+
+
 def _same(value: Any) -> Any:
     return value
 
@@ -172,6 +161,14 @@ def _frame(code: int) -> str:
 def _block(array: pb.Array) -> dict[str, Any]:
     """Return an array as the block that msgpack has."""
     return {"dtype": _DTYPE_NAMES.get(array.dtype, array.dtype), "shape": list(array.shape), "data": array.data}
+
+
+def _usual_block(array: pb.Array) -> Block:
+    return Block(_DTYPE_NAMES[array.dtype], list(array.shape), memoryview(array.data))
+
+
+def _doubles(values: Sequence[float]) -> Block:
+    return Block("f8", [len(values)], memoryview(pack(f"<{len(values)}d", *values)))
 
 
 @cache

@@ -10,29 +10,18 @@ from functools import lru_cache
 from math import prod
 from typing import Any, Final, Self
 
-import msgpack
-
 from optipmb_schemas.blocks import DTYPES
 from optipmb_schemas.codec import decode, encoding_of
+from optipmb_schemas.decoder import REFUSED, decoder_of
 from optipmb_schemas.limits import DEFAULT, Limits
 from optipmb_schemas.messages import Tracks
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import DTYPE_CODES, to_proto
-from optipmb_schemas.structure import check_msgpack
 
 __all__ = ["EncodedTracks", "transcode"]
 
-UNCHECKED: Final = 2**18
-"""Bytes of a payload of which msgpack may build what it declares without a walk before: at most some 16 MB."""
-
-MOST_ITEMS: Final = 256
-"""Items of one list or map in a payload that was not walked over."""
-
 _ENCODING: Final = encoding_of(Tracks)
-_REQUIRED: Final = frozenset(name for name, info in Tracks.model_fields.items() if info.is_required())
 _SCALARS: Final = tuple(name for name in Tracks.names if name not in Tracks.arrays)
-
-_msgpack: Any = msgpack  # its type information is partial
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,44 +63,32 @@ def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -
         MessageError: they are no tracks within the limits.
     """
     if encoding == _ENCODING and len(payload) <= limits.max_bytes:
-        most = MOST_ITEMS
-        if len(payload) > min(UNCHECKED, limits.max_values):
-            check_msgpack(payload, limits)
-            most = limits.max_values
         try:
-            fields = _msgpack.unpackb(
-                payload, ext_hook=_refuse, max_str_len=limits.max_text, max_array_len=most, max_map_len=most
-            )
-            tracks = _tracks(fields, limits)
-        except (AttributeError, KeyError, IndexError, TypeError, ValueError):
+            tracks = _tracks(decoder_of(Tracks)(payload), limits)
+        except REFUSED:
             tracks = None  # decoding says what is wrong, if anything is
         if tracks is not None:
             return tracks
     return EncodedTracks.of(to_proto(decode(payload, Tracks, encoding=encoding, limits=limits)))
 
 
-def _tracks(fields: Any, limits: Limits) -> EncodedTracks | None:
+def _tracks(fields: dict[str, Any], limits: Limits) -> EncodedTracks | None:
     """Return the tracks of fields that are as a service writes them, else None.
 
     Fields that are not known here are of a newer version, and are left out.
     """
-    fields = {name: value for name, value in fields.items() if value is not None}
-    if not fields.keys() >= _REQUIRED or len(fields["labels"]) > limits.max_labels:
+    if not fields.keys() >= Tracks.names_required or len(fields["labels"]) > limits.max_labels:
         return None
-    (rows,) = fields["id"]["shape"]
-    if type(rows) is not int or not 0 <= rows <= limits.max_tracks:
-        return None
-    horizons = fields["horizons"]["shape"][0] if "horizons" in fields else 0
-    if type(horizons) is not int or not 0 <= horizons <= limits.max_horizons:
+    (rows,), (horizons,) = fields["id"].shape, fields["horizons"].shape if "horizons" in fields else (0,)
+    if not (0 <= rows <= limits.max_tracks and 0 <= horizons <= limits.max_horizons):
         return None
     parts: list[bytes] = []
     for name, dtype, shape, size, prefix in _columns(rows, horizons, len(fields["labels"])):
         block = fields.get(name)
         if block is not None:
-            data = block["data"]
-            if block["dtype"] != dtype or block["shape"] != shape or type(data) is not bytes or len(data) != size:
+            if block.dtype != dtype or block.shape != shape or len(block.data) != size:
                 return None
-            parts += (prefix, data)
+            parts += (prefix, block.data)
     scalars = {name: fields[name] for name in _SCALARS if name in fields}
     return EncodedTracks.of(pb.Tracks(**scalars), b"".join(parts))
 
@@ -128,7 +105,3 @@ def _columns(rows: int, horizons: int, classes: int) -> list[tuple[str, str, lis
         field: bytes = proto.SerializeToString()
         columns.append((name, one.dtype, shape, size, field[: len(field) - size]))
     return columns
-
-
-def _refuse(code: int, _data: bytes) -> None:
-    raise ValueError(code)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from optipmb_service.runtime.byte_budget import MEGABYTE
 from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
-from optipmb_service.session.values import SECOND, Lineage
+from optipmb_service.session.values import SECOND, Incarnation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -54,7 +54,7 @@ class Admission:
         self.exceeded = self._quotas.exceeded
         self._lock = threading.Lock()
         self._sessions = 0
-        self._lives: OrderedDict[str, Lineage] = OrderedDict()
+        self._kept: OrderedDict[str, Incarnation] = OrderedDict()
         self._refused: dict[str, tuple[int, str]] = {}
         self._evicted: tuple[str, int] = "", 0
 
@@ -70,24 +70,24 @@ class Admission:
                 self._refused[stream] = now_ns + REFUSED_NS, why
         return why
 
-    def admit(self, stream: str) -> Lineage | None:
+    def admit(self, stream: str) -> Incarnation | None:
         """Count a session that begins; return what the stream had before, None when there is no room."""
         with self._lock:
             if self._sessions >= self._most:
                 return None
             self._sessions += 1
-            lineage = self._lives.pop(stream, Lineage())
+            incarnation = self._kept.pop(stream, Incarnation())
         self._quotas.count(stream, 1)
-        return lineage
+        return incarnation
 
-    def release(self, stream: str, lineage: Lineage) -> None:
+    def release(self, stream: str, incarnation: Incarnation) -> None:
         """Count a session that has ended, or was not begun, and remember what a later one has to know."""
         with self._lock:
             self._sessions -= 1
             self._refused.clear()  # who was refused may have room now
-            self._lives[stream] = lineage
-            if len(self._lives) > MAX_LIVES:
-                self._lives.popitem(last=False)
+            self._kept[stream] = incarnation
+            if len(self._kept) > MAX_LIVES:
+                self._kept.popitem(last=False)
         self._quotas.count(stream, -1)
 
     def _look_for_room(self, stream: str, now_ns: int) -> str:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.ports import Caches, MessageSink, Packet
     from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
-    from optipmb_service.session.values import Lineage
+    from optipmb_service.session.values import Incarnation
     from optipmb_service.settings.model import Settings
 
 PARTS: Final = 4
@@ -108,8 +108,8 @@ class ActorContext:
     dump: Callable[[str, bytes], str]
     caches: Callable[[], Caches]
     room: Callable[[str], str]
-    admit: Callable[[str], Lineage | None]
-    release: Callable[[str, Lineage], None]
+    admit: Callable[[str], Incarnation | None]
+    release: Callable[[str, Incarnation], None]
     discard: Callable[[Actor], None]
     submit: Callable[[Actor], None]
     arm: Callable[[Actor, int], None]

@@ -13,7 +13,7 @@ import structlog
 
 from optipmb_service.cluster.log_position import Missed, Position
 from optipmb_service.runtime.ports import Packet
-from optipmb_service.session.seen_numbers import number_of
+from optipmb_service.session.timeline import number_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -21,8 +21,7 @@ import structlog
 
 from optipmb_service.cluster.leases import partition_key, partition_of
 from optipmb_service.cluster.store import Fenced, StoreError, load_newest
-from optipmb_service.session.checkpoint import Checkpoint, CheckpointError
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.checkpoint import Checkpoint, CheckpointError, decode_checkpoint, encode_checkpoint
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

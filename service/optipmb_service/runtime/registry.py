@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.ports import Caches, MessageSink, Packet
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.runtime.scheduler import Scheduler
-    from optipmb_service.session.values import Lineage
+    from optipmb_service.session.values import Incarnation
     from optipmb_service.settings.model import Settings
 
 RIVAL_LEASES: Final = 3
@@ -331,11 +331,11 @@ class Registry:
         while self.untracked.newcomers and self._actors.has_room():
             self.untracked.hand_over_newcomer(self._take_up)
 
-    def _admit(self, stream: str) -> Lineage | None:
-        lineage = self._admission.admit(stream)
-        if lineage is not None:
+    def _admit(self, stream: str) -> Incarnation | None:
+        incarnation = self._admission.admit(stream)
+        if incarnation is not None:
             self._let_in()
-        return lineage
+        return incarnation
 
     def _lose(self, stream: str, lost: list[bool]) -> None:
         """Count messages that were dropped before their stream was tracked, each True: a frame."""

@@ -16,7 +16,7 @@ from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.track_publisher import Arrival
 from optipmb_service.session.checkpoint import CheckpointError
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Lineage, total
+from optipmb_service.session.values import Incarnation, total
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,9 +43,9 @@ class SessionOpening:
         self._context = context
         self._fused = fused
         self._restore_only = False
-        self.lineage: Lineage | None = None
+        self.incarnation: Incarnation | None = None
         """What an earlier session of the stream left behind, while one is being opened; else None."""
-        self._unread = Lineage()
+        self._unread = Incarnation()
         """The highest ids of sessions whose checkpoints are of another version."""
 
     def start(self, *, restore_only: bool) -> bool:
@@ -54,9 +54,9 @@ class SessionOpening:
         Args:
             restore_only: whether one is wanted only if it was kept, and not closed.
         """
-        self.lineage = self._context.admit(self._stream)
-        self._restore_only = restore_only and self.lineage is not None
-        return self.lineage is not None
+        self.incarnation = self._context.admit(self._stream)
+        self._restore_only = restore_only and self.incarnation is not None
+        return self.incarnation is not None
 
     def load(
         self, loaded: Callable[[Session | None, int | None, Packets], None], missed: Callable[[Packets], None]
@@ -73,7 +73,7 @@ class SessionOpening:
 
         def restore(checkpoint: Checkpoint) -> Session:
             now_ns = time.monotonic_ns()
-            if self._unread != Lineage():
+            if self._unread != Incarnation():
                 raise CheckpointError("older than one of another version, whose ids would be given out again")
             taken[:] = [checkpoint]
             if checkpoint.fused is not self._fused:
@@ -83,9 +83,9 @@ class SessionOpening:
             )
 
         def refused(error: CheckpointError) -> None:
-            if (unread := error.lineage) is not None:
+            if (unread := error.incarnation) is not None:
                 starts, next_id = max(self._unread.starts, unread.starts), max(self._unread.next_id, unread.next_id)
-                self._unread = Lineage(starts, next_id)
+                self._unread = Incarnation(starts, next_id)
 
         def load(restored: Session | None) -> None:
             checkpoint = taken[-1] if restored and taken else None
@@ -105,20 +105,20 @@ class SessionOpening:
 
     def release(self) -> None:
         """Give the room back: no session begins."""
-        if self.lineage is not None:
-            self._context.release(self._stream, self.lineage)
+        if self.incarnation is not None:
+            self._context.release(self._stream, self.incarnation)
         self._context.member.look()
 
     def end(self) -> None:
         """End the opening: a session has begun, or none does."""
-        self.lineage, self._restore_only = None, False
+        self.incarnation, self._restore_only = None, False
 
-    def begin(self, restored: Session | None, lineage: Lineage, fence: int | None) -> Session:
+    def begin(self, restored: Session | None, incarnation: Incarnation, fence: int | None) -> Session:
         """Return the session to go on with: the one that was restored, else a new one.
 
         Args:
             restored: the one that was kept, if any.
-            lineage: what an earlier session of the stream left behind.
+            incarnation: ids that an earlier session of the stream used.
             fence: of the partition.
         """
         context = self._context
@@ -136,10 +136,10 @@ class SessionOpening:
             context.policy,
             fused=self._fused,
             instance=context.instance,
-            life=Lineage(
-                max(lineage.starts, self._unread.starts),
-                max(lineage.next_id, self._unread.next_id),
-                total(lineage.run, fence or 0),
+            incarnation=Incarnation(
+                max(incarnation.starts, self._unread.starts),
+                max(incarnation.next_id, self._unread.next_id),
+                total(incarnation.run, fence or 0),
             ),
             tracker=context.tracker,
         )

@@ -129,7 +129,7 @@ class StreamActor:
 
         Such a stream has sent a valid message.
         """
-        return self.session is not None or self._opening.lineage is not None or self._closing
+        return self.session is not None or self._opening.incarnation is not None or self._closing
 
     @property
     def changed(self) -> bool:
@@ -222,7 +222,7 @@ class StreamActor:
 
     def _buffer(self, packet: Packet, *, frame: bool) -> None:
         """Keep a packet until a session takes it, and begin one if the packet is valid and the stream is to be here."""
-        if not (self._opening.lineage or self._closing or self._missed.buffers):
+        if not (self._opening.incarnation or self._closing or self._missed.buffers):
             if not self._context.member.holds(self.stream):
                 self._context.keep(self.stream, packet, frame=frame)
                 return
@@ -244,8 +244,8 @@ class StreamActor:
         With `create`, one begins if there is none.
         """
         if create and self.session is None and not self._closing and self._context.member.holds(self.stream):
-            _ = self._opening.lineage or self._open()
-        if self._opening.lineage or self._closing or self._missed.buffers:
+            _ = self._opening.incarnation or self._open()
+        if self._opening.incarnation or self._closing or self._missed.buffers:
             self._asking.append((command, create))
         else:
             self._guard(command, self)
@@ -310,8 +310,8 @@ class StreamActor:
 
     def _on_loaded(self, restored: Session | None, fence: int | None, missed: TakeoverBuffer) -> None:
         """Begin a session, or go on with the one that was kept and what it missed; unless the stream was lost."""
-        lineage = self._opening.lineage
-        if lineage is None:
+        incarnation = self._opening.incarnation
+        if incarnation is None:
             missed.take()
             return
         if self._opening.is_outdated(fence):
@@ -321,7 +321,7 @@ class StreamActor:
         if self._opening.is_wanted(restored):
             self._fence = fence
             self._out.tracks.open(fence)
-            session = self._opening.begin(restored, lineage, fence)
+            session = self._opening.begin(restored, incarnation, fence)
             self._accounts.open(session)
             self._tracking.changed, self.session = False, session
         else:
@@ -409,7 +409,7 @@ class StreamActor:
         self._missed.drop()
         self._out.tracks.close()
         self._accounts.close()
-        self._context.release(self.stream, session.life)
+        self._context.release(self.stream, session.incarnation)
         log.info(
             "session_closed", stream=self.stream, session=session.session, reason=reason, frames=session.counters.frames
         )

@@ -18,7 +18,7 @@ import structlog
 import optipmb
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.runtime.requests import guarded, problem_with
-from optipmb_service.session.checkpoint_codec import digest_of
+from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.convert import density_of
 from optipmb_service.session.values import RefusedError
 

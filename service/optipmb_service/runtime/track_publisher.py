@@ -108,8 +108,8 @@ class TrackPublisher:
             "step_ms": tracked.step_ns / MILLISECOND,
             "run": tracked.run,
         }
-        self._count_tracks(tracked.made.tracks.id.tobytes())
-        self.waiting.append((tracked.made.encoded(delivery), ticket, waited_ns, tracked.step_ns))
+        self._count_tracks(tracked.estimates.id.tobytes())
+        self.waiting.append((tracked.encoded(delivery), ticket, waited_ns, tracked.step_ns))
         self.flush()
 
     def flush(self) -> None:

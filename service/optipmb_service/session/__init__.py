@@ -1,1 +1,1 @@
-"""What the messages of one stream mean: pure, without I/O, threads or a clock of its own."""
+"""Sessions: tracking of the messages of one stream, without I/O, threads or a clock of their own."""

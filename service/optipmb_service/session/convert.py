@@ -10,13 +10,19 @@ from __future__ import annotations
 from functools import lru_cache
 from operator import attrgetter
 from struct import unpack
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
 from optipmb.frame import frame_of_checked
+from optipmb_service.session.values import Tracked
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from optipmb_service.session.timeline import FrameId
 
 IDENTITY = optipmb.Pose(translation=np.zeros(3), quaternion=np.array([1.0, 0.0, 0.0, 0.0]))
 """The pose of arrays that are in the world frame already."""
@@ -48,7 +54,7 @@ def view_of(message: schemas.Detections, pose: optipmb.Pose | None) -> optipmb.F
     """Return the field of view of a frame in the axes of its sensor, None when the sensor sees everything.
 
     Args:
-        message: whose it is.
+        message: the message of the frame.
         pose: `pose_of` the message.
 
     Raises:
@@ -122,3 +128,52 @@ def density_of(
         covariance=poisson.covariance,
         z=poisson.auxiliary[:, 3],
     )
+
+
+def tracks_of(  # noqa: PLR0913 - all keywords, each a field of the message
+    tracks: optipmb.Tracks,
+    paths: optipmb.PredictedPaths | None,
+    class_probability: NDArray[np.float64] | None = None,
+    *,
+    stream: str,
+    frame_id: FrameId,
+    session: str,
+    revision: int,
+    parameters: optipmb.Parameters,
+    cloud_used: bool,
+    gap: int,
+    ignored: int,
+) -> Tracked:
+    """Return the tracks of a frame, with paths and classes if there are any.
+
+    What the tracker made of checked detections needs one look, not the checks of a message from elsewhere; where that
+    look finds something odd, those checks say what it is.
+
+    Raises:
+        schemas.MessageError: the tracks hold numbers that no message may.
+    """
+    header: dict[str, Any] = {
+        "stream": stream,
+        "epoch": frame_id.epoch,
+        "seq": frame_id.seq,
+        "stamp_ns": frame_id.stamp_ns,
+        "sensor": frame_id.sensor,
+        "session": session,
+        "revision": revision,
+        "profile": parameters.name,
+        "cloud_used": cloud_used,
+        "gap": gap,
+        "ignored": ignored,
+        "labels": parameters.labels,
+    }
+    if not frame_id.sensor:
+        del header["sensor"]
+    others: dict[str, Any] = {}
+    if class_probability is not None:
+        others |= schemas.class_fields(class_probability)
+    if paths is not None:
+        others |= schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
+    if not optipmb.sound(tracks):
+        columns: dict[str, Any] = dict(tracks.columns()) | {"confirmed": tracks.confirmed.astype(np.int64)}
+        schemas.Tracks(**header, **columns, **others)
+    return Tracked(tracks, header, others)

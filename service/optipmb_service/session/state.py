@@ -7,13 +7,13 @@ two sessions that took the same frames have equal states, whatever came twice, l
 from __future__ import annotations
 
 from dataclasses import field, replace
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import optipmb_schemas as schemas
 from pydantic import Field
 
 from optipmb.records import record
-from optipmb_service.session.timeline import Cursor, FrameId, Order, Placement
+from optipmb_service.session.timeline import Cursor, FrameId, Order, Placement, Verdict
 from optipmb_service.session.values import MAX_LABELS, Count, Epoch, Whole
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ Position = tuple[_Metres, _Metres, _Metres]
 
 @record
 class FrameCounts:
-    """What became of the frames that were processed.
+    """Counts of the frames that were processed.
 
     Attributes:
         frames: tracked.
@@ -55,7 +55,7 @@ class FrameCounts:
 
 @record
 class PoseHistory:
-    """Where the sensor was, for judging where it can be.
+    """Last pose of a sensor, and those that were refused since.
 
     Attributes:
         stamp_ns: when; None before the first frame with a pose.
@@ -74,12 +74,12 @@ class PoseHistory:
 
 @record
 class SensorState:
-    """What the frames of one sensor so far mean for its next.
+    """State of one sensor after its frames so far.
 
     Attributes:
         cursor: its course; see `timeline`.
         tracked: epoch and highest sequence number of its frames tracked, for counting gaps.
-        reported: its unknown classes that were reported in this life.
+        reported: its unknown classes that were reported in this incarnation.
         pose_history: where it was.
     """
 
@@ -98,12 +98,12 @@ class FilterState:
 
     Attributes:
         density: after the last frame.
-        session: id of the present life of the density.
-        starts: lives so far.
+        session: id of the present incarnation of the density.
+        starts: incarnations so far.
         generation: see `timeline`; of the last frame tracked.
         last: the last frame processed, tracked or not.
         tracks: number of tracks at the last frame tracked.
-        counts: what became of the frames.
+        counts: of the frames.
         sensors: each sensor by its stream; the only one of a stream's own session by an empty name.
     """
 
@@ -125,44 +125,38 @@ class FilterState:
         """The courses of the sensors."""
         return {name: one.cursor for name, one in self.sensors.items()}
 
-    def begun_anew(self, density: optipmb.Density, session: str, starts: int) -> FilterState:
-        """Return the state of a later life of the density, in which nothing was said yet."""
+    def begun_anew(self, density: optipmb.Density, session: str) -> FilterState:
+        """Return the state in which the next incarnation of the density begins: no classes were reported yet."""
         sensors = {
             name: replace(one, reported=frozenset(), pose_history=PoseHistory()) for name, one in self.sensors.items()
         }
-        return replace(self, density=density, session=session, starts=starts, sensors=sensors, tracks=0)
+        return replace(self, density=density, session=session, starts=self.starts + 1, sensors=sensors, tracks=0)
+
+
+Inputs: TypeAlias = "tuple[schemas.Detections, optipmb.Frame, int]"
+"""Detections of a frame, the same as the tracker reads them without the cloud, and the number of objects left out
+because the profile lacks their class."""
+
+UNPLACED: Final = Placement(0, 0, None, Verdict.NEXT, 0, 0)
+"""Place of a frame that was read from a checkpoint, until the timeline gives it one."""
 
 
 @record
-class Contents:
-    """What is read of the detections of a frame before it is processed.
+class ProcessedFrame:
+    """Frame that is or was processed, as the window and checkpoints keep it.
+
+    Its detections are bytes: few of the frames that are kept are processed again, and those are decoded once more.
+    Decoded, they take twice the memory, in some forty pieces, and where each frame fills the memory of one long past
+    instead of the one before, a frame of 40 objects takes 3 % longer.
 
     Attributes:
-        message: the detections.
-        frame: the same as the tracker reads them, without the cloud.
-        ignored: how many were left out because the profile lacks their class.
-    """
-
-    message: schemas.Detections
-    frame: optipmb.Frame
-    ignored: int
-
-
-@record
-class Recorded:
-    """A frame of the window as checkpoints have it.
-
-    Its detections are bytes: few of the frames that are kept are processed again, and those are read once more. What is
-    read takes twice the memory, in some forty pieces, and where each frame fills the memory of one long past instead of
-    the one before, a frame of 40 objects takes 3 % longer.
-
-    Attributes:
-        frame_id: which.
-        detections: what `schemas.encode` gives for its detections.
+        frame_id: its identity.
+        detections: its detections as `schemas.encode` gives them.
         points: its cloud.
         missed: whether it waited for a cloud in vain.
         revision: of the tracks that were published last for it.
-        packed: its cloud as bytes, once a checkpoint has made them: it is in one checkpoint after the other.
+        packed: its cloud as bytes, once a checkpoint has encoded it: it is in one checkpoint after the other.
+        place: where it belongs; checkpoints leave it out.
     """
 
     frame_id: FrameId
@@ -171,34 +165,22 @@ class Recorded:
     missed: bool
     revision: int
     packed: list[bytes] = field(compare=False)
-
-
-@record
-class Entry(Recorded):
-    """A frame that is or was processed.
-
-    Attributes:
-        place: where it belongs.
-        weight: bytes that its inputs take, nearly.
-    """
-
     place: Placement
-    weight: int
 
     @property
     def message(self) -> schemas.Detections:
-        """Its detections, read from the bytes."""
+        """Its detections, decoded."""
         return schemas.decode(self.detections, schemas.Detections, limits=schemas.STORED)
-
-    def given(self, points: schemas.Points | None, *, missed: bool = False) -> Entry:
-        """Return it with a cloud, or with none for which it waited in vain."""
-        weight = size_of(self.detections, points)
-        return replace(self, points=points, missed=missed, weight=weight, packed=[])
 
     @property
     def order(self) -> Order:
         """The key by which frames are processed."""
         return self.place.order(self.frame_id)
+
+    @property
+    def weight(self) -> int:
+        """Bytes that its inputs take, nearly."""
+        return size_of(self.detections, self.points)
 
 
 def size_of(detections: bytes, points: schemas.Points | None = None) -> int:

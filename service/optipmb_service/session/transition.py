@@ -1,73 +1,66 @@
-"""One frame through the tracker: from one state of a session to the next, and the tracks in between.
+"""Processing of one frame: from one state of a session to the next, and the tracks of the frame.
 
-A pure function of state, frame and parameters, so that frames can be gone through once more whenever one is put
-between them. Whatever it raises, nothing has changed.
+It is a pure function of state, frame and parameters, so frames can be processed again when one is inserted before them.
+When a step raises, nothing has changed.
 
-A session id names one life of the density. It is derived from the stream, the frame at which that life began and the
-parameters, so that a repeated run gives it again, and a service that was restarted without its checkpoints and went on
-with another frame does not. When a late frame turns out to be the first of a life, the life gets the id that it would
-have had in order; the tracks that were published under the other are corrected like all others behind that frame.
+A session id names one incarnation of the density. It is derived from the stream, the first frame of the incarnation and
+the parameters: a repeated run gives it again, and a service that was restarted without its checkpoints and went on with
+another frame does not. When a late frame turns out to be the first one, the incarnation gets the id that it would have
+had in order; tracks that were published under the other id are corrected like all others behind that frame.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
+import platform
+import traceback
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
+import optipmb_schemas as schemas
 
 import optipmb
 from optipmb.records import record
 from optipmb_service.session import convert
-from optipmb_service.session.frame_tracks import FrameTracks, tracks_of
-from optipmb_service.session.pose_check import judge
-from optipmb_service.session.state import Contents, Entry, FilterState, FrameCounts, PoseHistory, SensorState
+from optipmb_service.session.state import FilterState, FrameCounts, PoseHistory, SensorState
 from optipmb_service.session.timeline import JUMP_FRAMES, FrameId, Verdict
-from optipmb_service.session.values import MAX_LABELS, MAX_SENSORS, SECOND, total
+from optipmb_service.session.values import MAX_LABELS, MAX_SENSORS, SECOND, Begun, total
 
 if TYPE_CHECKING:
-    import optipmb_schemas as schemas
+    from collections.abc import Sequence
 
-    from optipmb_service.session.values import Policy, Steps
+    from optipmb_service.session.state import Inputs, Position, ProcessedFrame
+    from optipmb_service.session.values import Policy, Reason, Steps, Tracked
 
 GIVE_UP_NS: Final = SECOND
 """Sensor time after which a density that makes every frame too much is given up."""
 
+MAX_TRACE: Final = 100_000
+
 _OPENING: Final = frozenset({Verdict.NEW_EPOCH, Verdict.RESTART})
-
-
-@dataclass(frozen=True, slots=True)
-class SessionStart:
-    """Why a life of the density begins with a frame.
-
-    Attributes:
-        reason: see `values.Begun`.
-        jump_ns: how far the stamps jumped.
-    """
-
-    reason: Literal["first", "jump", "clock", "publisher", "pose", "effort"]
-    jump_ns: int
 
 
 @record
 class Outcome:
-    """What became of a frame.
+    """Outcome of processing a frame.
 
     Attributes:
-        entry: the frame.
-        tracks: its tracks, without their delivery part; None: it was refused.
-        begins: whether a life began with it.
+        frame: the frame.
+        tracks: its tracks; None: it was refused.
+        begun: the session id that it starts, if any.
         unknown: the classes that the profile lacks, with the number of objects of each, when not reported before.
         effort: why the frame was refused, when it needs more computing than a frame may.
     """
 
-    entry: Entry
-    tracks: FrameTracks | None
-    begins: SessionStart | None
-    unknown: dict[str, int]
+    frame: ProcessedFrame
+    tracks: Tracked | None = None
+    begun: Begun | None = None
+    unknown: dict[str, int] | None = None
     effort: optipmb.EffortError | None = None
 
 
@@ -90,7 +83,7 @@ class Transition:
         self._digest = hashlib.blake2b(values.encode(), digest_size=16).digest()
 
     def name(self, frame_id: FrameId | None, starts: int) -> str:
-        """Return the id of a life that begins with or after a frame."""
+        """Return the id of an incarnation that begins with or after a frame."""
         digest = hashlib.blake2b(self._digest, digest_size=16, person=b"optipmb-session")
         where = [frame_id.epoch.hex(), frame_id.seq, frame_id.stamp_ns] if frame_id else []
         if frame_id and frame_id.sensor:
@@ -98,80 +91,137 @@ class Transition:
         digest.update(json.dumps([self.stream, starts, *where]).encode())
         return digest.hexdigest()
 
-    def step(self, before: FilterState, entry: Entry, contents: Contents | None = None) -> tuple[FilterState, Outcome]:
-        """Go on by one frame.
+    def no_objects(self, next_id: int) -> optipmb.Density:
+        """Return an empty density."""
+        return optipmb.Density.empty(self.parameters.labels, next_id)
+
+    def step(
+        self, before: FilterState, frame: ProcessedFrame, inputs: Inputs | None = None
+    ) -> tuple[FilterState, Outcome]:
+        """Process a frame.
 
         Args:
             before: the state.
-            entry: the frame.
-            contents: what was read of it; None: it is read here.
+            frame: the frame.
+            inputs: its detections as the tracker reads them; None: they are decoded here.
 
         Raises:
             Exception: whatever the tracker raises.
         """
-        frame_id, place = entry.frame_id, entry.place
+        frame_id, place = frame.frame_id, frame.place
         if place.opens is Verdict.UNCONFIRMED:
             # What comes after is judged, and put in order, as if it had not been there.
-            passed = _passed(before, entry, before.sensor(frame_id.sensor).pose_history, unconfirmed=1)
-            return replace(passed, last=before.last), Outcome(entry, None, None, {})
-        if contents is None:
-            message = entry.message
-            contents = Contents(message, *convert.frame_of(self.parameters, message))
-        begins = _begins(before, entry)
-        moved = self.on_new_clock(before, entry, contents.message)
+            refused = _refused(before, frame, before.sensor(frame_id.sensor).pose_history, "unconfirmed")
+            return replace(refused, last=before.last), Outcome(frame)
+        if inputs is None:
+            message = frame.message
+            inputs = message, *convert.frame_of(self.parameters, message)
+        begun = self._begun(before, frame)
+        moved = self.on_new_clock(before, frame, inputs[0])
         if moved is not None:
-            before, begins = moved, SessionStart("clock", place.jump_ns)
+            before, begun = moved, self._begin(before, frame, "clock")
         sensor = before.sensor(frame_id.sensor)
-        known = PoseHistory() if begins else sensor.pose_history
-        pose_history, where = judge(known, contents.message, self._policy)
+        known = PoseHistory() if begun else sensor.pose_history
+        pose_history, where = check_pose(known, inputs[0], self._policy)
         if where == "moved" and self._others_stayed(before, frame_id):
             # The sensors of a session move together: this one waits for the others to say the same.
-            count = sensor.pose_history.astray + 1
-            there = pose_history.position
+            there, before_it = pose_history.position, sensor.pose_history
             pose_history = replace(
-                sensor.pose_history, astray=count, astray_ns=frame_id.stamp_ns, astray_position=there
+                before_it, astray=before_it.astray + 1, astray_ns=frame_id.stamp_ns, astray_position=there
             )
             where = "astray"
         if where == "astray":
-            return _passed(before, entry, pose_history, astray=1), Outcome(entry, None, None, {})
+            return _refused(before, frame, pose_history, "astray"), Outcome(frame)
         if where == "moved":
-            begins = SessionStart("pose", place.jump_ns)
+            begun = self._begin(before, frame, "pose")
         try:
-            return self._track(before, entry, contents, begins, pose_history)
+            return self._track(before, frame, inputs, begun, pose_history)
         except optipmb.EffortError as error:
             # What the frame cannot be tracked with may be a density of too many objects: they are given up when they
             # have not been updated for so long, and the frame alone is not too much.
             silent_ns = frame_id.stamp_ns - before.density.stamp_ns
-            if begins is None and before.density.stamp_ns >= 0 and silent_ns > GIVE_UP_NS:
+            if begun is None and before.density.stamp_ns >= 0 and silent_ns > GIVE_UP_NS:
                 with suppress(optipmb.EffortError):
-                    begins = SessionStart("effort", place.jump_ns)
-                    return self._track(before, entry, contents, begins, pose_history)
-            return _passed(before, entry, sensor.pose_history, effort=1), Outcome(entry, None, None, {}, error)
+                    return self._track(before, frame, inputs, self._begin(before, frame, "effort"), pose_history)
+            return _refused(before, frame, sensor.pose_history, "effort"), Outcome(frame, effort=error)
 
     def on_new_clock(
-        self, before: FilterState, entry: Entry, message: schemas.Detections | None = None
+        self, before: FilterState, frame: ProcessedFrame, message: schemas.Detections | None = None
     ) -> FilterState | None:
-        """Return the state with its stamps set back, where a frame begins a life because the clock stepped back.
+        """Return the state with its stamps set back, if a frame starts an incarnation because the clock stepped back.
 
         The objects are where they were: for as long as the frames that agreed on the step took, they go on. None where
-        the frame begins no life, or its stamps or its sensor are too far from those before to say so.
+        the frame starts none, or its stamps or its sensor are too far from those before to say so.
         """
-        sensor = before.sensor(entry.frame_id.sensor)
+        sensor = before.sensor(frame.frame_id.sensor)
         cursor, last, history = sensor.cursor, before.last, sensor.pose_history
-        same = last is not None and cursor.epoch == entry.frame_id.epoch and cursor.jumped > 0
-        if not same or not begins_with(before, entry) or not -self._policy.gap_limit_ns <= entry.place.jump_ns < 0:
+        same = last is not None and cursor.epoch == frame.frame_id.epoch and cursor.jumped > 0
+        if not same or not begins_with(before, frame) or not -self._policy.gap_limit_ns <= frame.place.jump_ns < 0:
             return None
-        stamp_ns = entry.frame_id.stamp_ns
+        stamp_ns = frame.frame_id.stamp_ns
         density = set_clock(before.density, max(0, stamp_ns - JUMP_FRAMES * (stamp_ns - cursor.jumped_ns)))
         if history.stamp_ns is not None:
             history = replace(history, stamp_ns=density.stamp_ns)
-        if judge(history, message or entry.message, self._policy)[1] != "near":
+        if check_pose(history, message or frame.message, self._policy)[1] != "near":
             return None
         known = replace(sensor, pose_history=history)
-        return replace(before, density=density, sensors=_sensors(before, entry.frame_id.sensor, known))
+        return replace(before, density=density, sensors=_sensors(before, frame.frame_id.sensor, known))
+
+    def dump(self, base: FilterState, frames: Sequence[ProcessedFrame], error: Exception) -> bytes:
+        """Return what `optipmb track --dump` replays to the same error.
+
+        Args:
+            base: the state before the window.
+            frames: those of the window with the one that failed, in the order of processing.
+            error: what was raised.
+        """
+        dumped: list[schemas.DumpedFrame] = []
+        state = base
+        for frame in frames:
+            anew = begins_with(state, frame)
+            if (moved := self.on_new_clock(state, frame)) is not None:
+                base, state, anew, dumped = moved, moved, False, []  # a dump has one clock
+            try:
+                state, outcome = self.step(state, frame)
+            except Exception:  # noqa: BLE001 - the very one
+                dumped.append(schemas.DumpedFrame(frame.message, frame.points, anew))
+                break
+            if outcome.tracks is not None:
+                begun = outcome.begun is not None and outcome.begun.reason not in {"first", "clock"}
+                dumped.append(schemas.DumpedFrame(frame.message, frame.points, begun))
+        return schemas.encode_dump(
+            schemas.Dump(
+                stream=self.stream,
+                error=f"{type(error).__name__}: {error}",
+                trace="".join(traceback.format_exception(error))[-MAX_TRACE:],
+                versions={name: version(name) for name in ("optipmb", "numpy", "numba")}
+                | {"python": platform.python_version()},
+                parameters=self.parameters.model_dump(mode="json"),
+                stamp_ns=base.density.stamp_ns,
+                next_id=base.density.next_id,
+                density=optipmb.bytes_of(base.density),
+                frames=tuple(dumped),
+            )
+        )
+
+    def _begin(self, before: FilterState, frame: ProcessedFrame, reason: Reason, jump_ns: int | None = None) -> Begun:
+        return Begun(
+            self.name(frame.frame_id, before.starts + 1), reason, frame.place.jump_ns if jump_ns is None else jump_ns
+        )
+
+    def _begun(self, before: FilterState, frame: ProcessedFrame) -> Begun | None:
+        """Return the session id that a frame starts by its place, if any."""
+        last, frame_id = before.last, frame.frame_id
+        if last is None:
+            return self._begin(before, frame, "first")
+        if not begins_with(before, frame):
+            return None
+        if frame_id.sensor:
+            return self._begin(before, frame, "jump", frame_id.stamp_ns - last.stamp_ns)
+        return self._begin(before, frame, "publisher" if frame_id.epoch != last.epoch else "jump")
 
     def _others_stayed(self, before: FilterState, frame_id: FrameId) -> bool:
-        """Whether another sensor of the session is where it was, as far as was heard lately."""
+        """Return whether another sensor of the session is where it was, as far as was heard lately."""
         return any(
             one.pose_history.stamp_ns is not None
             and not one.pose_history.astray
@@ -183,43 +233,41 @@ class Transition:
     def _track(
         self,
         before: FilterState,
-        entry: Entry,
-        contents: Contents,
-        begins: SessionStart | None,
+        frame: ProcessedFrame,
+        inputs: Inputs,
+        begun: Begun | None,
         pose_history: PoseHistory,
     ) -> tuple[FilterState, Outcome]:
-        frame_id = entry.frame_id
-        if begins:
-            starts, density = before.starts + 1, before.density
-            if begins.reason not in {"first", "clock"}:
-                density = optipmb.Density.empty(self.parameters.labels, density.next_id)
-            before = before.begun_anew(density, self.name(frame_id, starts), starts)
+        frame_id, (message, seen, ignored) = frame.frame_id, inputs
+        if begun:
+            keeps = begun.reason in {"first", "clock"}
+            density = before.density if keeps else self.no_objects(before.density.next_id)
+            before = before.begun_anew(density, begun.session)
         sensor = before.sensor(frame_id.sensor)
-        frame = contents.frame
-        if entry.points is not None:
-            frame = replace(frame, cloud=convert.cloud_of(entry.points))
-        result = self._tracker.step(before.density, frame)
+        if frame.points is not None:
+            seen = replace(seen, cloud=convert.cloud_of(frame.points))
+        result = self._tracker.step(before.density, seen)
         used = bool(result.diagnostics.cloud_used)
         same = sensor.tracked is not None and sensor.tracked[0] == frame_id.epoch
         highest = sensor.tracked[1] if sensor.tracked is not None and same else frame_id.seq - 1
         gap = max(0, frame_id.seq - highest - 1)
-        tracks = tracks_of(
+        tracks = convert.tracks_of(
             result.tracks,
             result.paths,
             result.class_probability,
             stream=self.stream,
             frame_id=frame_id,
             session=before.session,
-            revision=entry.revision,
+            revision=frame.revision,
             parameters=self.parameters,
             cloud_used=used,
             gap=gap,
-            ignored=contents.ignored,
+            ignored=ignored,
         )
-        unknown = self._unknown(contents.message, sensor.reported) if contents.ignored else {}
+        unknown = self._unknown(message, sensor.reported) if ignored else {}
         repaired = int(result.diagnostics.repaired)
         known = SensorState(
-            cursor=sensor.cursor.after(frame_id, entry.place),
+            cursor=sensor.cursor.after(frame_id, frame.place),
             tracked=(frame_id.epoch, max(highest, frame_id.seq)),
             reported=sensor.reported | unknown.keys() if unknown else sensor.reported,
             pose_history=pose_history,
@@ -228,13 +276,13 @@ class Transition:
             density=result.density,
             session=before.session,
             starts=before.starts,
-            generation=entry.place.generation,
+            generation=frame.place.generation,
             last=frame_id,
             tracks=len(result.tracks),
-            counts=_counted(before, entry, tracked=1, gap=gap, used=used, repaired=repaired),
+            counts=_counted(before, frame, frames=1, gaps=gap, clouds_used=used, repaired=repaired),
             sensors=_sensors(before, frame_id.sensor, known),
         )
-        return after, Outcome(entry, tracks, begins, unknown)
+        return after, Outcome(frame, tracks, begun, unknown)
 
     def _unknown(self, message: schemas.Detections, reported: frozenset[str]) -> dict[str, int]:
         found = convert.unknown_labels(self.parameters, message)
@@ -242,20 +290,49 @@ class Transition:
         return {label: found[label] for label in found if label in new}
 
 
-def _passed(
-    before: FilterState,
-    entry: Entry,
-    pose_history: PoseHistory,
-    *,
-    astray: int = 0,
-    effort: int = 0,
-    unconfirmed: int = 0,
-) -> FilterState:
-    """Return the state after a frame that is refused."""
-    counts = _counted(before, entry, astray=astray, effort=effort, unconfirmed=unconfirmed)
-    frame_id, sensor = entry.frame_id, before.sensor(entry.frame_id.sensor)
-    passed = replace(sensor, cursor=sensor.cursor.after(frame_id, entry.place), pose_history=pose_history)
-    return replace(before, last=frame_id, counts=counts, sensors=_sensors(before, frame_id.sensor, passed))
+def check_pose(
+    before: PoseHistory, message: schemas.Detections, policy: Policy
+) -> tuple[PoseHistory, Literal["near", "astray", "moved"]]:
+    """Check whether a sensor can be where a frame says it is.
+
+    A pose that jumps by a hundred metres (a lost localisation, poses of another vehicle) would leave every track behind
+    and give birth to as many: the frame is refused. When several frames in a row agree with each other about the new
+    place, the sensor is there, whatever brought it: the next of them starts a new incarnation of the session.
+
+    Args:
+        before: poses of the frames before it.
+        message: the frame.
+        policy: what a sensor can do.
+
+    Returns:
+        The poses with this frame, and whether the sensor is near where it was, astray (the frame is to be refused), or
+        taken to have moved.
+    """
+    if message.pose is None or policy.max_speed <= 0:
+        return before, "near"
+    x, y, z = message.pose.translation.tolist()
+    position, stamp_ns = (x, y, z), message.stamp_ns
+    there = PoseHistory(stamp_ns, position)
+    if before.stamp_ns is None or _near(before.stamp_ns, before.position, stamp_ns, position, policy):
+        return there, "near"
+    agrees = before.astray > 0 and _near(before.astray_ns, before.astray_position, stamp_ns, position, policy)
+    astray = before.astray + 1 if agrees else 1
+    if astray >= policy.astray_frames:
+        return there, "moved"
+    return replace(before, astray=astray, astray_ns=stamp_ns, astray_position=position), "astray"
+
+
+def _near(stamp_ns: int, position: Position, then_ns: int, then: Position, policy: Policy) -> bool:
+    reach = policy.pose_margin + policy.max_speed * abs(then_ns - stamp_ns) * 1e-9
+    return math.dist(position, then) <= reach
+
+
+def _refused(before: FilterState, frame: ProcessedFrame, pose_history: PoseHistory, count: str) -> FilterState:
+    """Return the state after a frame that is refused and counted under a name of `FrameCounts`."""
+    frame_id, sensor = frame.frame_id, before.sensor(frame.frame_id.sensor)
+    after = replace(sensor, cursor=sensor.cursor.after(frame_id, frame.place), pose_history=pose_history)
+    counts = _counted(before, frame, **{count: 1})
+    return replace(before, last=frame_id, counts=counts, sensors=_sensors(before, frame_id.sensor, after))
 
 
 def _sensors(before: FilterState, name: str, state: SensorState) -> dict[str, SensorState]:
@@ -267,33 +344,13 @@ def _sensors(before: FilterState, name: str, state: SensorState) -> dict[str, Se
     return sensors
 
 
-def _counted(  # noqa: PLR0913 - all keywords, each a count
-    state: FilterState,
-    entry: Entry,
-    *,
-    astray: int = 0,
-    effort: int = 0,
-    unconfirmed: int = 0,
-    tracked: int = 0,
-    gap: int = 0,
-    used: bool = False,
-    repaired: int = 0,
-) -> FrameCounts:
+def _counted(state: FilterState, frame: ProcessedFrame, **more: int) -> FrameCounts:
     """Return the counts with one more frame."""
-    before, frame_id = state.counts, entry.frame_id
+    before, frame_id = state.counts, frame.frame_id
     # In a session of several sensors each has its epochs; how one follows another follows from the frames before.
     succeeds = bool(frame_id.sensor) and state.sensor(frame_id.sensor).cursor.epoch not in {None, frame_id.epoch}
-    return FrameCounts(
-        frames=before.frames + tracked,
-        gaps=total(before.gaps, gap) if gap else before.gaps,
-        new_epochs=before.new_epochs + (entry.place.opens in _OPENING or succeeds),
-        clouds_used=before.clouds_used + used,
-        clouds_missed=before.clouds_missed + entry.missed,
-        astray=before.astray + astray,
-        effort=before.effort + effort,
-        unconfirmed=before.unconfirmed + unconfirmed,
-        repaired=before.repaired + repaired,
-    )
+    more |= {"new_epochs": frame.place.opens in _OPENING or succeeds, "clouds_missed": frame.missed}
+    return replace(before, **{name: total(getattr(before, name), count) for name, count in more.items() if count})
 
 
 def set_clock(density: optipmb.Density, stamp_ns: int) -> optipmb.Density:
@@ -314,25 +371,6 @@ def set_clock(density: optipmb.Density, stamp_ns: int) -> optipmb.Density:
     )
 
 
-def empty(
-    transition: Transition, last: FrameId | None, next_id: int, starts: int, counts: FrameCounts | None = None
-) -> FilterState:
-    """Return the moment before the first frame of a stream, or of a profile."""
-    density = optipmb.Density.empty(transition.parameters.labels, next_id)
-    return FilterState(density, transition.name(last, starts), starts=starts, counts=counts or FrameCounts())
-
-
-def begins_with(before: FilterState, entry: Entry) -> bool:
-    """Whether the place of a frame makes it begin with an empty density."""
-    return before.last is not None and entry.place.generation != before.generation
-
-
-def _begins(before: FilterState, entry: Entry) -> SessionStart | None:
-    if before.last is None:
-        return SessionStart("first", entry.place.jump_ns)
-    if entry.place.generation != before.generation:
-        if entry.frame_id.sensor:
-            return SessionStart("jump", entry.frame_id.stamp_ns - before.last.stamp_ns)
-        other = entry.frame_id.epoch != before.last.epoch
-        return SessionStart("publisher" if other else "jump", entry.place.jump_ns)
-    return None
+def begins_with(before: FilterState, frame: ProcessedFrame) -> bool:
+    """Return whether the place of a frame makes it begin with an empty density."""
+    return before.last is not None and frame.place.generation != before.generation

@@ -1,20 +1,20 @@
-"""What goes into a session and what comes out of it, as plain values; times in nanoseconds."""
+"""Settings, outputs and counts of sessions as plain values; times in nanoseconds."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, Protocol
+from typing import Annotated, Any, Final, Literal, NamedTuple, Protocol
 
+import numpy as np
 import optipmb_schemas as schemas
 from pydantic import AfterValidator, Field
 
-from optipmb.records import record
-
-if TYPE_CHECKING:
-    import optipmb
-    from optipmb_service.session.frame_tracks import FrameTracks
+import optipmb
 
 SECOND: Final = 1_000_000_000
+
+COLUMNS: Final = tuple(optipmb.Tracks.described)
+"""Columns of the tracks in the order of the message."""
 
 MAX_COUNT: Final = 2**61
 """Where counters end, so that neither one more nor the sum of two leaves the 64 bits of a message."""
@@ -40,7 +40,7 @@ class JumpLimits(NamedTuple):
     """Steps of the stamps, in the order of a publisher, beyond which they jumped.
 
     Attributes:
-        back_ns: largest step back: what a late frame is put in its place for.
+        back_ns: largest step back: within it a late frame is inserted.
         ahead_ns: largest step ahead.
     """
 
@@ -70,7 +70,7 @@ def total(*counts: int) -> int:
 
 
 class Steps(Protocol):
-    """What a session needs of a tracker; `optipmb.Tracker` has it."""
+    """Tracker of a session; `optipmb.Tracker` is one."""
 
     def step(self, density: optipmb.Density, frame: optipmb.Frame) -> optipmb.StepResult:
         """Return the density after the frame, and its tracks."""
@@ -125,11 +125,11 @@ class Policy:
 
 
 @dataclass(frozen=True, slots=True)
-class Lineage:
-    """What outlives a session, so that neither its id nor its track ids come again.
+class Incarnation:
+    """Numbers that the next session of a stream continues, so that neither its id nor its track ids come again.
 
     Attributes:
-        starts: how many lives the stream has had.
+        starts: incarnations of the density so far.
         next_id: the next track id.
         run: see `Session.run`; of the next session, higher than that of any which may have published before.
     """
@@ -139,41 +139,62 @@ class Lineage:
     run: int = 0
 
 
-@record
+@dataclass(slots=True)
 class Tracked:
-    """Tracks to be published, without their delivery part.
+    """Tracks of a frame.
+
+    The message is built when somebody reads it. The bytes to publish are put together without it: the columns of the
+    tracks lie one behind the other in one array, in the order in which the message has them.
 
     Attributes:
-        made: the tracks.
-        ticket: what the caller gave with the detections.
+        estimates: tracks of the tracker, with numbers that a message may hold.
+        header: the fields of the message before the columns, those without a value left out.
+        others: the fields behind the columns: classes and predicted paths, where the profile has them.
+        ticket: value that the caller gave with the detections.
         step_ns: time that conversion and tracking took.
         run: see `Session.run`.
     """
 
-    made: FrameTracks
-    ticket: Any
-    step_ns: int
+    estimates: optipmb.Tracks
+    header: dict[str, Any]
+    others: dict[str, Any]
+    ticket: Any = None
+    step_ns: int = 0
     run: int = 0
 
     @property
     def tracks(self) -> schemas.Tracks:
-        """The message, made anew."""
-        return self.made.message
+        """The message, without its delivery part."""
+        columns: dict[str, Any] = dict(self.estimates.columns())
+        columns["confirmed"] = columns["confirmed"].astype(np.int64)
+        for column in columns.values():
+            column.flags.writeable = False
+        return schemas.Tracks.trusted(self.header | columns | self.others)
+
+    def encoded(self, delivery: dict[str, Any]) -> bytes:
+        """Return the bytes of the message with a delivery part of these values, all that it has, in its order."""
+        if self.others:
+            return schemas.encode(self.tracks, delivery=schemas.Delivery.trusted(delivery))
+        words = self.estimates.words
+        return schemas.encode_columns(schemas.Tracks, self.header, COLUMNS, words, {"delivery": delivery})
+
+
+Reason = Literal["first", "jump", "clock", "publisher", "pose", "effort", "reset", "parameters", "quarantine"]
+"""Why the density started again; `clock`: after a step back, with its objects."""
 
 
 @dataclass(frozen=True, slots=True)
 class Begun:
-    """A new life of the density began: at the first frame, at a jump, by a reset.
+    """Start of a session id: at the first frame, at a jump, by a reset.
 
     Attributes:
-        session: its id.
-        reason: "first", "jump", "clock" (a step back, after which the objects are kept), "publisher", "pose", "effort",
-            "reset", "parameters" or "quarantine".
+        session: the id.
+        reason: why.
         jump_ns: how far the stamps jumped.
     """
 
     session: str
-    reason: str
+    reason: Reason
     jump_ns: int = 0
 
 
@@ -195,7 +216,7 @@ Output = Tracked | schemas.Problem | Begun | Quarantined
 
 @dataclass(slots=True)
 class Deliveries:
-    """What was not tracked, and what was corrected: all of it depends on how messages were delivered.
+    """Counts of frames that were not tracked, and of corrections: they depend on how messages were delivered.
 
     Attributes:
         duplicates: frames that came again.
@@ -214,7 +235,7 @@ class Deliveries:
 
 @dataclass(slots=True)
 class Counters:
-    """What happened to the messages of a session so far; see `Deliveries` and `state.FrameCounts`."""
+    """Counts of the messages of a session so far; see `Deliveries` and `state.FrameCounts`."""
 
     frames: int = 0
     duplicates: int = 0

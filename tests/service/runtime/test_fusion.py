@@ -16,7 +16,7 @@ from optipmb_service.cluster.leases import partition_of
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.ports import Packet
-from optipmb_service.session.checkpoint_codec import digest_of
+from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import SECOND, Policy
 from optipmb_service.settings.loading import SettingsInvalidError, load

@@ -16,7 +16,7 @@ from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.scheduler import Scheduler
-from optipmb_service.session.cloud_buffer import CloudBuffer
+from optipmb_service.session.pending import CloudBuffer
 from optipmb_service.session.problems import problem_of
 from optipmb_service.settings.loading import SettingsInvalidError, load
 from optipmb_service.settings.model import Settings

@@ -14,19 +14,20 @@ import optipmb_schemas as schemas
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.session.checkpoint import Checkpoint, CheckpointError
-from optipmb_service.session.checkpoint_codec import (
+from optipmb_service.session.checkpoint import (
     DIGEST,
     HEAD,
     MAGIC,
     VERSION,
+    Checkpoint,
+    CheckpointError,
     decode_checkpoint,
     encode_checkpoint,
     seal,
     state_bytes,
 )
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Lineage, Policy
+from optipmb_service.session.values import Incarnation, Policy
 from router import SECOND, Sensor
 from sessions import Merged, chained, feed, problems, tracks
 
@@ -58,6 +59,14 @@ def test_equal_sessions_give_equal_bytes() -> None:
     assert encode_checkpoint(checkpoint) == data
     restored = Session.restore(checkpoint, 0).snapshot()
     assert (restored.run, encode_checkpoint(replace(restored, run=0))) == (1, data)
+
+
+def test_classes_keep_their_order() -> None:
+    """The classes of a profile are numbered by their order in it, whatever their names."""
+    kitti = optipmb.load_profile("kitti")
+    one = Session(SENSOR.stream, kitti)
+    assert sorted(kitti.labels) != list(kitti.labels)
+    assert decode_checkpoint(encode_checkpoint(one.snapshot())).parameters.labels == kitti.labels
 
 
 def test_a_snapshot_does_not_change_any_more() -> None:
@@ -139,7 +148,7 @@ def test_large_clouds_shorten_the_window_not_the_checkpoint() -> None:
         one.on_points(SENSOR.points(seq, count=3000), 0)
         feed(one, [seq], SENSOR)
     checkpoint = one.snapshot()
-    assert len(one._processed.entries) == 6
+    assert len(one._window.frames) == 6
     assert [entry.frame_id.seq for entry in checkpoint.window] == [5, 6]
     assert len(encode_checkpoint(checkpoint)) < 130_000
     two = Session.restore(checkpoint, 0, policy)
@@ -233,14 +242,14 @@ def test_another_version_is_refused_by_number(version: int) -> None:
     expected = f"version {version}: expected {VERSION}, the only one of this release; start the release that wrote it"
     with pytest.raises(CheckpointError, match=expected) as refused:
         decode_checkpoint(other)
-    assert refused.value.lineage == Lineage(checkpoint.head.starts, checkpoint.head.density.next_id)
+    assert refused.value.incarnation == Incarnation(checkpoint.head.starts, checkpoint.head.density.next_id)
 
 
 def altered(change: Any) -> Checkpoint:
     """Read a checkpoint whose body was changed and sealed again."""
     body = msgpack.unpackb(encode_checkpoint(example().snapshot())[HEAD:])
     change(body)
-    return decode_checkpoint(seal(msgpack.packb(body), Lineage()))
+    return decode_checkpoint(seal(msgpack.packb(body), Incarnation()))
 
 
 def _set_profile(body: Any, **changes: Any) -> None:
@@ -318,7 +327,7 @@ def test_more_may_be_added() -> None:
 def test_any_body_is_read_or_refused(body: bytes) -> None:
     """Whatever the bytes under a good seal, nothing but `CheckpointError` is raised."""
     with pytest.raises(CheckpointError):
-        decode_checkpoint(seal(body, Lineage()))
+        decode_checkpoint(seal(body, Incarnation()))
 
 
 # The bytes of the version

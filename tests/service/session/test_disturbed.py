@@ -11,7 +11,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 from optipmb_schemas import Detections, MessageError, decode, encode
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
 from router import SECOND, Sensor

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from optipmb_service.session import convert
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
-from optipmb_service.session.frame_tracks import tracks_of
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.timeline import FrameId
 from router import Sensor
@@ -75,7 +74,7 @@ def test_a_covariance_that_no_message_can_carry_is_not_published() -> None:
 
 def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> schemas.Tracks:
     """The message for tracks."""
-    return tracks_of(
+    return convert.tracks_of(
         found,
         paths,
         stream=SENSOR.stream,
@@ -86,7 +85,7 @@ def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> 
         cloud_used=False,
         gap=0,
         ignored=0,
-    ).message
+    ).tracks
 
 
 @settings(max_examples=40, deadline=None)

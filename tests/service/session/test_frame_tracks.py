@@ -8,8 +8,9 @@ import numpy as np
 import optipmb_schemas as schemas
 from hypothesis import example, given
 from hypothesis import strategies as st
-from optipmb_service.session.frame_tracks import COLUMNS, FrameTracks, tracks_of
+from optipmb_service.session.convert import tracks_of
 from optipmb_service.session.timeline import FrameId
+from optipmb_service.session.values import COLUMNS, Tracked
 
 import optipmb
 
@@ -26,7 +27,7 @@ def sound_tracks(count: int) -> optipmb.Tracks:
     return optipmb.Tracks(**columns | {"id": np.arange(count) * 3})
 
 
-def made(tracks: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None, **fields: Any) -> FrameTracks:
+def made(tracks: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None, **fields: Any) -> Tracked:
     """Tracks of a frame."""
     header: dict[str, Any] = {"stream": "a/b/c", "session": "0" * 32, "revision": 0, "cloud_used": False}
     header |= {"gap": 0, "ignored": 0, "parameters": PARAMETERS, "frame_id": FrameId(b"0" * 16, 1, 2)}
@@ -66,10 +67,10 @@ def test_bytes_are_those_of_the_message(*, count: int, node: int, sensor: bool, 
     tracks = made(sound_tracks(count), stream=stream, frame_id=frame_id, gap=run, revision=run)
     values = delivery(run)
     payload = tracks.encoded(values)
-    assert payload == schemas.encode(tracks.message, delivery=schemas.Delivery(**values))
+    assert payload == schemas.encode(tracks.tracks, delivery=schemas.Delivery(**values))
     message = schemas.decode(payload, schemas.Tracks)
     assert (message.seq, message.sensor, len(message.id)) == (seq, frame_id.sensor or None, count)
-    for name, column in tracks.tracks.columns():
+    for name, column in tracks.estimates.columns():
         np.testing.assert_array_equal(getattr(message, name), column)
 
 

@@ -11,10 +11,10 @@ from fusing import FRONT, FUSED, REAR, SIDE, drive
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_schemas import Pose
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint, state_bytes
-from optipmb_service.session.fused_timeline import FusedTimeline
-from optipmb_service.session.pending import PendingFrames
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.pending import SensorQueue
 from optipmb_service.session.session import Session
+from optipmb_service.session.timeline import FusedTimeline
 from optipmb_service.session.values import MAX_SENSORS, Policy
 from router import SECOND, Sensor
 from sessions import Failing, Merged, begun, chained, delayed, feed, problems, tracks
@@ -227,14 +227,14 @@ def test_a_session_takes_so_many_sensors() -> None:
 
 def test_the_state_can_be_told_while_a_sensor_comes(monkeypatch: pytest.MonkeyPatch) -> None:
     """The state of a session may be asked for by any thread, also when a sensor comes while they are counted."""
-    one, length = fused(), PendingFrames.__len__
+    one, length = fused(), SensorQueue.__len__
     given_to(one, [FRONT.detections(0), REAR.detections(0)])
 
-    def interrupted(pending: PendingFrames) -> int:
+    def interrupted(pending: SensorQueue) -> int:
         one.on_detections(replace(SIDE, stream=f"site/car/lidar-{len(one.sensors)}").detections(0), 0)
         return length(pending)
 
-    monkeypatch.setattr(PendingFrames, "__len__", interrupted)
+    monkeypatch.setattr(SensorQueue, "__len__", interrupted)
     before = len(one.sensors)
     assert one.state().queue == 0
     assert len(one.sensors) == before + 2
@@ -256,7 +256,7 @@ def test_a_sensor_that_is_silent_makes_room_for_another() -> None:
                 decode_checkpoint(encode_checkpoint(one.snapshot())), 0, Policy(recovery_wait_ns=0), tracker=chained
             )
             one.recovered(0)
-    for kept in (one.sensors, one._processed.head.sensors, one._processed.timeline.seen):
+    for kept in (one.sensors, one._window.head.sensors, one._timeline.seen):
         assert len(kept) == MAX_SENSORS
         assert names[-1] in kept
         assert FRONT.stream in kept
@@ -272,8 +272,8 @@ def test_what_is_remembered_of_sensors_is_bounded() -> None:
             other = Session.restore(decode_checkpoint(encode_checkpoint(other.snapshot())), 0, tracker=chained)
             other.recovered(0)
         again.take(given_to(other, [frame]), other.run)
-    assert len(one._processed.timeline.seen) == MAX_SENSORS
-    assert len(one._processed.timeline.clock) == MAX_SENSORS
+    assert len(one._timeline.seen) == MAX_SENSORS
+    assert len(one._timeline.clock) == MAX_SENSORS
     assert state_bytes(one.snapshot()) == state_bytes(other.snapshot())
     assert merged.plain() == again.plain()
 

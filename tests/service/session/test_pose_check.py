@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_schemas import Detections, Pose
-from optipmb_service.session.checkpoint_codec import state_bytes
+from optipmb_service.session.checkpoint import state_bytes
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Output, Policy
 from router import Sensor

@@ -14,7 +14,7 @@ from optipmb_client import dumps as client
 from optipmb_client.cli import run
 from optipmb_client.errors import UsageError
 from optipmb_service.runtime.dumps import FOLDER, MOST, save
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
 from router import Sensor

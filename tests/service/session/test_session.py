@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import sessions
 from optipmb_schemas import PATHS, Detections, decode, encode
-from optipmb_service.session.checkpoint_codec import decode_checkpoint, encode_checkpoint
+from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.session.session import Session
-from optipmb_service.session.values import Lineage, Output, Policy, RefusedError
+from optipmb_service.session.values import Incarnation, Output, Policy, RefusedError
 from router import SECOND, Sensor, plain
 from sessions import begun, problems, tracks
 
@@ -150,7 +150,9 @@ def test_session_ids_depend_on_where_a_session_began() -> None:
     """A service that was restarted and joins later does not give a new session an id that was used."""
     assert tracks(feed(session(), [0]))[0].session == tracks(feed(session(), [0]))[0].session
     assert tracks(feed(session(), [0]))[0].session != tracks(feed(session(), [1]))[0].session
-    assert tracks(feed(session(), [0]))[0].session != tracks(feed(session(life=Lineage(1, 1)), [0]))[0].session
+    assert (
+        tracks(feed(session(), [0]))[0].session != tracks(feed(session(incarnation=Incarnation(1, 1)), [0]))[0].session
+    )
 
 
 def test_a_cloud_before_its_frame_is_used_at_once() -> None:

@@ -6,10 +6,11 @@ import itertools
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.session.seen_numbers import WINDOW
+from optipmb_service.session.pending import SensorQueue
 from optipmb_service.session.state import FilterState, SensorState
-from optipmb_service.session.timeline import Cursor, Decision, FrameId, Timeline, Verdict, hold_until
-from optipmb_service.session.values import JumpLimits
+from optipmb_service.session.timeline import WINDOW, Cursor, Decision, FrameId, StreamTimeline, Timeline, Verdict
+from optipmb_service.session.values import JumpLimits, Policy
+from router import Sensor
 
 import optipmb
 
@@ -32,7 +33,8 @@ def state_after(cursor: Cursor, last: FrameId | None) -> FilterState:
 
 def judge_all(marks: list[FrameId], *, window: bool = False) -> tuple[list[Decision], Timeline]:
     """Judge frames; without a window none can be gone behind."""
-    timeline, decisions, cursor, floor = Timeline(LIMITS), [], Cursor(), None
+    timeline: Timeline = StreamTimeline(LIMITS, {"": ()})
+    decisions, cursor, floor = [], Cursor(), None
     for one in marks:
         decision, timeline = timeline.judge(one)
         decisions.append(decision)
@@ -115,7 +117,7 @@ def test_the_frame_between_undoes_a_jump() -> None:
 def test_memory_is_bounded(arrived: list[FrameId], window: bool) -> None:  # noqa: FBT001 - drawn
     """Sequence numbers may leap by 2^62 without the memory of them growing beyond its window."""
     _, timeline = judge_all(arrived, window=window)
-    assert all(0 < seen.mask.bit_length() <= WINDOW for seen in timeline.epochs)
+    assert all(0 < seen.mask.bit_length() <= WINDOW for seen in timeline.seen[""])
     assert window or not timeline.frame_ids
 
 
@@ -270,14 +272,9 @@ def test_a_publisher_s_last_frame_may_be_overtaken_by_its_successor_s_first() ->
 )
 def test_waiting_for_a_cloud(has_points: bool | None, newest: int | None, stamp: int, wait: int) -> None:  # noqa: FBT001 - drawn
     """A frame waits if it says so, or says nothing and a cloud came lately; never longer than allowed."""
-    until = hold_until(
-        has_points=has_points,
-        stamp_ns=stamp,
-        arrived_ns=7,
-        newest_cloud_ns=newest,
-        cloud_wait_ns=wait,
-        cloud_memory_ns=2 * SECOND,
-    )
+    queue = SensorQueue(Policy(cloud_wait_ns=wait, cloud_memory_ns=2 * SECOND), StreamTimeline(LIMITS, {"": ()}))
+    queue.clouds.newest_ns = newest
+    until = queue.cloud_deadline_ns(Sensor().detections(0, has_points=has_points, stamp_ns=stamp), 7)
     lately = newest is not None and abs(stamp - newest) <= 2 * SECOND
     waits = wait > 0 and (has_points or (has_points is None and lately))
     assert until == (7 + wait if waits else None)
