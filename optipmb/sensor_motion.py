@@ -113,6 +113,8 @@ def follow_sensor(density: Density, frame: Frame) -> Density:
             still = math.hypot(found[0], found[1]) < STANDING[0] * dt and abs(found[2]) < STANDING[1] * dt
             return standing if still else _carried(density, found, dt)
     found = _begun(pairs, ahead, dt)
+    if found is None and before is not None and together(*pairs, np.zeros(3)).sum() < SHARE * len(rows):
+        found = before * dt  # neither gone on nor stopped: the next frame may tell
     if found is None:
         return standing
     return _carried(density if before is not None else _over_ground(density, found, dt, frame), found, dt)
@@ -122,7 +124,7 @@ def _continued(pairs: Pairs, driven: Array, guess: Array, dt: float) -> Array | 
     """Return the motion near that of the frame before, which stays where there are few objects; None if it is gone."""
     start, label, target, target_label = pairs
     start = start + np.where(np.hypot(*driven.T)[:, None] > MOVING * dt, driven, 0.0)
-    reach, turn, trust = 1.0 + CHANGE[0] * dt * dt, 0.02 + CHANGE[1] * dt * dt, (0.15 / (0.05 + 2.0 * dt * dt)) ** 2
+    reach, turn, trust = 1.0 + CHANGE[0] * dt * dt, 0.02 + CHANGE[1] * dt * dt, (0.15 / (0.05 + dt * dt)) ** 2
     found, count, _ = common_motion(start, label, target, target_label, guess, reach, turn, trust)
     if count >= max(CREW // 2, 0.5 * SHARE * len(start)):
         return found

@@ -68,7 +68,7 @@ def tracked(
 
 @pytest.mark.parametrize(("speed", "turn", "rate"), [(15.0, 0.0, 10.0), (15.0, 0.0, 2.0), (10.0, 0.3, 5.0)])
 def test_parked_cars_keep_their_ids_and_stand(speed: float, turn: float, rate: float) -> None:
-    """Past a sensor that drives straight or round a bend: one id each, and no speed; without the estimate more ids where the way is long."""
+    """Past a sensor that drives straight or round a bend: one id each, and no speed; without it more ids."""
     frames = street(speed, rate, turn=turn)
     found, ids = tracked(GENERIC, frames)
     assert all(len(one) == 1 for one in ids.values())
