@@ -14,7 +14,7 @@ from optipmb.errors import FrameError
 from optipmb.heading import doubt, sign_probability
 from optipmb.position_noise import PLAIN
 from optipmb.preprocess import Measurements
-from optipmb.reported import DOUBTED, STANDING, follow_box
+from optipmb.reported import follow_box
 from optipmb.rows import Column, Rows, arrays_of
 
 if TYPE_CHECKING:
@@ -170,12 +170,11 @@ def extract_tracks(
         n = rows[k]
         own = classes[objects.label[n]]
         copy_state(objects.mean, objects.covariance, n, state, covariance, k)
-        m, v = measurement[n], state[k, V]
+        m = measurement[n]
         tracks.detection[k] = z.source[m] if m >= 0 else -1
-        doubted = 1.0 if v * v + covariance[k, V, V] > STANDING * STANDING else DOUBTED
         if m >= 0 and own.reported_position + own.reported_heading > 0.0:
             position = z.position[m]
-            r_x = r_y = doubted * own.reported_position
+            r_x = r_y = own.reported_position
             if position.shape[0] > PLAIN:
                 r_x, r_y = r_x * position[2], r_y * position[4]
             follow_box(
@@ -184,11 +183,11 @@ def extract_tracks(
                 z.yaw[m],
                 r_x,
                 r_y,
-                doubted * own.reported_heading,
+                own.reported_heading,
                 state[k],
                 covariance[k],
             )
-        phi = state[k, PHI]
+        v, phi = state[k, V], state[k, PHI]
         center[k, 0], center[k, 1], center[k, 2] = state[k, X], state[k, Y], objects.auxiliary[n, 3]
         for s in range(3):
             size[k, s] = objects.auxiliary[n, s]

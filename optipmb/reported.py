@@ -9,8 +9,7 @@ used the detection with R already, that is one more update of it, by the same z,
     m_b + G nu,    (I - G) P_bb,    (I - G) P_bo;          nu_phi modulo pi, as in `optipmb.update`
 
 Speed, turn rate and acceleration, o, stay as they are (the gain of a Schmidt-Kalman filter), and nothing goes back into
-the recursion. A missed object reports its state, and so does a class without `reported_noise`. Of an object that stands
-R_x is `DOUBTED` times as large: its detections jitter, and the state rests on many of them.
+the recursion. A missed object reports its state, and so does a class without `reported_noise`.
 """
 
 from __future__ import annotations
@@ -26,12 +25,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
-
-DOUBTED: Final = 4.0
-"""Factor of R_x for objects that stand: more lies stiller, and farther from detections whose errors last."""
-
-STANDING: Final = 0.6
-"""An object stands where the root mean square of its speed, of mean and variance, is below this, m/s."""
 
 BOX: Final = (X, Y, PHI)
 """The entries of the state that a box shows, b."""

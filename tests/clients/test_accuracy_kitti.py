@@ -104,7 +104,7 @@ def thinned(clip: Clip, every: int) -> Clip:
     [("pointrcnn", 0.7617), ("second_iou", 0.7765), ("pvrcnn", 0.7686), ("casa", 0.7887), ("virconv", 0.8273)],
 )
 def test_boxes_of_cars_lie_nearer_than_those_of_their_detector(detections: str, motp: float) -> None:
-    """In no direction is the error above that of the detections; MOTP is 0.014 above that of the state's own boxes.
+    """In no direction is the error above that of the detections; MOTP is 0.015 above that of the state's own boxes.
 
     Headings are backward at most 1.2 times as often as the detector's, and 90 to 98 % of their errors lie within the
     interval of 95 %.
@@ -120,7 +120,7 @@ def test_boxes_of_cars_lie_nearer_than_those_of_their_detector(detections: str, 
     figures_of: Any = found.figures(found.detected)
     for direction in ("along", "across", "height", "heading"):
         assert figures_of["track"][direction] <= figures_of["detection"][direction], direction
-    assert figures("kitti", detections, "Car").to_json()["MOTP"] >= motp + 0.014
+    assert figures("kitti", detections, "Car").to_json()["MOTP"] >= motp + 0.015
     assert figures_of["backward"]["track"] <= 1.2 * figures_of["backward"]["detection"]
     all_boxes: Any = found.figures(np.ones(len(found.speed), dtype=bool))
     assert 0.90 <= all_boxes["heading"]["coverage"] <= 0.98

@@ -270,17 +270,13 @@ def confidence(c: Any, odds: float) -> tuple[float, float]:
 
 
 def report(c: Any, z: Measurement | None, m: Array, P: Array) -> tuple[Array, Array]:
-    """The state that is told: its box updated once more with the noise that is left between R and R'.
-
-    That of an object that stands, by the mean square of its speed, counts four times.
-    """
+    """The state that is told: its box updated once more with the noise that is left between R and R'."""
     if z is None or c.reported_noise is None:
         return m, P
     less, noise = c.reported_noise, c.measurement_noise
     names = ["position", "position", "heading"]
     used = [i for i, name in enumerate(names) if getattr(less, name) < getattr(noise, name)]
-    doubted = 4.0 if m[2] ** 2 + P[2, 2] <= 0.6**2 else 1.0
-    left = [doubted / (getattr(less, names[i]) ** -2 - getattr(noise, names[i]) ** -2) for i in used]
+    left = [1 / (getattr(less, names[i]) ** -2 - getattr(noise, names[i]) ** -2) for i in used]
     H = np.eye(6)[[[0, 1, 3][i] for i in used]]
     nu = np.array([z.xy[0] - m[0], z.xy[1] - m[1], fold(z.yaw - m[3])])[used]
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(left))
