@@ -24,6 +24,7 @@ REACH: Final = (  # the gate, m, and the standard deviation of an unknown speed,
     ("pedestrian", (1.8, 2.0)), ("bicycle", (2.5, 5.0)), ("motorcycle", (2.5, 12.0)), (OTHER, (2.5, 10.0)),
 )  # fmt: skip
 GATE_DEVIATIONS: Final = 2.75
+GROUPED: Final = frozenset({"car", "truck", "bus"})
 SIZED: Final = frozenset({"truck", "bus", "trailer"})
 AGILE: Final = frozenset({"pedestrian"})
 TWO_WHEELED: Final = frozenset({"bicycle", "motorcycle"})
@@ -71,6 +72,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
     gate, unknown_speed = dict(REACH)[kind]
     agile, two_wheeled, sized = kind in AGILE, kind in TWO_WHEELED, kind in SIZED
     return {
+        **({"group": "vehicle", "suppress_in_group": False} if kind in GROUPED else {}),
         "score_filter": 0.05,
         "announce_score": 0.15,
         "birth_score": 0.5,

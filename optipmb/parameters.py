@@ -264,6 +264,9 @@ class ClassParameters(_Table):
         description="eta_iou and the class gate take classes with the same group for one, and a track has a posterior "
         "over them (`optipmb.class_posterior`); none, the paper: the class alone",
     )
+    suppress_in_group: bool = Field(
+        default=True, exclude_if=bool, description="true: eta_iou compares detections of the group; false: of the class"
+    )
     class_confusion: ModerateProbability = Field(
         default=0.05, exclude_if=(0.05).__eq__, description="kappa: probability of another label of the group"
     )

@@ -59,7 +59,8 @@ def preprocess(
 ) -> tuple[Measurements, Index, int, int]:
     """Remove detections scored below eta_sf, then those that overlap a better one by more than eta_iou.
 
-    They are compared with detections of their class, and with those of the other classes of its group, if it has one.
+    They are compared with detections of their class, and of the other classes of its group unless it has none or
+    `suppress_in_group` is off.
     `score` (M,) stands for the scores of the frame.
 
     Returns:
@@ -195,19 +196,19 @@ def non_maximum_suppression(boxes: Array, label: Index, classes: Sequence[ClassR
     widest = np.zeros(len(classes))
     for m in range(count):
         radius[m] = 0.5 * math.hypot(boxes[m, 2], boxes[m, 3])
-        g = classes[label[m]].group
+        g = classes[label[m]].suppressed_with
         widest[g] = max(widest[g], radius[m])
     # Only kept boxes stand in the torus; the cells of a group are as wide as two of its boxes reach.
     head, following, side = empty_torus(count)
     for m in range(count):
-        g, threshold = classes[label[m]].group, classes[label[m]].nms_iou
+        g, threshold = classes[label[m]].suppressed_with, classes[label[m]].nms_iou
         cell_size = 2.0 * widest[g]
         first_x, last_x, first_y, last_y = block(boxes[m, 0], boxes[m, 1], radius[m] + widest[g], cell_size)
         for i in range(first_x, last_x + 1):
             for j in range(first_y, last_y + 1):
                 k = head[(i & (side - 1)) * side + (j & (side - 1))]
                 while k != NOBODY and keep[m]:
-                    if classes[label[k]].group == g:
+                    if classes[label[k]].suppressed_with == g:
                         dx, dy, reach = boxes[k, 0] - boxes[m, 0], boxes[k, 1] - boxes[m, 1], radius[k] + radius[m]
                         if dx * dx + dy * dy < reach * reach:
                             left -= 1

@@ -28,6 +28,7 @@ class ClassRow(Protocol):
     Attributes:
         group: the first class of the group, the class itself without one.
         group_size: G, how many classes the group has.
+        suppressed_with: the first class of those that eta_iou compares with it.
         clutter_intensity: lambda_c = mu_c / A, 1/m^2.
         birth_intensity: mu_b0 / A, 1/m^2.
         acceleration_time: time constant of the acceleration, s, infinite where it is constant.
@@ -81,6 +82,7 @@ class ClassRow(Protocol):
     min_existence: float
     group: int
     group_size: int
+    suppressed_with: int
     class_memory: float
     clutter_intensity: float
     birth_intensity: float
@@ -153,9 +155,13 @@ class ClassTable:
         """Lay out the classes of a profile as a table."""
         rows = tuple(parameters.classes.values())
         groups = [(p.group,) if p.group is not None else row for row, p in enumerate(rows)]
+        suppressed = [
+            group if p.suppress_in_group else row for row, (p, group) in enumerate(zip(rows, groups, strict=True))
+        ]
         classes: Any = np.zeros(len(rows), CLASS)
         for c, (p, group) in enumerate(zip(rows, groups, strict=True)):
             shared = {"group": groups.index(group), "group_size": groups.count(group)}
+            shared["suppressed_with"] = suppressed.index(suppressed[c])
             for name, value in (_values(p) | shared).items():
                 classes[name][c] = value
         confusion = _confusion(classes, np.array([p.class_confusion for p in rows]))

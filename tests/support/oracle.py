@@ -184,7 +184,7 @@ class Oracle:
             rivals = [
                 other
                 for other, known in zip(boxes, kept, strict=True)
-                if known.label == label or self.classes[known.label].group == self.classes[label].group is not None
+                if known.label == label or self._suppressed_together(known.label, label)
             ]
             if any(iou(box, other) > self.classes[label].nms_iou for other in rivals):
                 continue
@@ -221,6 +221,11 @@ class Oracle:
         position = self.classes[z.label].measurement_noise.position
         value = log_likelihood(z.xy, component.mean, component.covariance, position)
         return value + (math.log(component.pi @ self._called(z)) if isinstance(component, Bernoulli) else 0.0)
+
+    def _suppressed_together(self, one: int, other: int) -> bool:
+        """Whether eta_iou compares detections of two classes: both are of one group, and suppressed in it."""
+        first, second = self.classes[one], self.classes[other]
+        return first.group == second.group is not None and first.suppress_in_group and second.suppress_in_group
 
     def _group(self, label: int) -> list[int]:
         """The classes that share the group of a class, itself among them."""

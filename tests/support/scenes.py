@@ -283,6 +283,7 @@ def random_parameters(
     if seed % 3 == 1:
         for values in list(classes.values())[: 2 + seed % 2]:
             values |= {"group": "road users", "class_confusion": rng.uniform(0.05, 0.4)}
+            values |= {"suppress_in_group": bool(seed % 2)}
             values["class_memory"] = rng.uniform(0.5, 0.99)
     if calibrated:
         for values in classes.values():

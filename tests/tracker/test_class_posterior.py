@@ -249,3 +249,15 @@ def test_the_outermost_values_keep_a_posterior(values: dict[str, float]) -> None
         np.testing.assert_allclose(posterior.sum(axis=1), 1.0)
     assert posterior is not None
     assert posterior[-1, LABELS.index("truck")] > 0.9
+
+
+def test_a_vehicle_of_two_names_keeps_its_id_by_default() -> None:
+    """A car that is called a truck in three frames of ten is one track of `auto`, a car."""
+    parameters = optipmb.generic_parameters(("car", "truck"), 0.1)
+    tracker, found = optipmb.OnlineTracker(parameters), list[optipmb.OnlineTracks]()
+    for k, truck in enumerate(np.random.default_rng(4).random(100) < 0.3):
+        boxes = {"center": [[0.8 * k, 5.0, 0.8]], "size": [[4.5, 1.9, 1.6]], "yaw": [0.0], "score": [0.9]}
+        found.append(tracker.update(stamp_ns=k * 100_000_000, label=["truck" if truck else "car"], **boxes))
+    assert {int(identity) for one in found for identity in one.tracks.id} == {1}
+    assert all(len(one) == 1 for one in found[5:])
+    assert {parameters.labels[label] for label in found[-1].tracks.label} == {"car"}

@@ -110,7 +110,7 @@ def test_suppression_is_the_greedy_one_per_group(seed: int, *, mixed: bool, grou
         rivals = [k for k in wanted if group[label[k]] == group[label[i]]]
         if all(textbook.iou(boxes[i], boxes[k]) <= thresholds[label[i]] for k in rivals):
             wanted.append(i)
-    found = non_maximum_suppression(boxes, label, class_rows(3, nms_iou=thresholds, group=group), UNLIMITED)
+    found = non_maximum_suppression(boxes, label, class_rows(3, nms_iou=thresholds, suppressed_with=group), UNLIMITED)
     np.testing.assert_array_equal(np.flatnonzero(found), wanted)
     assert 0 < len(wanted) < 60
 

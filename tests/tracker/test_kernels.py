@@ -115,7 +115,7 @@ def test_only_scores_from_the_filter_on_are_chosen(seed: int) -> None:
     score, label = rng.choice([0.2, 0.3, 0.5], 40), rng.integers(0, 2, 40)
     center = np.column_stack([np.arange(40) * 100.0, np.zeros((40, 2))])
     thresholds = np.array([0.3, 0.5])
-    classes = class_rows(2, score_filter=thresholds, nms_iou=0.1, group=[0, 1])
+    classes = class_rows(2, score_filter=thresholds, nms_iou=0.1, suppressed_with=[0, 1])
     given = read_only(center, np.ones((40, 3)), np.zeros(40), np.zeros((40, 2)), score, label, np.arange(40))
     above, chosen, columns = select(*given, 2, classes, 10**6)
     wanted = np.flatnonzero(score >= thresholds[label])
