@@ -194,7 +194,7 @@ tune: install
 
 ablate: install
 	$(BIN)/optipmb ablate $(KITTI) --markdown
-	$(BIN)/optipmb ablate $(NUSCENES) --markdown
+	$(BIN)/optipmb ablate $(NUSCENES) --profile nuscenes --markdown
 
 # A hundred SIGKILLs in the middle of recorded sequences, which CI does three times; needs the KITTI data.
 kills: install

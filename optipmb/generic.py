@@ -24,7 +24,7 @@ REACH: Final = (  # the gate, m, and the standard deviation of an unknown speed,
     ("pedestrian", (1.8, 2.0)), ("bicycle", (2.5, 5.0)), ("motorcycle", (2.5, 12.0)), (OTHER, (2.5, 10.0)),
 )  # fmt: skip
 GATE_DEVIATIONS: Final = 2.75
-GROUPED: Final = frozenset({"car", "truck", "bus"})
+GROUPED: Final = frozenset({"car", "truck"})
 SIZED: Final = frozenset({"truck", "bus", "trailer"})
 AGILE: Final = frozenset({"pedestrian"})
 TWO_WHEELED: Final = frozenset({"bicycle", "motorcycle"})
@@ -85,7 +85,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "detection_floor": 0.6,
         "adaptive_birth_rate": 0.2,
         "undetected_birth_rate": 0.5,
-        "clutter_rate": 10.0,
+        "clutter_rate": 4.0,
         "area": 10_000.0,
         "poisson_steps": 2,
         "extract_new": 0.7,

@@ -44,7 +44,7 @@ def test_no_class_is_tracked_worse_than_greedily(detections: str) -> None:
 def test_the_figures_of_the_ablation_come_out_as_they_are_written(capsys: pytest.CaptureFixture[str]) -> None:
     """`optipmb ablate` prints the sixteen rows of each class in docs/ablation/nuscenes.csv, and frames per second."""
     data = ["--dataset", "nuscenes", "--root", str(nuscenes_root()), "--detections", "centerpoint"]
-    assert run(["ablate", *data, "--markdown"]) == 0
+    assert run(["ablate", *data, "--profile", "nuscenes", "--markdown"]) == 0
     printed, title = [], ""
     for line in capsys.readouterr().out.splitlines():
         if line.endswith(":") and not line.startswith("|"):
