@@ -31,9 +31,6 @@ from optipmb_schemas.model import Message
 
 T = TypeVar("T", bound=Message)
 
-KINDS: Final[frozenset[type[Message]]] = frozenset({Detections, Points, Tracks, Density})
-"""Messages with columns. Others are small."""
-
 MOST_BYTES: Final = 2**16
 """Bytes of a payload up to which msgspec encodes the fields again to compare them."""
 
@@ -112,20 +109,20 @@ def _type_of(kind: type[Message]) -> Any:
     return _TypedDict(kind.__name__, types, total=False)
 
 
-@cache
-def decoder_of(kind: type[Message]) -> Callable[[bytes], dict[str, Any]]:
-    """Return what decodes the fields of a message by their types alone; it raises what `REFUSED` names."""
-    return msgspec.msgpack.Decoder(_type_of(kind)).decode
-
+# Made on import: of two threads that ask msgspec for a decoder at once, one would use a type that is not complete.
+DECODERS: Final[dict[type[Message], Callable[[bytes], dict[str, Any]]]] = {
+    kind: msgspec.msgpack.Decoder(_type_of(kind)).decode for kind in (Detections, Points, Tracks, Density)
+}
+"""Functions that decode the fields of messages with columns by their types alone; they raise what `REFUSED` names."""
 
 _encode: Final = msgspec.msgpack.Encoder().encode
 
 
 def read(payload: bytes, kind: type[T], limits: Limits) -> T | None:
     """Return the message of a payload in this form, else None."""
-    if kind not in KINDS:
+    fields_of = DECODERS.get(kind)
+    if fields_of is None:
         return None
-    fields_of = decoder_of(kind)
     try:
         fields = fields_of(payload)
         message = checked(fields, kind, limits)

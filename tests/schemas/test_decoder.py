@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_schemas import Detections, Limits, Message, MessageError, codec, decode, encode, encoded
-from optipmb_schemas.decoder import KINDS, MOST_BYTES, MOST_NUMBERS, read
+from optipmb_schemas.decoder import DECODERS, MOST_BYTES, MOST_NUMBERS, read
 from optipmb_schemas.limits import DEFAULT
 
 CORPUS = Path(__file__).parents[1] / "fuzz" / "corpus" / "messages"
@@ -28,7 +30,7 @@ NUMBERS = (0.0, -0.0, NAN, INF, -INF, 5e-324, -5e-324, 1.0, 1.0 + 2**-52, 1e3, 1
 SMALL = (Limits(max_detections=2), Limits(max_labels=1), Limits(max_values=60), Limits(max_depth=3), Limits(max_text=4))
 
 
-NAMES = sorted(kind.__name__ for kind in KINDS)
+NAMES = sorted(kind.__name__ for kind in DECODERS)
 
 
 def by_models(payload: bytes, kind: type[Message], limits: Limits = DEFAULT) -> Message:
@@ -247,5 +249,29 @@ def test_damaged_bytes(examples: dict[str, Message], data: st.DataObject) -> Non
 @pytest.mark.parametrize("file", sorted(CORPUS.iterdir()), ids=lambda one: one.name)
 def test_files_that_a_search_found(file: Path) -> None:
     """Every file kept for the search, whatever message it was meant to be."""
-    for kind in KINDS:
+    for kind in DECODERS:
         check(file.read_bytes()[1:], kind)
+
+
+FIRST = """
+import sys, threading
+from router import Sensor
+import optipmb_schemas as schemas
+sys.setswitchinterval(1e-6)
+payload, start = schemas.encode(Sensor().detections(0)), threading.Barrier(8)
+def decode():
+    start.wait()
+    schemas.decode(payload, schemas.Detections)
+threads = [threading.Thread(target=decode) for _ in range(8)]
+for one in threads: one.start()
+for one in threads: one.join()
+"""
+
+
+def test_threads_may_decode_their_first_messages_at_once() -> None:
+    """No process ends by a signal whose threads all decode as soon as the modules are imported."""
+    folder = str(Path(__file__).parents[1] / "support")
+    for _ in range(8):
+        code = f"import sys; sys.path.insert(0, {folder!r}){FIRST}"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+        assert (done.returncode, done.stderr) == (0, "")

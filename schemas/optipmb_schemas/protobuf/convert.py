@@ -19,7 +19,7 @@ from google.protobuf.message import Message as ProtoMessage
 from numpy.typing import NDArray
 
 from optipmb_schemas.codec import build
-from optipmb_schemas.decoder import KINDS, REFUSED, Block, checked
+from optipmb_schemas.decoder import DECODERS, REFUSED, Block, checked
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import DEFAULT, Limits
 from optipmb_schemas.model import Message
@@ -72,7 +72,7 @@ def from_proto(proto: ProtoMessage, kind: type[T], limits: Limits = DEFAULT) -> 
     Raises:
         MessageError: whenever it is not a valid message within the limits.
     """
-    if kind in KINDS:
+    if kind in DECODERS:
         with suppress(*REFUSED):
             return checked(_usual_fields(proto), kind, limits)
     return build(_fields(proto), kind, limits)

@@ -12,7 +12,7 @@ from typing import Any, Final, Self
 
 from optipmb_schemas.blocks import DTYPES
 from optipmb_schemas.codec import decode, encoding_of
-from optipmb_schemas.decoder import REFUSED, decoder_of
+from optipmb_schemas.decoder import DECODERS, REFUSED
 from optipmb_schemas.limits import DEFAULT, Limits
 from optipmb_schemas.messages import Tracks
 from optipmb_schemas.protobuf import tracking_pb2 as pb
@@ -64,7 +64,7 @@ def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -
     """
     if encoding == _ENCODING and len(payload) <= limits.max_bytes:
         try:
-            tracks = _tracks(decoder_of(Tracks)(payload), limits)
+            tracks = _tracks(DECODERS[Tracks](payload), limits)
         except REFUSED:
             tracks = None  # decoding says what is wrong, if anything is
         if tracks is not None:
