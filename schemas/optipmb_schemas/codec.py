@@ -34,7 +34,7 @@ except ModuleNotFoundError as missing:  # without numpy the models read every fo
     if missing.name != "numpy":
         raise
 
-    def read(payload: bytes, kind: type["T"], limits: Limits) -> "T | None":  # noqa: ARG001, D103  the other one's
+    def read(payload: bytes, kind: type["T"], limits: Limits) -> "T | None":  # noqa: ARG001, D103  in place of `decoder.read`
         return None
 
 
