@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-GENERIC = optipmb.load_profile("generic")
-FIXED = GENERIC.model_copy(update={"sensor_motion": False})
+FIXED = optipmb.load_profile("generic")
+GENERIC = FIXED.model_copy(update={"sensor_motion": True})
 PLACES = np.random.default_rng(5).uniform((0.0, -25.0), (300.0, 25.0), (60, 2))
 """Parked cars along a way of 300 m."""
 HEADINGS = np.random.default_rng(6).choice([0.0, math.pi], 60)
