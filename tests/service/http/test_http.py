@@ -34,6 +34,7 @@ from starlette.routing import Route
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from concurrent.futures import Future
     from pathlib import Path
 
     from starlette.requests import Request
@@ -188,15 +189,21 @@ def test_connections_without_a_request_keep_no_probe_out(sent: bytes) -> None:
 def test_slow_requests_keep_no_probe_out() -> None:
     """While all the requests that are answered at once hang, probes are answered and others refused."""
     gate = threading.Event()
+    hanging: list[Future[tuple[int, str]]] = []
 
     def hang(_request: Request) -> PlainTextResponse:
-        gate.wait(END_S)
+        gate.wait()
         return PlainTextResponse("late", headers={"cache-control": "no-store"})
+
+    def all_busy() -> bool:
+        """Whether a further request is refused; one that took the place of a hanging request is made up for."""
+        hanging[:] = [one for one in hanging if not one.done()]
+        hanging.extend(pool.submit(get, address, "/hang") for _ in range(REQUESTS - len(hanging)))
+        return get(address, "/nothing")[0] == 503
 
     with served(Said(), Route("/hang", hang)) as address, ThreadPoolExecutor(REQUESTS) as pool:
         try:
-            hanging = [pool.submit(get, address, "/hang") for _ in range(REQUESTS)]
-            until(lambda: get(address, "/nothing")[0] == 503, "all are busy")
+            until(all_busy, "all are busy")
             assert get(address, "/healthz")[0] == get(address, "/readyz")[0] == 200
         finally:
             gate.set()
