@@ -40,7 +40,7 @@ def test_the_tracker_is_imported_for_offline_tracking_alone() -> None:
 
 def test_zenoh_is_imported_in_one_folder() -> None:
     """Only modules of the folder zenoh/ import zenoh."""
-    modules = {f"zenoh/{name}.py" for name in ("configuration", "connection", "sender", "subscription")}
+    modules = {f"zenoh/{name}.py" for name in ("configuration", "connection", "handles", "session")}
     assert importers("zenoh") == modules
 
 

@@ -23,7 +23,7 @@ from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.load.material import FIRST, Frames, chain, head, message
 from optipmb_client.sessions import close_session, set_parameters
 from optipmb_client.zenoh import Connection
-from optipmb_client.zenoh.sender import Sender
+from optipmb_client.zenoh.handles import Sender
 
 __all__ = ["STAGES", "Load", "Run", "run_load"]
 

@@ -21,7 +21,7 @@ from optipmb_client.replay import CLOUD_WAIT_S, KEPT_PROBLEMS, POINTS_WANTED_S, 
 from optipmb_client.sessions import close_session, session_state, set_parameters
 from optipmb_client.subscriber import Subscriber
 from optipmb_client.zenoh import Connection
-from optipmb_client.zenoh.sender import Sender
+from optipmb_client.zenoh.handles import Sender
 
 __all__ = ["PlayedStream", "choose", "play"]
 
