@@ -62,7 +62,7 @@ def test_a_timeout_that_is_none_is_one_error(timeout: float, scheme: str) -> Non
 def test_a_connection_may_wait_for_ever(endpoint: str) -> None:
     """With an infinite timeout a connection opens; it has a router when it is open."""
     with Connection(endpoint, timeout=math.inf) as connection:
-        assert connection._session.linked
+        assert connection._session.linked()
 
 
 def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:
@@ -74,7 +74,7 @@ def test_a_router_that_comes_later_within_the_timeout_is_waited_for() -> None:
     try:
         with Connection(address, timeout=60.0) as connection:
             assert not connection.closed
-            assert connection._session.linked
+            assert connection._session.linked()
     finally:
         timer.join()
         opened[0].close()

@@ -64,7 +64,7 @@ class Connection:
             raise self._unanswered(endpoints, timeout, settings) from error
         # A router that starts at this moment may be known and not linked yet: what is sent then is lost.
         ends = time.monotonic() + timeout
-        while json.loads(settings.get_json("mode")) == "client" and not self._session.linked:
+        while json.loads(settings.get_json("mode")) == "client" and not self._session.linked():
             if time.monotonic() > ends:
                 self._session.close()
                 raise self._unanswered(endpoints, timeout, settings)

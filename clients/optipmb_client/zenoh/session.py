@@ -20,7 +20,7 @@ from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Answer, Arrival
 from optipmb_client.zenoh.handles import CLOSE_S, Channel, Declared, Query, Reading, Sender, directly, reason, usable
 
-__all__ = ["EVERYTHING", "NEWEST", "KeyNumbers", "Sample", "Session", "opened"]
+__all__ = ["EVERYTHING", "NEWEST", "KeyNumbers", "Opened", "Sample", "Session", "opened"]
 
 MOST_KEYS = 0xFFFF
 """Keys that a Zenoh session can declare in its life: it numbers them by 16 bits and gives no number back. Beyond, it
@@ -59,6 +59,7 @@ and Zenoh would take these for lost. Heartbeats tell of what was missed.
 
 _RECOVERY = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
 
+Opened: TypeAlias = zenoh.Session
 Sample: TypeAlias = zenoh.Sample
 _Item = TypeVar("_Item")
 _log_failure = partial(logging.getLogger("optipmb_client").exception, "the receiver of %s failed")
@@ -72,7 +73,7 @@ class KeyNumbers:
     open: int = 0
 
 
-def opened(config: zenoh.Config) -> zenoh.Session:
+def opened(config: zenoh.Config) -> Opened:
     """Open a session of Zenoh's.
 
     Raises:
@@ -82,6 +83,12 @@ def opened(config: zenoh.Config) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise ConnectionFailed(reason(error)) from error
+
+
+def close_session(session: Opened) -> None:
+    """Close a session of Zenoh's, also one that is closed."""
+    with contextlib.suppress(zenoh.ZError):
+        session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
 
 class Session:
@@ -95,7 +102,7 @@ class Session:
         failed: Called with the name of a subscription or queryable in place of an exception of its receiver.
     """
 
-    def __init__(self, session: zenoh.Session, failed: Callable[[str], object] = _log_failure) -> None:
+    def __init__(self, session: Opened, failed: Callable[[str], object] = _log_failure) -> None:
         self._session = session
         self._failed = failed
         self._lock = threading.Lock()
@@ -110,9 +117,8 @@ class Session:
         """Whether `close` has been called."""
         return self._session.is_closed()
 
-    @property
     def linked(self) -> bool:
-        """Whether it has a router."""
+        """Return whether it has a router."""
         return bool(self._session.info.routers_zid())
 
     @property
@@ -139,8 +145,7 @@ class Session:
         self.stop(timeout)
         for one in (*self._senders, *self._declared):
             one.close()
-        with contextlib.suppress(zenoh.ZError):
-            self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
+        close_session(self._session)
 
     # Sending
 
@@ -244,7 +249,12 @@ class Session:
         """Hand over samples on a thread of its own; of those that wait the newest `most` stay."""
         with self._counted(PLAIN):
             subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(most))
-        return self._read(key, self._keep(subscriber.undeclare, PLAIN), subscriber.handler, receive)
+
+        def take(sample: Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                receive(sample)
+
+        return self._read(key, self._keep(subscriber.undeclare, PLAIN), subscriber.handler, take)
 
     def listen(
         self, key: str, receive: Callable[[Sample], object], *, recovers: bool = False, history: Any = None

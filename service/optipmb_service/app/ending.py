@@ -62,9 +62,9 @@ RESTART: Final = 75
 
 STDERR: Final = 2
 CALLS: Final = 6
-"""Calls that are logged of a thread: the innermost one, and those of this package."""
+"""Calls that are logged of a thread: the innermost one, and those of these packages."""
 
-PACKAGE: Final = __name__.partition(".")[0]
+PACKAGES: Final = ("optipmb_service", "optipmb_client")
 
 log = structlog.get_logger("optipmb_service")
 
@@ -212,8 +212,8 @@ def _log_threads(seconds: float) -> None:
 
 
 def _calls(frame: FrameType) -> str:
-    """Return what a thread does; nothing where that is nothing of this package."""
+    """Return what a thread does; nothing where that is nothing of these packages."""
     stack = [(one.f_globals.get("__name__", ""), one, line) for one, line in traceback.walk_stack(frame)]
-    ours = [one for one in stack if one[0].partition(".")[0] == PACKAGE]
+    ours = [one for one in stack if one[0].partition(".")[0] in PACKAGES]
     calls = [*stack[:1], *(one for one in ours if one is not stack[0])][:CALLS] if ours else []
     return " < ".join(f"{module}.{one.f_code.co_name}:{line}" for module, one, line in calls)

@@ -26,12 +26,14 @@ from optipmb_service.session.problems import problem_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from optipmb_client.incoming import Arrival
+
     from optipmb_service.app.loops import StopRequest
     from optipmb_service.cluster.message_log import Topic
     from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.observability.metrics import Value
     from optipmb_service.settings.model import Settings
-    from optipmb_service.zenoh.client import Client, Message
+    from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
 
@@ -104,7 +106,7 @@ class LogBridge:
         for code, count in self._reporter.counts().items():
             yield "problems_total", (code,), count
 
-    def _take(self, message: Message) -> None:
+    def _take(self, message: Arrival) -> None:
         """Put a valid message into the log; one that is not, who tracks reports."""
         try:
             stream = self._client.keys.stream_of(message.key)

@@ -17,8 +17,9 @@ from optipmb_service.observability.health import BEAT_S
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from optipmb_client.zenoh.session import KeyNumbers
+
     from optipmb_service.app.ending import EndBound
-    from optipmb_service.zenoh.key_numbers import KeyCount
 
 SWITCH_S: Final = 0.0005
 """By default it is ten times as long, and a frame that meets two other threads waits 10 ms."""
@@ -114,7 +115,7 @@ async def beat(health: Heartbeat) -> None:
         await asyncio.sleep(BEAT_S)
 
 
-async def watch_keys(asked: StopRequest, used: Callable[[], KeyCount], most: int) -> None:
+async def watch_keys(asked: StopRequest, used: Callable[[], KeyNumbers], most: int) -> None:
     """Have the process begin again before its network session has no number for keys any more.
 
     It does not where that would give it few: what is open when it ends needs as many again.

@@ -71,7 +71,7 @@ async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHe
 
     async def connected(asked: StopRequest, health: ProcessHealth) -> bool | None:
         log.info("connecting", endpoints=settings.connect)
-        client = await unless(asked, lambda: Client.opened(settings))
+        client = await unless(asked, lambda: Client(settings))
         if client is None:
             return None
         health.metrics.add(lambda: collectors.of_network(client.key_numbers.declared, linked=client.linked()))

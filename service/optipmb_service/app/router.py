@@ -14,7 +14,7 @@ import structlog
 
 from optipmb_service.app import process
 from optipmb_service.app.loops import say_ready
-from optipmb_service.zenoh import Router
+from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
     from optipmb_service.app.loops import StopRequest
@@ -40,7 +40,7 @@ async def run(settings: Settings) -> int:
     """Route until SIGINT or SIGTERM; returns the exit status, as `process.run` does."""
 
     async def serve(asked: StopRequest, health: ProcessHealth) -> bool:
-        router = Router(settings)
+        router = Client(settings)
         health.report(_Routing())
         say_ready("router", settings.instance, settings.endpoints)
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)

@@ -34,11 +34,13 @@ from optipmb_service.runtime.service_queries import ServiceQueries, members_of
 from optipmb_service.runtime.stream_queries import StreamQueries
 from optipmb_service.runtime.track_query import TrackQuery
 from optipmb_service.session.problems import problem_of
-from optipmb_service.zenoh import Transport
+from optipmb_service.zenoh.transport import Transport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from optipmb_client.zenoh.session import KeyNumbers
 
     from optipmb_service.observability.metrics import Value
     from optipmb_service.runtime.context import Actor
@@ -46,7 +48,6 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.settings.model import Settings
     from optipmb_service.zenoh.client import Client
-    from optipmb_service.zenoh.key_numbers import KeyCount
 
 log = structlog.get_logger("optipmb_service")
 
@@ -204,7 +205,7 @@ class Service:
         return ended and kept and not unfinished
 
     @property
-    def key_numbers(self) -> KeyCount:
+    def key_numbers(self) -> KeyNumbers:
         """What is used of the numbers that its network session has for keys."""
         return self.client().key_numbers
 

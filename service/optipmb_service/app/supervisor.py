@@ -30,7 +30,7 @@ from optipmb_service.app.worker_process import WorkerProcess
 from optipmb_service.observability import logs
 from optipmb_service.observability.health import BEAT_S
 from optipmb_service.runtime.ports import EdgeError, TransportError
-from optipmb_service.zenoh import Transport
+from optipmb_service.zenoh.transport import Transport
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -22,8 +22,10 @@ from optipmb_service.grpc.selection import Selection
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from optipmb_service.zenoh.client import Client, Message
-    from optipmb_service.zenoh.subscription import Subscription
+    from optipmb_client.incoming import Answer, Arrival
+    from optipmb_client.zenoh.handles import Reading
+
+    from optipmb_service.zenoh.client import Client
 
 KEPT: Final = 256
 """Subscriptions that are kept when no call has them any more."""
@@ -71,7 +73,7 @@ class Listener(Protocol):
 @dataclass(eq=False)
 class _Feed:
     listeners: tuple[Listener, ...] = ()
-    subscription: Subscription | None = None
+    subscription: Reading | None = None
 
 
 class Feeds:
@@ -132,10 +134,10 @@ class Feeds:
         return await asyncio.to_thread(self._recent, key)
 
     def _recent(self, key: str) -> list[EncodedTracks]:
-        messages = self._client.recent(key, HISTORY_S)
+        messages = self._client.cached(key, timeout=HISTORY_S)
         return [tracks for one in messages if (tracks := self._tracks(one)) is not None]
 
-    def _receive(self, feed: _Feed, message: Message) -> None:
+    def _receive(self, feed: _Feed, message: Arrival) -> None:
         """Take a message on the thread of its subscription."""
         if not (listeners := feed.listeners):
             return
@@ -165,14 +167,14 @@ class Feeds:
             listener, item = self._handed.popleft()
             listener.take(item)
 
-    def _tracks(self, message: Message) -> EncodedTracks | None:
+    def _tracks(self, message: Answer | Arrival) -> EncodedTracks | None:
         try:
             return transcode(message.payload, encoding=message.encoding)
         except schemas.MessageError as error:
             self._invalid(str(error))
             return None
 
-    def _problem(self, message: Message) -> schemas.Problem | None:
+    def _problem(self, message: Arrival) -> schemas.Problem | None:
         try:
             return schemas.decode(message.payload, schemas.Problem, encoding=message.encoding)
         except schemas.MessageError as error:

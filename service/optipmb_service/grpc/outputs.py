@@ -111,10 +111,10 @@ async def kept(call: Call, stream: str, wanted: schemas.TracksRequest) -> AsyncI
     next_ns: int | None = wanted.from_ns
     while next_ns is not None:
         part = wanted.model_copy(update={"from_ns": next_ns})
-        answers = await asyncio.to_thread(client.ask, key, schemas.encode(part), encoding, timeout=KEPT_S)
-        found = [one for one in answers if one.good and one.encoding != encoding]
+        answers = await asyncio.to_thread(client.query, key, schemas.encode(part), encoding, timeout=KEPT_S)
+        found = [one for one in answers if one.ok and one.encoding != encoding]
         problems = [
-            schemas.decode(one.payload, schemas.Problem, encoding=one.encoding) for one in answers if not one.good
+            schemas.decode(one.payload, schemas.Problem, encoding=one.encoding) for one in answers if not one.ok
         ]
         if not problems and len(found) == len(answers):
             raise EndCall(grpc.StatusCode.UNAVAILABLE, "the tracks did not come completely" if found else NOBODY)

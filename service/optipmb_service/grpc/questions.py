@@ -65,13 +65,13 @@ async def list_streams(call: Call) -> None:
     client.keys.matching(pattern, "tracks")
     call.caller.may_read(pattern)
     answers, alive = await asyncio.gather(
-        asyncio.to_thread(client.ask, client.keys.all_status(), timeout=QUERY_S),
-        asyncio.to_thread(client.alive, client.keys.all_alive(), QUERY_S),
+        asyncio.to_thread(client.query, client.keys.all_status(), timeout=QUERY_S),
+        asyncio.to_thread(client.alive, client.keys.all_alive(), timeout=QUERY_S),
     )
     services = {client.keys.instance_of(key) for key in alive}
     listed = []
     for answer in answers:
-        if answer.good:
+        if answer.ok:
             status = schemas.decode(answer.payload, schemas.ServiceStatus, encoding=answer.encoding)
             if status.instance in services:
                 listed += [(status.instance, one) for one in status.sessions if _matches(one.stream, pattern)]
@@ -88,9 +88,9 @@ async def _asked(call: Call, key: str, message: schemas.Message | None, kind: ty
     """
     payload = b"" if message is None else schemas.encode(message)
     encoding = "" if message is None else schemas.encoding_of(message)
-    answers = await asyncio.to_thread(call.gateway.client.ask, key, payload, encoding, timeout=QUERY_S)
+    answers = await asyncio.to_thread(call.gateway.client.query, key, payload, encoding, timeout=QUERY_S)
     for answer in answers:
-        if answer.good:
+        if answer.ok:
             return schemas.decode(answer.payload, kind, encoding=answer.encoding)
     if not answers:
         raise EndCall(grpc.StatusCode.UNAVAILABLE, NOBODY)

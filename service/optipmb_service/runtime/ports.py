@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol
 
+from optipmb_client.errors import ConnectionFailed
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
@@ -116,8 +118,8 @@ class Request(Protocol):
         """Tell the asker that nothing follows."""
 
 
-class TransportError(Exception):
-    """The network cannot be used; the text is one clear line."""
+TransportError = ConnectionFailed
+"""The network cannot be used; the text is one clear line."""
 
 
 class EdgeError(Exception):

@@ -8,18 +8,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-import zenoh
-
-from optipmb_service.runtime.ports import TransportError
-from optipmb_service.zenoh.connection import line
-from optipmb_service.zenoh.handles import undeclare
-
 if TYPE_CHECKING:
     from collections.abc import Set as AbstractSet
 
     import optipmb_schemas as schemas
-
-    from optipmb_service.zenoh.handles import Undeclared
+    from optipmb_client.zenoh.handles import Declared
+    from optipmb_client.zenoh.session import Session
 
 MOST: Final = 32
 """Streams of one token. A stream that comes or goes costs those who watch as many names as its token has."""
@@ -37,11 +31,11 @@ class Announcements:
         run: tells this process from others of its name.
     """
 
-    def __init__(self, session: zenoh.Session, keys: schemas.Keys, instance: str, run: str) -> None:
+    def __init__(self, session: Session, keys: schemas.Keys, instance: str, run: str) -> None:
         self._session, self._keys, self._instance, self._run = session, keys, instance, run
         self._groups: dict[str, tuple[str, ...]] = {}
         """The group of each stream that is announced."""
-        self._tokens: dict[tuple[str, ...], Undeclared] = {}
+        self._tokens: dict[tuple[str, ...], Declared] = {}
 
     def announce(self, streams: AbstractSet[str]) -> None:
         """Announce these streams, and no others; those that stay are announced all the time.
@@ -58,15 +52,9 @@ class Announcements:
         groups = [tuple(pool[first : first + MOST]) for first in range(0, len(pool), MOST)]
         for group in groups:
             if group not in self._tokens:
-                self._tokens[group] = self._declared(group)
+                self._tokens[group] = self._session.token(self._keys.discovered(group, self._instance, self._run))
             self._groups.update(dict.fromkeys(group, group))
         for group in left.difference(groups):
-            undeclare(self._tokens.pop(group))
+            self._tokens.pop(group).close()
         for stream in gone:
             del self._groups[stream]
-
-    def _declared(self, group: tuple[str, ...]) -> Undeclared:
-        try:
-            return self._session.liveliness().declare_token(self._keys.discovered(group, self._instance, self._run))
-        except zenoh.ZError as error:
-            raise TransportError(line(error)) from error

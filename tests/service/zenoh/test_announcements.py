@@ -18,11 +18,7 @@ class Tokens:
         self.now: set[str] = set()
         self.heard = StreamDirectory("other", 1, lambda _: True)
 
-    def liveliness(self) -> "Tokens":
-        """Return what declares tokens."""
-        return self
-
-    def declare_token(self, key: str) -> "Token":
+    def token(self, key: str) -> "Token":
         """Declare one, and have it heard of."""
         assert key not in self.now
         self.now.add(key)
@@ -50,7 +46,7 @@ class Token:
     def __init__(self, session: Tokens, key: str) -> None:
         self._session, self._key = session, key
 
-    def undeclare(self) -> None:
+    def close(self) -> None:
         """Withdraw it."""
         self._session.withdraw(self._key)
 
