@@ -8,9 +8,8 @@ import typer
 from optipmb_client.commands.options import AsJson, print_json, say
 from optipmb_client.commands.service_options import ServiceOptions
 from optipmb_client.errors import ServiceUnavailable, UsageError
-from optipmb_client.history import kept_tracks
 from optipmb_client.results.table import track_columns
-from optipmb_client.sessions import session_state
+from optipmb_client.sessions import kept_tracks, session_state
 from optipmb_client.table_files import SUFFIXES, write_table
 
 SECOND = 1_000_000_000

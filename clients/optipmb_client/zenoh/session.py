@@ -240,11 +240,6 @@ class Session:
         declared = self.listen(key, samples.put, recovers=True, history=EVERYTHING if history else None)
         return self._read(key, declared, samples, late_join.take, ended)
 
-    def read(self, key: str, receive: Callable[[Sample], None], *, history: Any = None) -> Reading:
-        """Hand over samples on a thread of its own; while too many wait, the network waits."""
-        samples: Channel[Sample] = Channel(SUBSCRIBED)
-        return self._read(key, self.listen(key, samples.put, history=history), samples, receive)
-
     def read_newest(self, key: str, receive: Callable[[Sample], None], *, most: int = 1) -> Reading:
         """Hand over samples on a thread of its own; of those that wait the newest `most` stay."""
         with self._counted(PLAIN):

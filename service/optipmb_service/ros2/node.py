@@ -11,8 +11,6 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from optipmb_client.zenoh.session import EVERYTHING
-
 from optipmb_service.ros2 import graph
 from optipmb_service.zenoh.client import Client
 
@@ -20,12 +18,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_client.zenoh.handles import Sender
-    from optipmb_client.zenoh.session import Sample
 
     from optipmb_service.settings.model import Settings
 
+MESSAGES: Final = 1024
 CLOUDS: Final = 8
-"""Clouds between Zenoh and the reader; the oldest goes beyond it."""
+"""Messages of a topic, or clouds, between Zenoh and the reader; the oldest goes beyond it."""
 
 JOIN_S: Final = 1.0
 
@@ -101,15 +99,15 @@ class Ros2Node:
         endpoint = self._endpoint(graph.SUBSCRIPTION, topic, type_name, type_hash, qos)
         pattern = graph.topic_pattern(self._domain, topic)
 
-        def take(sample: Sample) -> None:
-            key = graph.parse_topic(str(sample.key_expr))
-            if key is not None:
-                receive(key, sample.payload.to_bytes())
+        def take(at: str, payload: bytes) -> None:
+            if (key := graph.parse_topic(at)) is not None:
+                receive(key, payload)
 
-        if clouds and not qos.transient_local:
-            self.client.read_newest(pattern, take, most=CLOUDS)
+        if qos.transient_local:
+            self.client.subscribe(pattern, lambda arrival: take(arrival.key, arrival.payload), history=True)
         else:
-            self.client.read(pattern, take, history=EVERYTHING if qos.transient_local else None)
+            most = CLOUDS if clouds else MESSAGES
+            self.client.read_newest(pattern, lambda one: take(str(one.key_expr), one.payload.to_bytes()), most=most)
         self.client.token(endpoint.token())
 
     def watch(self, changed: Callable[[graph.Endpoint, bool], None]) -> None:

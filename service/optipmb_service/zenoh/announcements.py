@@ -38,11 +38,7 @@ class Announcements:
         self._tokens: dict[tuple[str, ...], Declared] = {}
 
     def announce(self, streams: AbstractSet[str]) -> None:
-        """Announce these streams, and no others; those that stay are announced all the time.
-
-        Raises:
-            TransportError: the session is closed.
-        """
+        """Announce these streams, and no others; those that stay are announced all the time."""
         new = sorted(streams - self._groups.keys())
         gone = self._groups.keys() - streams
         if not new and not gone:

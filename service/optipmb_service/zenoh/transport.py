@@ -63,6 +63,8 @@ class StreamPublisher:
 class Transport:
     """A Zenoh session with what the service declares on it.
 
+    Its methods raise `TransportError` when the session is closed, or has declared all keys that it can.
+
     Args:
         settings: endpoints, prefix, instance.
 
@@ -138,9 +140,6 @@ class Transport:
             kind: what of it.
             stream: its name.
             cached: whether what was lost is recovered from the publisher's cache.
-
-        Raises:
-            TransportError: the session is closed.
         """
         if kind == "discovery":
             self._topics["detections"].subscribe(kind, self._keys.all("detections"), self._discover)
@@ -264,11 +263,7 @@ class Transport:
         return self._taps.join((stream, detections or stream), receive)
 
     def recent_tracks(self, stream: str) -> list[tuple[bytes, str]]:
-        """Return what those who track a stream keep of its tracks for subscribers, each message with its encoding.
-
-        Raises:
-            TransportError: the session is closed.
-        """
+        """Return what those who track a stream keep of its tracks for subscribers, each message with its encoding."""
         return [(one.payload, one.encoding) for one in self._client.cached(self._keys.tracks(stream), timeout=CACHES_S)]
 
     def client(self) -> Client:
@@ -293,11 +288,7 @@ class Transport:
         self._alive = self._client.token(self._keys.alive(self._instance))
 
     def open_publisher(self, stream: str) -> StreamPublisher:
-        """Open the publisher of a stream's tracks, say that this instance tracks it, and declare its inputs' keys.
-
-        Raises:
-            TransportError: the session is closed, or has declared all keys that it can.
-        """
+        """Open the publisher of a stream's tracks, say that this instance tracks it, and declare its inputs' keys."""
         # Who subscribes asks the caches, and hears by heartbeats of what it missed: nobody needs a token for that, and
         # each costs the router more the more there are.
         key, encoding = self._keys.tracks(stream), schemas.encoding_of(schemas.Tracks)
@@ -311,11 +302,7 @@ class Transport:
         self._client.publish_problem(problem)
 
     def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
-        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more.
-
-        Raises:
-            TransportError: the session is closed.
-        """
+        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more."""
         if self._owners is not None:
             self._owners.close(0.0)
             self._owners = None
