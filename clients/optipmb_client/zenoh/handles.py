@@ -253,8 +253,9 @@ def _stay_attached() -> None:
 
     The interpreter makes one whenever a foreign thread calls into it, and drops it on the way back unless an earlier
     call has not returned. Per message that is memory mapped and unmapped, and every processor of the process is
-    interrupted to forget it. This is such a call; the lock is given back with the callback, as ever. A thread that ends
-    leaves its state behind; Zenoh's threads live as long as the process, unless a callback blocks in Zenoh.
+    interrupted to forget it: half the system time, and a tenth of all time, that receiving 4 kB takes. This is such a
+    call; the lock is given back with the callback, as ever. A thread that ends leaves its state behind; Zenoh's threads
+    live as long as the process, unless a callback blocks in Zenoh.
     """
     ctypes.pythonapi.PyGILState_Ensure()
     _thread.attached = True

@@ -12,16 +12,16 @@ import structlog
 
 from optipmb_service.runtime.ports import Packet, TransportError
 from optipmb_service.runtime.requests import problem_with
-from optipmb_service.zenoh.announcements import Announcements
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.inputs import ReturnedPublishers, Topic
 from optipmb_service.zenoh.taps import Taps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Set as AbstractSet
 
     from optipmb_client.zenoh.handles import Declared, Reading, Sender
-    from optipmb_client.zenoh.session import Sample
+    from optipmb_client.zenoh.session import Sample, Session
 
     from optipmb_service.runtime.intake import Kind
     from optipmb_service.runtime.ports import Request
@@ -38,6 +38,9 @@ TRACKS_CACHE: Final = 100
 
 It is longer than a dead link of the client library takes to be noticed and replaced, 4 s.
 """
+
+ANNOUNCED: Final = 32
+"""Streams of one token. A stream that comes or goes costs those who watch as many names as its token has."""
 
 CACHES_S: Final = 1.0
 """How long the caches may take to answer."""
@@ -58,6 +61,44 @@ class StreamPublisher:
         """Withdraw all of it."""
         for one in (*self._others, self._sender):
             one.close()
+
+
+class Announcements:
+    """The streams that a discoverer announces, by tokens of many streams each: all are full, but for one.
+
+    What a router takes to declare a token grows with how many tokens there are, for each that watches them: with a
+    token for each stream it was most of what a new stream cost, and with 10,000 streams beyond what one router can do.
+
+    Args:
+        session: to declare on.
+        keys: of the network.
+        instance: who announces.
+        run: tells this process from others of its name.
+    """
+
+    def __init__(self, session: Session, keys: schemas.Keys, instance: str, run: str) -> None:
+        self._session, self._keys, self._instance, self._run = session, keys, instance, run
+        self._groups: dict[str, tuple[str, ...]] = {}
+        """The group of each stream that is announced."""
+        self._tokens: dict[tuple[str, ...], Declared] = {}
+
+    def announce(self, streams: AbstractSet[str]) -> None:
+        """Announce these streams, and no others; those that stay are announced all the time."""
+        new = sorted(streams - self._groups.keys())
+        gone = self._groups.keys() - streams
+        if not new and not gone:
+            return
+        left = {self._groups[stream] for stream in gone} | {group for group in self._tokens if len(group) < ANNOUNCED}
+        pool = [stream for group in sorted(left) for stream in group if stream not in gone] + new
+        groups = [tuple(pool[first : first + ANNOUNCED]) for first in range(0, len(pool), ANNOUNCED)]
+        for group in groups:
+            if group not in self._tokens:
+                self._tokens[group] = self._session.token(self._keys.discovered(group, self._instance, self._run))
+            self._groups.update(dict.fromkeys(group, group))
+        for group in left.difference(groups):
+            self._tokens.pop(group).close()
+        for stream in gone:
+            del self._groups[stream]
 
 
 class Transport:
