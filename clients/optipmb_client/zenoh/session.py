@@ -164,13 +164,13 @@ class Session:
 
     def plain_sender(self, key: str, encoding: str, *, cache: int = 0) -> Sender:
         """Open a publisher for large messages: lower priority than the small ones; with `cache` it keeps the newest."""
-        return self.sender(key, encoding, cache, zenoh.Priority.DATA_LOW)
+        return self.sender(key, encoding, cache or None, zenoh.Priority.DATA_LOW)
 
     def sender(
         self,
         key: str,
         encoding: str = "",
-        cache: int = 0,
+        cache: int | None = None,
         priority: zenoh.Priority = zenoh.Priority.DATA,
         *,
         express: bool = False,
@@ -183,18 +183,18 @@ class Session:
             "priority": priority,
             "express": express,
         }
-        if cache:
+        if cache is not None:
             heartbeat = zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
             options |= {"cache": zenoh.ext.CacheConfig(cache), "sample_miss_detection": heartbeat}
             options |= {"publisher_detection": detected}
-        keys = CACHED if cache else PLAIN
+        keys = PLAIN if cache is None else CACHED
         with self._counted(keys):
             publisher: Any = (
-                zenoh.ext.declare_advanced_publisher(self._session, key, **options)
-                if cache
-                else self._session.declare_publisher(key, **options)
+                self._session.declare_publisher(key, **options)
+                if cache is None
+                else zenoh.ext.declare_advanced_publisher(self._session, key, **options)
             )
-        sender = Sender(publisher, lambda _: self._free(keys), cached=cache > 0)
+        sender = Sender(publisher, lambda _: self._free(keys), cached=cache is not None)
         self._senders.add(sender)
         return sender
 
