@@ -14,8 +14,8 @@ from collections import deque
 from typing import TYPE_CHECKING, Final
 
 import optipmb_schemas as schemas
-from optipmb_service.app.kernels import warm_up
-from optipmb_service.app.loops import settle
+from optipmb_service.app.lifecycle import settle
+from optipmb_service.app.worker import warm_up
 from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session import convert
 from optipmb_service.session.timeline import FrameId

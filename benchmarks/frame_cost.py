@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import optipmb_schemas as schemas
 from optipmb_client.load import generated
 from optipmb_client.load.material import FIRST, head, message
-from optipmb_service.app.kernels import warm_up
+from optipmb_service.app.worker import warm_up
 from optipmb_service.observability import logs
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter

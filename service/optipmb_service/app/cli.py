@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import shutil
 import sys
+import sysconfig
 from importlib import import_module
 from inspect import Parameter, Signature, signature
 from pathlib import Path  # noqa: TC003 - typer reads the annotations at run time
@@ -19,8 +22,8 @@ from optipmb_schemas.installation import install_command
 from typer.main import get_command
 
 from optipmb_service import __version__
-from optipmb_service.app import health_command, nats, router
-from optipmb_service.app.ending import leave_or_restart
+from optipmb_service.app import edges, health_command
+from optipmb_service.app.lifecycle import leave_or_restart
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import logs
 from optipmb_service.settings.forms import DEFAULT_GRPC, DEFAULT_LISTEN, DEFAULT_NATS, address, without_password
@@ -32,6 +35,10 @@ if TYPE_CHECKING:
 
 WRONG_USE: Final = 2
 PASSED_ON: Final = {"allow_extra_args": True, "ignore_unknown_options": True}
+
+NATS: Final = "nats-server"
+NATS_PAYLOAD_MB: Final = 8
+"""Largest message; a checkpoint may have three quarters of it. NATS' default, one, is too little for many objects."""
 
 app = typer.Typer(
     add_completion=False,
@@ -131,7 +138,14 @@ def run_command(**given: Unpack[Options]) -> None:
     settings = _begin(_load(given))
     if settings.cluster:
         _needed("optipmb_service.cluster.jetstream", "cluster")
-    leave_or_restart(_run_one(settings) if settings.workers == 1 else _run_many(settings))
+    if settings.workers > 1:
+        from optipmb_service.app.workers import supervise  # noqa: PLC0415 - a process that tracks needs none
+
+        leave_or_restart(asyncio.run(supervise(settings)))
+    # It takes the tracker along: 150 MB and seconds.
+    from optipmb_service.app import worker  # noqa: PLC0415 - neither a parent nor a question needs it
+
+    leave_or_restart(worker.run(settings))
 
 
 def _version(value: bool) -> None:  # noqa: FBT001 - the parser calls it so
@@ -187,7 +201,7 @@ def config_command(
 @_taking(RouterOptions)
 def router_command(**given: Unpack[RouterOptions]) -> None:
     """Run a Zenoh router alone, without tracking. SIGINT and SIGTERM end it."""
-    leave_or_restart(asyncio.run(router.run(_begin(_load({**given, "router": True})))))
+    leave_or_restart(asyncio.run(edges.run_router(_begin(_load({**given, "router": True})))))
 
 
 @app.command("grpc")
@@ -195,8 +209,8 @@ def router_command(**given: Unpack[RouterOptions]) -> None:
 def grpc_command(**given: Unpack[GatewayOptions]) -> None:
     """Run a gRPC gateway alone, a client of routers. Prints one line, `ready …`; SIGINT and SIGTERM end it."""
     settings = _begin(_load(given, grpc=DEFAULT_GRPC, connect=[DEFAULT_LISTEN]))
-    run = _needed("optipmb_service.app.gateway", "grpc").run
-    leave_or_restart(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+    _needed("optipmb_service.grpc.server", "grpc")
+    leave_or_restart(asyncio.run(edges.run_gateway(settings.model_copy(update={"router": False, "listen": ()}))))
 
 
 @app.command("ros2")
@@ -231,13 +245,30 @@ def nats_command(
         address(listen)
     except ValueError as error:
         _wrong(f"option listen: {error}")
-    server = nats.program()
+    server = nats_server()
     if server is None:
-        _wrong(f"this needs nats-server, which is not installed: {install_command('cluster')}")
+        _wrong(f"this needs {NATS}, which is not installed: {install_command('cluster')}")
+    folder = (store or state_home() / "nats").absolute()
     try:
-        nats.become(server, listen, (store or state_home() / "nats").absolute())
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "nats.conf").write_text(nats_configuration(listen, folder), encoding="utf-8")
+        # The process becomes the server, so signals and exit status are the server's own.
+        os.execv(server, [server, "--config", str(folder / "nats.conf")])  # noqa: S606 - no shell is wanted
     except OSError as error:
         _wrong(f"{error.filename}: {error.strerror}")
+
+
+def nats_server() -> str | None:
+    """Return the path of the server, from the package beside this one or else from the system; None without one."""
+    return shutil.which(NATS, path=sysconfig.get_path("scripts")) or shutil.which(NATS)
+
+
+def nats_configuration(listen: str, folder: Path) -> str:
+    """Return the configuration of a server, by where it listens and the folder of its files."""
+    return f"""listen: "{listen}"
+max_payload: {NATS_PAYLOAD_MB}MB
+jetstream {{ store_dir: "{folder}" }}
+"""
 
 
 @app.command("copy")
@@ -250,7 +281,7 @@ def copy_command(
     given: dict[str, Any] = {"settings": settings, "cluster": cluster, "store": store and str(store)}
     loaded = _begin(_load(given))
     _needed("optipmb_service.cluster.jetstream", "cluster")
-    from optipmb_service.app.clustering import copy_folder  # noqa: PLC0415 - it takes the tracker along
+    from optipmb_service.app.storage import copy_folder  # noqa: PLC0415 - it takes the tracker along
 
     try:
         copied, known = copy_folder(loaded)
@@ -278,19 +309,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         _wrong(describe())
     sys.exit(status if isinstance(status, int) else 0)
-
-
-def _run_one(settings: Settings) -> int:
-    # It takes the tracker along: 150 MB and seconds.
-    from optipmb_service.app.worker import run_alone  # noqa: PLC0415 - neither a parent nor a question needs it
-
-    return run_alone(settings)
-
-
-def _run_many(settings: Settings) -> int:
-    from optipmb_service.app.supervisor import supervise  # noqa: PLC0415 - a process that tracks needs none
-
-    return asyncio.run(supervise(settings))
 
 
 def _load(given: Mapping[str, Any], **defaults: Any) -> Loaded:

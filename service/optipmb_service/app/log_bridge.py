@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Final
 import optipmb_schemas as schemas
 import structlog
 
-from optipmb_service.app import process
-from optipmb_service.app.clustering import nats_access
-from optipmb_service.app.loops import say_ready, settle
+from optipmb_service.app import lifecycle
+from optipmb_service.app.lifecycle import say_ready, settle
+from optipmb_service.app.storage import nats_access
 from optipmb_service.cluster.log_writer import LogWriter
 from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
+from optipmb_service.observability.health import Reporter
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.kept_tracks import order_of
 from optipmb_service.session.problems import problem_of
@@ -26,7 +27,7 @@ from optipmb_service.session.problems import problem_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from optipmb_service.app.loops import StopRequest
+    from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.cluster.message_log import Topic
     from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.observability.metrics import Value
@@ -41,7 +42,7 @@ DRAIN_POLL_S: Final = 0.01
 MEGABYTE: Final = 2**20
 
 
-class LogBridge:
+class LogBridge(Reporter):
     """From a network into the log.
 
     Args:
@@ -49,15 +50,13 @@ class LogBridge:
         client: the network; closed by the caller, after this.
     """
 
-    stuck: Final = False
-
     def __init__(self, settings: Settings, client: Client) -> None:
         self._client = client
         self._instance = settings.instance
         self._limits = settings.limits.limits()
         self._grace_s = settings.grace_s
         self._invalid = 0
-        self._reporter = ProblemReporter(client.publish_problem, log_problem)
+        self.reporter = ProblemReporter(client.publish_problem, log_problem)
         keep: dict[Topic, Retention] = {"detections": Retention(settings.log_s, settings.log_mb * MEGABYTE)}
         if settings.log_tracks_s:
             keep["tracks"] = Retention(settings.log_tracks_s, settings.log_tracks_mb * MEGABYTE)
@@ -75,13 +74,6 @@ class LogBridge:
         """Why nothing can be received or written; empty while it can."""
         why = self._writer.failure
         return self._client.failure or (f"log: {why}" if why else "")
-
-    def status(self) -> None:
-        """Return nothing: a bridge has no streams."""
-
-    def housekeeping(self) -> None:
-        """Do what is due about once a second."""
-        self._reporter.flush(time.monotonic_ns())
 
     def close(self) -> None:
         """Write what was received, within the grace, and end."""
@@ -101,7 +93,7 @@ class LogBridge:
         yield "log_dropped_total", (), writer.dropped
         yield "log_invalid_total", (), self._invalid
         yield "log_waiting_bytes", (), writer.held_bytes
-        for code, count in self._reporter.counts().items():
+        for code, count in self.reporter.counts().items():
             yield "problems_total", (code,), count
 
     def _take(self, message: Message) -> None:
@@ -132,11 +124,11 @@ class LogBridge:
             received=why,
             message=f"Log: a message is not in the log: {why}.",
         )
-        self._reporter.report(problem, time.monotonic_ns())
+        self.reporter.report(problem, time.monotonic_ns())
 
 
 async def run(settings: Settings) -> int:
-    """Write until SIGINT or SIGTERM; returns the exit status, as `process.run` does."""
+    """Write until SIGINT or SIGTERM; returns the exit status, as `lifecycle.run` does."""
 
     async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
         bridge = LogBridge(settings, client)
@@ -147,8 +139,8 @@ async def run(settings: Settings) -> int:
         log.info("ready", instance=settings.instance, connect=settings.connect)
         while not asked.is_set():
             await asked.wait(HOUSEKEEPING_S)
-            bridge.housekeeping()
+            bridge.reporter.flush(time.monotonic_ns())
         health.ends()
         await asyncio.to_thread(bridge.close)
 
-    return await process.run_client(settings, serve)
+    return await lifecycle.run_client(settings, serve)

@@ -19,9 +19,9 @@ from optipmb_schemas.ros2.arrays import CLOUD
 from optipmb_schemas.ros2.tracks import TOPICS
 from optipmb_schemas.ros2.types import own_types
 
-from optipmb_service.app import process
-from optipmb_service.app.loops import say_ready, unless
-from optipmb_service.observability.health import BEAT_S, STUCK_S
+from optipmb_service.app import lifecycle
+from optipmb_service.app.lifecycle import say_ready, unless
+from optipmb_service.observability.health import BEAT_S, STUCK_S, Reporter
 from optipmb_service.ros2 import graph
 from optipmb_service.ros2.bridge import Bridge
 from optipmb_service.ros2.diagnostics import DIAGNOSTICS, diagnostics
@@ -32,7 +32,7 @@ from optipmb_service.zenoh.ros2 import Ros2Node
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from optipmb_service.app.loops import StopRequest
+    from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.settings.model import Settings
     from optipmb_service.zenoh.client import Message, Outgoing
@@ -60,10 +60,8 @@ ODOMETRY: Final = "nav_msgs/msg/Odometry"
 log = structlog.get_logger("optipmb_service")
 
 
-class _Work:
+class _Work(Reporter):
     """The node, the bridge and what wires them; what the process reports."""
-
-    failure: Final = ""
 
     def __init__(self, settings: Settings, node: Ros2Node) -> None:
         self._settings = settings
@@ -96,9 +94,6 @@ class _Work:
     def stuck(self) -> bool:
         """Whether the working thread has been at one piece of work for too long."""
         return time.monotonic() - self._turned > STUCK_S
-
-    def status(self) -> None:
-        """Return nothing: the bridge tracks no streams."""
 
     def open(self) -> None:
         """Declare everything."""
@@ -303,7 +298,7 @@ class _Work:
 
 
 async def run(settings: Settings) -> int:
-    """Bridge until SIGINT or SIGTERM; returns the exit status, as `process.run` does."""
+    """Bridge until SIGINT or SIGTERM; returns the exit status, as `lifecycle.run` does."""
 
     async def serve(asked: StopRequest, health: ProcessHealth) -> bool | None:
         log.info("connecting", endpoints=settings.connect)
@@ -325,4 +320,4 @@ async def run(settings: Settings) -> int:
             await asyncio.to_thread(work.close)
         return True
 
-    return await process.run(settings, serve)
+    return await lifecycle.run(settings, serve)

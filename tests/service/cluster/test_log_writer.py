@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 import structlog
 from nats_process import NatsProcess, NatsTrio, started
-from optipmb_service.app.nats import program
+from optipmb_service.app.cli import nats_server
 from optipmb_service.cluster.log_writer import OVERHEAD, TRIES, LogWriter
 from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
 from optipmb_service.cluster.nats_connection import RefusedError
@@ -103,7 +103,7 @@ def test_a_message_that_may_not_be_published_is_given_up(tmp_path: Path) -> None
             {{ user: one, password: one, permissions: {{ publish: {{ deny: "*.a.b.c" }} }} }}
         ] }}
     """)
-    server = program()
+    server = nats_server()
     assert server is not None
     process = started([server, "--config", str(file)], address, tmp_path / "nats.log")
     log = MessageLog([f"nats://one:one@{address}"], "optipmb")

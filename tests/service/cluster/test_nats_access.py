@@ -15,7 +15,7 @@ from lease_log import Alone
 from log_process import LogProcess
 from nats_process import started
 from optipmb_client import Connection, kept_tracks
-from optipmb_service.app.nats import program
+from optipmb_service.app.cli import nats_server
 from optipmb_service.cluster.jetstream import JetStream
 from optipmb_service.cluster.nats_access import NatsAccess
 from optipmb_service.cluster.store import StoreError
@@ -54,7 +54,7 @@ def serve(tmp_path: Path) -> Iterator[Serve]:
         file = tmp_path / f"{len(processes)}.conf"
         store = tmp_path / f"{len(processes)}"
         file.write_text(f'listen: "{address}"\njetstream {{ store_dir: "{store}" }}\n{more}\n')
-        server = program()
+        server = nats_server()
         assert server is not None
         processes.append(started([server, "--config", str(file)], address, tmp_path / "nats.log"))
         return address.replace("127.0.0.1", "localhost")

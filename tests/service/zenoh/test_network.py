@@ -32,7 +32,7 @@ from optipmb_schemas import (
     encode_json,
     encoding_of,
 )
-from optipmb_service.app.aggregate import QUERIES
+from optipmb_service.app.workers import QUERIES
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Tracked
