@@ -17,8 +17,7 @@ import structlog
 from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import say_ready, settle
 from optipmb_service.app.storage import nats_access
-from optipmb_service.cluster.log_writer import LogWriter
-from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
+from optipmb_service.cluster.message_log import LogMessage, LogWriter, MessageLog, Retention
 from optipmb_service.observability.health import Reporter
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.kept_tracks import order_of

@@ -20,7 +20,6 @@ from optipmb_service.cluster.store import KEPT, Record
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Mapping, Sequence
 
-    from optipmb_service.cluster.nats_access import NatsAccess
     from optipmb_service.cluster.store import Fenced, Write
 
 _T = TypeVar("_T")
@@ -50,15 +49,15 @@ class JetStream:
         servers: addresses of NATS servers, as `nats://host:4222`; of one cluster, where there are several.
         prefix: first chunks of every key of the service.
         keep_s: age at which a checkpoint that nobody has replaced is forgotten; 0: never.
-        access: what the servers want to see.
+        options: of NATS' client, as `nats_connection.access` returns them.
     """
 
     remote: Final = True
 
     def __init__(
-        self, servers: Sequence[str], prefix: str, keep_s: float = 0.0, access: NatsAccess | None = None
+        self, servers: Sequence[str], prefix: str, keep_s: float = 0.0, options: Mapping[str, Any] | None = None
     ) -> None:
-        self._connection = NatsConnection(servers, self._lost, access)
+        self._connection = NatsConnection(servers, self._lost, options)
         self._name = f"OPTIPMB_{token(prefix)}"
         self._keep_s = round(keep_s)
         self._there = False

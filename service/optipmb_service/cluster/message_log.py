@@ -5,18 +5,22 @@ are bounded, the oldest messages go. A message has an id, and the server drops w
 not matter how many write the same. Point clouds are never put here.
 
 A reader looks for the beginning of what it wants from the newest message on, backwards by the server's own times, so
-that neither the clocks of machines nor those of sensors are compared with each other.
+that neither the clocks of machines nor those of sensors are compared with each other. What cannot be read is as if it
+were not there: the caches of publishers may still have it. A writer holds messages while the servers are away.
 """
 
 from __future__ import annotations
 
 import asyncio
 import math
+import threading
 import time
+from collections import deque
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
+import structlog
 from nats.errors import Error as NatsError
 
 from optipmb_service.cluster.nats_connection import NatsConnection, NobodyAnswersError, RefusedError, text_of, token
@@ -26,7 +30,10 @@ if TYPE_CHECKING:
 
     from nats.aio.msg import Msg
 
-    from optipmb_service.cluster.nats_access import NatsAccess
+    from optipmb_service.cluster.log_position import Missed, Position
+
+
+log = structlog.get_logger("optipmb_service")
 
 Topic = Literal["detections", "tracks"]
 
@@ -58,6 +65,46 @@ ID: Final = "Nats-Msg-Id"
 FRAME: Final = "Optipmb-Frame"
 ENCODING: Final = "Optipmb-Encoding"
 HEADERS: Final = len(b"NATS/1.0\r\n\r\n")
+
+
+READ_AT_ONCE: Final = 16
+"""Streams that are read at once."""
+
+READ_S: Final = 3.0
+"""Longest time for one stream, from its turn on."""
+
+WAIT_S: Final = 30.0
+"""Longest time in all, with what it waits for its turn."""
+
+OUTAGE_S: Final = 30.0
+"""How far a stream is read at most that has a position, by the log's own times, unless one without has it longer.
+
+To track more than that would keep the newest frames waiting for as long as they are of use.
+"""
+
+MOST_BYTES: Final = 2**25
+"""Bytes of a stream that are given at once at most; the oldest frames go."""
+
+MOST_FRAMES: Final = 1024
+"""Frames of a stream that are given at once at most: as many as a session holds while some are missing."""
+
+LOOK_AGAIN_S: Final = (0.3, 0.7)
+"""When the log is read again for what was not there yet, after the first time and after that."""
+
+AT_ONCE: Final = 256
+"""Messages on their way to the servers at once."""
+
+HELD_BYTES: Final = 2**28
+"""Bytes that are held at most; the oldest messages go first."""
+
+OVERHEAD: Final = 512
+"""What a message takes beside its payload, nearly."""
+
+RETRY_S: Final = 0.5
+"""Between two tries."""
+
+ALONE_TRIES: Final = 5
+"""How often a message is tried alone that is not written by servers that work."""
 
 
 class NotKeptError(Exception):
@@ -123,15 +170,15 @@ class MessageLog:
     Args:
         servers: addresses of NATS servers.
         prefix: first chunks of every key of the service.
-        access: what the servers want to see.
+        options: of NATS' client, as `nats_connection.access` returns them.
 
     Attributes:
         connection: to the servers; closed by the owner of the log. All methods run on its loop.
     """
 
-    def __init__(self, servers: Sequence[str], prefix: str, access: NatsAccess | None = None) -> None:
+    def __init__(self, servers: Sequence[str], prefix: str, options: Mapping[str, Any] | None = None) -> None:
         self._names = {topic: f"OPTIPMB-{topic.upper()}_{token(prefix)}" for topic in ("detections", "tracks")}
-        self.connection = NatsConnection(servers, self.look_again, access)
+        self.connection = NatsConnection(servers, self.look_again, options)
         self._there: set[str] = set()
         self._missing_until: dict[Topic, float] = {}
 
@@ -306,3 +353,291 @@ def _found(topic: Topic, message: Msg) -> _Found:
         return _Found(int(headers["Nats-Sequence"]), at_s, content)
     except (LookupError, ValueError) as error:
         raise NatsError(f"in the log there is something else than messages: {error}") from error
+
+
+class LogReader:
+    """The reader of one process.
+
+    Args:
+        message_log: what is read; its connection is closed with the reader.
+        back_s: how far a stream is read that has no position: so long before its newest message.
+    """
+
+    def __init__(self, message_log: MessageLog, back_s: float) -> None:
+        self._log = message_log
+        self._back_s = back_s
+        self._turns = asyncio.Semaphore(READ_AT_ONCE)
+
+    def missed(
+        self, wanted: Missed, take: Callable[[list[LogMessage]], None], again_s: Sequence[float] = LOOK_AGAIN_S
+    ) -> None:
+        """Read what a session has missed, without waiting for it.
+
+        Args:
+            wanted: of which streams, from where on.
+            take: called, on a thread that must not be kept, with what there is, in the order of the log of each stream;
+                then a few times with what has come since. The first time it is called in any case.
+            again_s: pauses after which the log is read again.
+        """
+        self._log.connection.start(self._missed(wanted, take, again_s))
+
+    def tracks(
+        self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
+    ) -> None:
+        """Read the tracks of a stream from a stamp on, without waiting for it.
+
+        Args:
+            stream: whose.
+            from_ns: the stamp; some earlier ones may come, too.
+            take: called, on a thread that must not be kept, with some of them, in the order of the log, until it says
+                that it has enough (False).
+            end: called once afterwards, with the reason when not all could be read.
+        """
+        self._log.connection.start(self._tracks(stream, from_ns, take, end))
+
+    def close(self, timeout: float) -> None:
+        """End."""
+        self._log.connection.close(timeout)
+
+    # On the loop
+
+    async def _missed(self, wanted: Missed, take: Callable[[list[LogMessage]], None], again_s: Sequence[float]) -> None:
+        parts: dict[str, _Part] = {}
+        for number, pause_s in enumerate((0.0, *again_s)):
+            await asyncio.sleep(pause_s)
+            messages = await self._look(wanted, parts)
+            if messages or number == 0:
+                take(messages)
+
+    async def _look(self, wanted: Missed, parts: dict[str, _Part]) -> list[LogMessage]:
+        """Return what is new in the log; nothing where it cannot be read in time."""
+        messages: list[LogMessage] = []
+        try:
+            async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
+                streams = set(wanted.streams)
+                if wanted.node:
+                    streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.node)))
+                for stream in sorted(streams):
+                    await self._read(parts.setdefault(stream, _Part(stream, wanted.positions.get(stream))), messages)
+        except (NatsError, RefusedError, TimeoutError, OSError) as error:
+            log.warning("log_unread", streams=sorted(wanted.streams), error=self._log.connection.described(error))
+        except Exception:
+            log.exception("internal_error", streams=sorted(wanted.streams))  # the session waits for whatever there is
+        return messages
+
+    async def _read(self, part: _Part, messages: list[LogMessage]) -> None:
+        """Append what is new of a stream."""
+        position = part.position
+        before = (lambda _: False) if position is None else position.before
+        if part.next is None:
+            back_s = max(OUTAGE_S, self._back_s) if position and position.tracked else self._back_s
+            part.next = await self._log.since("detections", part.stream, before, back_s)
+        kept: deque[LogMessage] = deque()
+        size = cut = 0
+        try:
+            while part.next is not None and (found := await self._log.read("detections", part.stream, part.next)):
+                part.next = found[-1][0] + 1
+                for _, message in found:
+                    if before(message):
+                        continue
+                    kept.append(message)
+                    size += len(message.payload)
+                    while len(kept) > MOST_FRAMES or size > MOST_BYTES:
+                        size -= len(kept.popleft().payload)
+                        cut += 1
+        finally:  # what was read before a failure is not read again
+            messages.extend(kept)
+        if cut:
+            log.warning("log_cut", stream=part.stream, frames=len(kept) + cut, kept=len(kept))
+
+    async def _tracks(
+        self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
+    ) -> None:
+        failure = ""
+        try:
+            async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
+                number = await self._log.since("tracks", stream, lambda one: one.stamp_ns < from_ns)
+                while number is not None and (found := await self._log.read("tracks", stream, number)):
+                    number = found[-1][0] + 1
+                    if not take([message for _, message in found]):
+                        break
+        except (NatsError, RefusedError, TimeoutError, OSError) as error:
+            failure = self._log.connection.described(error)
+        except Exception as error:
+            log.exception("internal_error", stream=stream)
+            failure = f"{type(error).__name__}: {error}"
+        end(failure)
+
+
+@dataclass(slots=True)
+class _Part:
+    """How far a stream has been read."""
+
+    stream: str
+    position: Position | None
+    next: int | None = None
+
+
+class LogWriter:
+    """The writer of one process.
+
+    Args:
+        log: where messages go; closed by the caller, after this.
+        keep: what is kept of which topics.
+        lost: called, on any thread, with the stream of a message that is not in the log, and why.
+        held_bytes: bytes that are held at most.
+    """
+
+    def __init__(
+        self,
+        log: MessageLog,
+        keep: Mapping[Topic, Retention],
+        lost: Callable[[str, str], None],
+        held_bytes: int = HELD_BYTES,
+    ) -> None:
+        self._log = log
+        self._connection = log.connection
+        self._keep = keep
+        self._lost = lost
+        self._most = held_bytes
+        self._lock = threading.Lock()
+        self._waiting: deque[LogMessage] = deque()
+        self._came = asyncio.Event()
+        self.held_bytes = 0
+        """Bytes that wait, nearly."""
+        self._at_once = AT_ONCE
+        self._tries = 0
+        self._tried: LogMessage | None = None
+        self._failure = "the log was not reached yet"
+        self.written = 0
+        """Messages that are in the log by this writer."""
+        self.repeated = 0
+        """Messages that were in the log already."""
+        self.dropped = 0
+        """Messages that are not in the log."""
+        self._running = self._connection.start(self._run())
+
+    @property
+    def failure(self) -> str:
+        """Why nothing can be written at present; empty while it can."""
+        return self._connection.failure or self._failure
+
+    def put(self, message: LogMessage) -> None:
+        """Have a message written; never waits."""
+        with self._lock:
+            wakes = not self._waiting
+            self._waiting.append(message)
+            self.held_bytes += _size(message)
+            dropped = []
+            while self._waiting and self.held_bytes > self._most:
+                dropped.append(self._take())
+        for one in dropped:
+            self._lose(one, f"at most {self._most} bytes waiting for the log")
+        if wakes:
+            self._connection.soon(self._came.set)
+
+    def idle(self) -> bool:
+        """Whether all that was put has been written, or lost."""
+        with self._lock:
+            return not self.held_bytes
+
+    def close(self) -> None:
+        """End; what waits is lost."""
+        self._running.cancel()
+
+    def _take(self) -> LogMessage:
+        """Take the oldest that waits; called with the lock."""
+        message = self._waiting.popleft()
+        self.held_bytes -= _size(message)
+        return message
+
+    def _lose(self, message: LogMessage, why: str) -> None:
+        self.dropped += 1
+        self._lost(message.stream, why)
+
+    # On the loop of the log
+
+    async def _run(self) -> None:
+        while not await self._ready():  # noqa: ASYNC110 - the servers are asked again, nobody else says anything
+            await asyncio.sleep(RETRY_S)
+        self._works()
+        while True:
+            await self._came.wait()
+            self._came.clear()
+            while batch := self._next():
+                failed = await self._write(batch)
+                if self._tries == ALONE_TRIES:
+                    self._tries = 0
+                    self._lose(failed.pop(), self._failure)
+                    self._go_on()
+                with self._lock:
+                    self._waiting.extendleft(reversed(failed))
+                    self.held_bytes -= sum(map(_size, batch)) - sum(map(_size, failed))
+                if failed:
+                    await asyncio.sleep(RETRY_S)
+
+    async def _ready(self) -> bool:
+        try:
+            for topic, keep in self._keep.items():
+                await self._log.ready(topic, keep)
+        except (NatsError, RefusedError, TimeoutError, OSError) as error:
+            self._failed(error)
+            return False
+        return True
+
+    def _next(self) -> list[LogMessage]:
+        """Take what is to be written at once; its bytes still count."""
+        with self._lock:
+            return [self._waiting.popleft() for _ in range(min(self._at_once, len(self._waiting)))]
+
+    async def _write(self, batch: list[LogMessage]) -> list[LogMessage]:
+        """Write messages; return those that have to be tried again.
+
+        One message can keep all beside it from being written, by having the connection closed. So after a failure they
+        are tried alone, and the tries of the first one count while the servers say that its log is there.
+        """
+        if not await self._ready():
+            return batch
+        results = await asyncio.gather(*map(self._log.put, batch), return_exceptions=True)
+        failed: list[LogMessage] = []
+        for message, result in zip(batch, results, strict=True):
+            if isinstance(result, NotKeptError):
+                self._lose(message, str(result))
+            elif isinstance(result, NatsError | RefusedError | TimeoutError | OSError):
+                self._failed(result)
+                failed.append(message)
+            elif isinstance(result, BaseException):
+                self._lose(message, f"{type(result).__name__}: {result}")
+            else:
+                self.written += result
+                self.repeated += not result
+        if failed:
+            self._log.look_again()
+            alone = batch[0] if len(batch) == 1 else None
+            self._tries = 0 if alone is None else 1 if alone is not self._tried else self._tries + 1
+            self._tried = alone
+            self._at_once = 1
+        else:
+            self._tries = 0
+            self._at_once = min(AT_ONCE, 2 * self._at_once)
+            self._go_on()
+        return failed
+
+    def _go_on(self) -> None:
+        """Take the servers for sound, unless what failed before may be among the messages that wait."""
+        if self._at_once == AT_ONCE or not self._waiting:
+            self._works()
+
+    def _works(self) -> None:
+        if self._failure:
+            self._failure = ""
+            log.info("log_back")
+
+    def _failed(self, error: BaseException) -> None:
+        if not self._failure:
+            log.error("log_failed", error=str(error))
+        self._failure = self._connection.described(error)
+
+
+def _size(message: LogMessage) -> int:
+    return OVERHEAD + len(message.payload)
