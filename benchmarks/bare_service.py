@@ -19,7 +19,7 @@ from optipmb_service.app.worker import warm_up
 from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session import convert
 from optipmb_service.session.timeline import FrameId
-from optipmb_service.settings.model import Settings
+from optipmb_service.settings import Settings
 from optipmb_service.zenoh.connection import opened
 from optipmb_service.zenoh.handles import cached_publisher, directly
 

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 from optipmb_service.observability.logs import EVENTS
 from optipmb_service.observability.metrics import METRICS, NAMESPACE
 from optipmb_service.session.problems import CODES
-from optipmb_service.settings.model import Settings
-from optipmb_service.settings.tables import LimitSettings, Ros2Settings, Ros2Stream
+from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

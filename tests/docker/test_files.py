@@ -17,7 +17,7 @@ import kubernetes_validate
 import pytest
 import yaml
 from optipmb_service.observability.metrics import METRICS, NAMESPACE
-from optipmb_service.settings.model import Settings
+from optipmb_service.settings import Settings
 from routers import free_endpoint
 from service_process import ServiceProcess
 

@@ -14,7 +14,7 @@ from optipmb_schemas import Code
 from optipmb_service.app import cli
 from optipmb_service.observability.logs import EVENTS
 from optipmb_service.session.problems import CODES
-from optipmb_service.settings.loading import load
+from optipmb_service.settings import load
 from reference import main, page
 
 FILE = Path(__file__).parents[2] / "docs" / "operation.md"

@@ -13,7 +13,7 @@ from optipmb_service.runtime.persistence import NoPersistence
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.registry import Registry
-from optipmb_service.settings.model import Settings
+from optipmb_service.settings import Settings
 from sessions import chained
 
 if TYPE_CHECKING:

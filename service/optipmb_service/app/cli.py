@@ -26,9 +26,18 @@ from optipmb_service.app import edges, health_command
 from optipmb_service.app.lifecycle import leave_or_restart
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.observability import logs
-from optipmb_service.settings.forms import DEFAULT_GRPC, DEFAULT_LISTEN, DEFAULT_NATS, address, without_password
-from optipmb_service.settings.loading import Loaded, SettingsInvalidError, load
-from optipmb_service.settings.model import Settings, state_home
+from optipmb_service.settings import (
+    DEFAULT_GRPC,
+    DEFAULT_LISTEN,
+    DEFAULT_NATS,
+    Loaded,
+    Settings,
+    SettingsInvalidError,
+    address,
+    load,
+    state_home,
+    without_password,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -19,7 +19,7 @@ from optipmb_service.zenoh import Router
 if TYPE_CHECKING:
     from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.observability.health import ProcessHealth
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")

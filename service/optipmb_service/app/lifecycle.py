@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from optipmb_service.grpc.beside import AddFigures
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.key_numbers import KeyCount
 
 HANDOVER_S: Final = 4.0

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from optipmb_service.cluster.message_log import Topic
     from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.observability.metrics import Value
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client, Message
 
 log = structlog.get_logger("optipmb_service")

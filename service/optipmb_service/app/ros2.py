@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.observability.health import ProcessHealth
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Message, Outgoing
     from optipmb_service.zenoh.subscription import Subscription
 

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.context import Actor
     from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.profiles import Profiles
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
     from optipmb_service.zenoh.key_numbers import KeyCount
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from optipmb_service.cluster.store import LeaseStore
     from optipmb_service.runtime.kept_tracks import KeptTracks
     from optipmb_service.runtime.missed_frames import MissedFrames
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
 

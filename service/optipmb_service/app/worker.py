@@ -31,7 +31,7 @@ from optipmb_service.app.lifecycle import grpc_edge, leave, say_ready, settle, u
 from optipmb_service.app.service import Service
 from optipmb_service.observability import logs
 from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.settings.model import Settings
+from optipmb_service.settings import Settings
 
 if TYPE_CHECKING:
     from optipmb_service.app.lifecycle import StopRequest

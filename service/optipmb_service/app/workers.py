@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.observability.metrics import Metrics
     from optipmb_service.runtime.ports import Request
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from optipmb_service.observability.metrics import Value
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
 
     AddFigures = Callable[[Callable[[], Iterable[Value]]], None]

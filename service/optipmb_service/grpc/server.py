@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from optipmb_service.grpc.calls import Context
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
 
 SERVICE: Final = pb.DESCRIPTOR.services_by_name["TrackingService"].full_name

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.ports import Caches, MessageSink, Packet
     from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
     from optipmb_service.session.values import Incarnation
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 PARTS: Final = 4
 """What a stream's memory is divided into: mailbox, clouds, frames held, window."""

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.runtime.scheduler import Scheduler
     from optipmb_service.session.values import Incarnation
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 RIVAL_LEASES: Final = 3
 """Leases for which the token of an instance may stay whose stream has been taken over."""

@@ -9,7 +9,7 @@ from typing import Any
 from optipmb_schemas import DrainRequest, Keys, encode, encoding_of
 from optipmb_service.app.workers import AggregateView, Worker
 from optipmb_service.observability.metrics import Metrics
-from optipmb_service.settings.loading import load
+from optipmb_service.settings import load
 
 KEYS = Keys()
 HANGS_S = 60.0

@@ -13,7 +13,7 @@ import pytest
 from optipmb_schemas import Keys, ServiceStatus, SessionParameters, decode
 from optipmb_schemas.installation import install_command
 from optipmb_service.app import cli, worker
-from optipmb_service.settings.loading import load
+from optipmb_service.settings import load
 from router import Node, Sensor
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess

@@ -15,7 +15,7 @@ from optipmb_service.app.lifecycle import EndBound, StopRequest
 from optipmb_service.app.workers import Supervisor, Worker, serve_workers
 from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.observability.metrics import Metrics
-from optipmb_service.settings.loading import load
+from optipmb_service.settings import load
 from unbounded import NO_BOUND
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from optipmb_service.app.cli import nats_server
 from optipmb_service.cluster.jetstream import JetStream
 from optipmb_service.cluster.nats_connection import access
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.settings.loading import SettingsInvalidError, load
+from optipmb_service.settings import SettingsInvalidError, load
 from protected import MAKE, make
 from router import Node, Sensor, until
 from routers import free_endpoint, open_router

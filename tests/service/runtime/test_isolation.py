@@ -39,7 +39,7 @@ from optipmb_service.runtime.ports import PACKET_BYTES, Packet
 from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import MAX_COUNT, SECOND
-from optipmb_service.settings.tables import LimitSettings
+from optipmb_service.settings import LimitSettings
 from router import Node, Sensor, until
 
 import optipmb

@@ -18,9 +18,7 @@ from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session.pending import CloudBuffer
 from optipmb_service.session.problems import problem_of
-from optipmb_service.settings.loading import SettingsInvalidError, load
-from optipmb_service.settings.model import Settings
-from optipmb_service.settings.tables import LimitSettings
+from optipmb_service.settings import LimitSettings, Settings, SettingsInvalidError, load
 from router import SECOND, Sensor
 
 import optipmb

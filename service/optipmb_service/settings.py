@@ -1,4 +1,8 @@
-"""Which settings the service has.
+"""The settings of the service, and where their values come from.
+
+A TOML file, over it the environment, over that the options of the command line. Environment variables are ``OPTIPMB_``
+and the name in capitals, nested names after ``__`` (``OPTIPMB_LIMITS__MAX_BYTES``); lists are written with commas
+there, tables as JSON.
 
 Times are in seconds. Every setting is described where it stands; `docs/operation.md` prints the same table, and so does
 ``optipmb-service config``.
@@ -7,35 +11,165 @@ Times are in seconds. Every setting is described where it stands; `docs/operatio
 from __future__ import annotations
 
 import ipaddress
+import json
 import os
 import re
 import secrets
 import socket
+import tomllib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from pydantic import Field
-from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict
-
-from optipmb_service.settings.forms import (
-    DEFAULT_LISTEN,
-    Address,
-    Endpoints,
-    Names,
-    Patterns,
-    Prefix,
-    Servers,
+from optipmb_schemas import DEFAULT, Keys, Limits, MessageError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    NoDecode,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    SettingsError,
 )
-from optipmb_service.settings.tables import LimitSettings, Ros2Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 PREFIX: Final = "OPTIPMB_"
 """Of environment variables."""
-
 
 RUN: Final = secrets.token_hex(3)
 """Tells this process from one with its number in another container that has the host's name."""
 
 HOST_CHARACTERS: Final = 40
+
+DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"
+DEFAULT_GRPC: Final = "127.0.0.1:50051"
+DEFAULT_NATS: Final = "127.0.0.1:4222"
+
+
+def _form(pattern: str, expected: str) -> AfterValidator:
+    """Return the check of a text: it matches a regular expression in full, or the error says what was expected."""
+
+    def check(value: str) -> str:
+        if not re.fullmatch(pattern, value):
+            raise ValueError(f"{expected}, received {value!r}")
+        return value
+
+    return AfterValidator(check)
+
+
+def address(value: str) -> str:
+    """Return an address as it is, `host:port` or nothing.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if value and not re.fullmatch(r"([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.%]+\]):\d{1,5}", value):
+        raise ValueError(f"an address looks like 127.0.0.1:8080, received {value!r}")
+    return value
+
+
+def without_password(server: str) -> str:
+    """Return the address of a server as it may be shown."""
+    return re.sub(r"(?<=//)[^/@]*@", "***@", server)
+
+
+def _listed(value: Any) -> Any:
+    """Take a text for a list: JSON, or names separated by commas."""
+    if not isinstance(value, str):
+        return value
+    if not value.startswith("["):
+        return [part.strip() for part in value.split(",") if part.strip()]
+    try:
+        return json.loads(value)
+    except ValueError as error:
+        raise ValueError(f"names separated by commas, or a JSON list, received {value!r}") from error
+
+
+Prefix = Annotated[str, _form(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*", "chunks of [A-Za-z0-9_.-] separated by '/'")]
+Address = Annotated[str, AfterValidator(address)]
+Pattern = Annotated[
+    str, _form(r"[A-Za-z0-9_.*-]+(/[A-Za-z0-9_.*-]+){2}", "a pattern of streams looks like site/*/lidar*")
+]
+Server = Annotated[str, _form(r"(nats|tls)://\S+", "a NATS server looks like nats://127.0.0.1:4222")]
+Endpoint = Annotated[
+    str,
+    _form(r"[a-z0-9]+/[^\s/#?]+:\d+([?#]\S*)?|[a-z0-9-]+/\S+", f"an endpoint looks like {DEFAULT_LISTEN}"),
+]
+Names = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)]
+Patterns = Annotated[tuple[Pattern, ...], NoDecode, BeforeValidator(_listed)]
+Servers = Annotated[tuple[Server, ...], NoDecode, BeforeValidator(_listed)]
+Endpoints = Annotated[tuple[Endpoint, ...], NoDecode, BeforeValidator(_listed)]
+
+
+class LimitSettings(BaseModel):
+    """Bounds on what one message may hold; what is larger is refused before memory is taken for it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_bytes: int = Field(default=DEFAULT.max_bytes, ge=1024, le=2**30, description="bytes of a msgpack payload")
+    max_json_bytes: int = Field(default=2**21, ge=1024, le=2**30, description="bytes of a JSON payload")
+    max_values: int = Field(default=2**17, ge=64, description="values of one message, each number of a list among them")
+    max_points: int = Field(default=DEFAULT.max_points, ge=0, description="points of one cloud")
+    max_detections: int = Field(default=DEFAULT.max_detections, ge=1, description="detections of one frame")
+
+    def limits(self) -> Limits:
+        """Return the limits for the decoder."""
+        return Limits(**self.model_dump())
+
+
+Topic = Annotated[str, _form(r"((/[A-Za-z_][A-Za-z0-9_]*)+)?", "a topic looks like /lidar/points")]
+
+
+class Ros2Stream(BaseModel):
+    """The topics of one stream."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    detections: Topic = Field(min_length=1, description="topic of the detections")
+    type: Literal[
+        "vision_msgs/msg/Detection3DArray",
+        "autoware_perception_msgs/msg/DetectedObjects",
+        "autoware_auto_perception_msgs/msg/DetectedObjects",
+    ] = Field(default="vision_msgs/msg/Detection3DArray", description="type of the detections")
+    points: Topic = Field(default="", description="topic of the point clouds")
+    tracks: Topic = Field(
+        default="", description="topic of the tracks; default: `/tracks` below that of the detections"
+    )
+    classes: dict[str, str] = Field(default_factory=dict, description="class names by those in the messages")
+    covariance: bool = Field(default=False, description="use the covariances of the detections' positions")
+    fixed: bool = Field(default=False, description="the sensor does not move and its frame is the world")
+
+    @property
+    def tracks_topic(self) -> str:
+        """Topic of the tracks."""
+        return self.tracks or f"{self.detections}/tracks"
+
+
+def _streams(value: dict[str, Ros2Stream]) -> dict[str, Ros2Stream]:
+    for name in value:
+        try:
+            Keys().detections(name)
+        except MessageError as error:
+            raise ValueError(f"a stream is named {error.expected}, received {error.received}") from None
+    return value
+
+
+class Ros2Settings(BaseModel):
+    """Topics of a ROS 2 system whose middleware is rmw_zenoh; used by `optipmb-service ros2`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    domain: int = Field(default=0, ge=0, le=232, description="`ROS_DOMAIN_ID` of the system")
+    node: str = Field(default="optipmb", pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="name of the ROS 2 node")
+    fixed_frame: str = Field(default="", description="frame of the tracks; default: the root of tf")
+    odometry: Topic = Field(default="", description="topic of `nav_msgs/Odometry`, for poses that tf has not")
+    tf_wait_s: float = Field(default=0.5, ge=0, le=60, description="longest wait of a message for its transform")
+    diagnostics: Topic = Field(default="/diagnostics", description="topic of `diagnostic_msgs/DiagnosticArray`")
+    streams: Annotated[dict[str, Ros2Stream], AfterValidator(_streams)] = Field(
+        default_factory=dict, description="topics by stream (`site/node/sensor`)"
+    )
 
 
 def _default_instance() -> str:
@@ -348,3 +482,116 @@ class Settings(BaseSettings):
         """Take values given to the constructor alone: `load` reads the file and the environment in its order."""
         del settings_cls, env_settings, dotenv_settings, file_secret_settings
         return (init_settings,)
+
+
+Source = Literal["option", "environment", "file", "default"]
+
+TABLES: Final = frozenset(
+    name
+    for name, field in Settings.model_fields.items()
+    if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+)
+"""The settings that are tables of settings and merged name by name; `profiles` is one value, whose order matters."""
+
+
+class SettingsInvalidError(ValueError):
+    """The settings cannot be used; the text is one clear line."""
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """Settings and, for every one of them, where its value came from."""
+
+    settings: Settings
+    sources: dict[str, Source]
+    unknown: tuple[str, ...] = ()
+    """Environment variables that look like settings and are none."""
+
+
+def load(
+    file: Path | None = None, options: Mapping[str, Any] | None = None, defaults: Mapping[str, Any] | None = None
+) -> Loaded:
+    """Merge the defaults of a command, the file, the environment and the options (None: not given); check the result.
+
+    Raises:
+        SettingsInvalidError: the file cannot be read, or a value is not allowed.
+    """
+    layers: list[tuple[Source, dict[str, Any]]] = [
+        ("default", dict(defaults or {})),
+        ("file", _read(file) if file is not None else {}),
+        ("environment", _environment()),
+        ("option", {name: value for name, value in (options or {}).items() if value is not None}),
+    ]
+    values: dict[str, Any] = {}
+    sources: dict[str, Source] = dict.fromkeys(Settings.model_fields, "default")
+    for source, layer in layers:
+        for name, value in layer.items():
+            old = values.get(name)
+            if name in TABLES and isinstance(old, dict) and isinstance(value, dict):
+                values[name] = {**old, **value}
+            else:
+                values[name] = value
+            sources[name] = source
+    try:
+        settings = Settings(**values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        path = ".".join(str(part) for part in first["loc"]) or "settings"
+        source = sources.get(str(first["loc"][0]) if first["loc"] else "", "default")
+        where = f" (from the {source})" if source != "default" else ""
+        message = first["msg"].removeprefix("Value error, ")
+        raise SettingsInvalidError(f"setting {path}{where}: {message}") from error
+    if not settings.endpoints and not settings.connect:
+        raise SettingsInvalidError("setting listen: neither an endpoint to listen on nor one to connect to")
+    if settings.fuse and not settings.rewind_s:
+        raise SettingsInvalidError("setting fuse: sensors do not come in order of their stamps: rewind_s must not be 0")
+    _check_cluster(settings)
+    if settings.workers > 1 and settings.zenoh_config is not None and settings.is_router:
+        # Its access control would be deaf to the workers, which come over a socket and without a certificate.
+        raise SettingsInvalidError(
+            "setting workers: with zenoh_config, a router of its own: start `optipmb-service router` and connect to it"
+        )
+    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields}
+    unknown = (name for name in os.environ if name.startswith(PREFIX) and name.split("__")[0] not in known)
+    return Loaded(settings, sources, tuple(sorted(unknown)))
+
+
+def _check_cluster(settings: Settings) -> None:
+    """Refuse files for NATS servers that are not there or not used.
+
+    Raises:
+        SettingsInvalidError: there are such.
+    """
+    folder, file = settings.cluster_tls, settings.cluster_credentials
+    for name, value in (("cluster_tls", folder), ("cluster_credentials", file)):
+        if value is not None and not settings.cluster:
+            raise SettingsInvalidError(f"setting {name}: without servers in `cluster`")
+    if folder is not None:
+        if any(not server.startswith("tls://") for server in settings.cluster):
+            raise SettingsInvalidError("setting cluster_tls: servers in `cluster` as tls://host:4222 expected")
+        if not (folder / "ca.pem").is_file():
+            raise SettingsInvalidError(f"setting cluster_tls: {folder}: no file ca.pem in it")
+        if (folder / "cert.pem").is_file() is not (folder / "key.pem").is_file():
+            raise SettingsInvalidError(f"setting cluster_tls: {folder}: cert.pem and key.pem belong together")
+    if file is not None and not file.is_file():
+        raise SettingsInvalidError(f"setting cluster_credentials: {file}: no such file")
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
+        raise SettingsInvalidError(f"settings file {file}: {reason}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsInvalidError(f"settings file {file}: not TOML: {error}") from error
+
+
+def _environment() -> dict[str, Any]:
+    try:
+        return EnvSettingsSource(Settings)()
+    except SettingsError as error:
+        match = re.search(r'field "(\w+)"', str(error))
+        name = f"{PREFIX}{match[1].upper()}" if match else "environment"
+        example = '{"site/*/*": "kitti"}'
+        raise SettingsInvalidError(f"{name}: tables are written as JSON, as '{example}'") from error
