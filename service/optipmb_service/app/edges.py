@@ -14,6 +14,7 @@ import structlog
 from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import say_ready, settle
 from optipmb_service.observability.health import Reporter
+from optipmb_service.observability.metrics import GATEWAY_METRICS
 from optipmb_service.zenoh import Router
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ async def run_gateway(settings: Settings) -> int:
 
     async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
         server = Server(settings, client)
-        health.metrics.add(server.metrics.figures)
+        health.metrics.add(GATEWAY_METRICS, lambda: server.metrics)
         await server.start()
         health.report(ClientReporter(client))
         settle()

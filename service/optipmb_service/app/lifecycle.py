@@ -33,10 +33,10 @@ from optipmb_schemas.installation import install_command
 
 from optipmb_service import __version__
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.observability import collectors, logs
+from optipmb_service.observability import logs
 from optipmb_service.observability.certificates import Certificates
 from optipmb_service.observability.health import BEAT_S, ProcessHealth
-from optipmb_service.observability.metrics import Metrics
+from optipmb_service.observability.metrics import GATEWAY_METRICS, NETWORK_METRICS, TLS_METRICS, Metrics
 from optipmb_service.runtime.ports import EdgeError, TransportError
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.connection import LISTENING, certificates_of
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import FrameType
 
-    from optipmb_service.grpc.beside import AddFigures
     from optipmb_service.settings import Settings
     from optipmb_service.zenoh.key_numbers import KeyCount
 
@@ -369,13 +368,13 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def grpc_edge(settings: Settings, client: Callable[[], Client], add: AddFigures) -> Iterator[None]:
+def grpc_edge(settings: Settings, client: Client, metrics: Metrics) -> Iterator[None]:
     """Serve gRPC beside a process, where that is asked for.
 
     Args:
         settings: address and certificates.
-        client: returns what it uses of the network.
-        add: has its figures read with the metrics.
+        client: network.
+        metrics: of the process; get those of gRPC.
 
     Raises:
         EdgeError: it cannot be served.
@@ -387,7 +386,8 @@ def grpc_edge(settings: Settings, client: Callable[[], Client], add: AddFigures)
         from optipmb_service.grpc.beside import serving  # noqa: PLC0415 - an extra that only this needs
     except ModuleNotFoundError as error:
         raise EdgeError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
-    with serving(settings, client(), add):
+    with serving(settings, client) as calls:
+        metrics.add(GATEWAY_METRICS, lambda: calls)
         yield
 
 
@@ -424,7 +424,7 @@ async def run(
     tasks = [asyncio.create_task(beat())]
     try:
         health.tls = certificates = Certificates(_certificate_files(settings), fixed=LISTENING)
-        health.metrics.add(certificates.figures)
+        health.metrics.add(TLS_METRICS, lambda: certificates)
         tasks.append(asyncio.create_task(certificates.watch()))
         with _monitoring(settings, health):
             ended = await serve(asked, health)
@@ -450,7 +450,7 @@ async def run_client(settings: Settings, serve: Callable[[StopRequest, ProcessHe
         client = await unless(asked, lambda: Client.opened(settings))
         if client is None:
             return None
-        health.metrics.add(lambda: collectors.of_network(client.key_numbers.declared, linked=client.linked()))
+        health.metrics.add(NETWORK_METRICS, lambda: client)
         watching = asyncio.create_task(watch_keys(asked, lambda: client.key_numbers, settings.restart_keys))
         try:
             await serve(asked, health, client)

@@ -19,17 +19,15 @@ from optipmb_service.app.lifecycle import say_ready, settle
 from optipmb_service.app.storage import nats_access
 from optipmb_service.cluster.message_log import LogMessage, LogWriter, MessageLog, Retention
 from optipmb_service.observability.health import Reporter
+from optipmb_service.observability.metrics import LOG_METRICS, PROBLEM_METRICS
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.kept_tracks import order_of
 from optipmb_service.session.problems import problem_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.cluster.message_log import Topic
     from optipmb_service.observability.health import ProcessHealth
-    from optipmb_service.observability.metrics import Value
     from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client, Message
 
@@ -54,13 +52,13 @@ class LogBridge(Reporter):
         self._instance = settings.instance
         self._limits = settings.limits.limits()
         self._grace_s = settings.grace_s
-        self._invalid = 0
+        self.invalid = 0
         self.reporter = ProblemReporter(client.publish_problem, log_problem)
         keep: dict[Topic, Retention] = {"detections": Retention(settings.log_s, settings.log_mb * MEGABYTE)}
         if settings.log_tracks_s:
             keep["tracks"] = Retention(settings.log_tracks_s, settings.log_tracks_mb * MEGABYTE)
         self._log = MessageLog(settings.cluster, settings.prefix, nats_access(settings))
-        self._writer = LogWriter(self._log, keep, self._unlogged)
+        self.writer = LogWriter(self._log, keep, self._unlogged)
         self._subscriptions = [client.subscribe(client.keys.all(topic), self._take) for topic in keep]
 
     @property
@@ -71,7 +69,7 @@ class LogBridge(Reporter):
     @property
     def failure(self) -> str:
         """Why nothing can be received or written; empty while it can."""
-        why = self._writer.failure
+        why = self.writer.failure
         return self._client.failure or (f"log: {why}" if why else "")
 
     def close(self) -> None:
@@ -79,21 +77,10 @@ class LogBridge(Reporter):
         ends = time.monotonic() + self._grace_s
         for subscription in self._subscriptions:
             subscription.close(CLOSE_S)
-        while not self._writer.idle() and time.monotonic() < ends:
+        while not self.writer.idle() and time.monotonic() < ends:
             time.sleep(DRAIN_POLL_S)
-        self._writer.close()
+        self.writer.close()
         self._log.connection.close(CLOSE_S)
-
-    def figures(self) -> Iterator[Value]:
-        """Return what it counts."""
-        writer = self._writer
-        yield "log_written_total", (), writer.written
-        yield "log_repeated_total", (), writer.repeated
-        yield "log_dropped_total", (), writer.dropped
-        yield "log_invalid_total", (), self._invalid
-        yield "log_waiting_bytes", (), writer.held_bytes
-        for code, count in self.reporter.counts().items():
-            yield "problems_total", (code,), count
 
     def _take(self, message: Message) -> None:
         """Put a valid message into the log; one that is not, who tracks reports."""
@@ -102,17 +89,17 @@ class LogBridge(Reporter):
             kind = schemas.Detections if message.key.endswith("/detections") else schemas.Tracks
             content = schemas.decode(message.payload, kind, encoding=message.encoding, limits=self._limits)
         except schemas.MessageError:
-            self._invalid += 1
+            self.invalid += 1
             return
         if content.stream != stream:
-            self._invalid += 1
+            self.invalid += 1
             return
         topic: Topic = "detections"
         sensor, order = "", (0, 0)
         if isinstance(content, schemas.Tracks):
             topic, sensor, order = "tracks", content.sensor or "", order_of(content)
         frame = content.epoch, content.seq, content.stamp_ns, sensor
-        self._writer.put(LogMessage(topic, stream, *frame, order, message.payload, message.encoding))
+        self.writer.put(LogMessage(topic, stream, *frame, order, message.payload, message.encoding))
 
     def _unlogged(self, stream: str, why: str) -> None:
         problem = problem_of(
@@ -131,7 +118,7 @@ async def run(settings: Settings) -> int:
 
     async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
         bridge = LogBridge(settings, client)
-        health.metrics.add(bridge.figures)
+        health.metrics.add(LOG_METRICS | PROBLEM_METRICS, lambda: bridge)
         health.report(bridge)
         settle()
         say_ready("log", settings.instance, settings.connect)

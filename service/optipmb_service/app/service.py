@@ -21,9 +21,14 @@ from optipmb_service import __version__
 from optipmb_service.app.lifecycle import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
 from optipmb_service.app.storage import open_log, open_store
 from optipmb_service.cluster.member import Member
-from optipmb_service.observability import collectors
 from optipmb_service.observability.health import Reporter
-from optipmb_service.observability.metrics import Metrics
+from optipmb_service.observability.metrics import (
+    NETWORK_METRICS,
+    PROBLEM_METRICS,
+    STREAM_METRICS,
+    Metrics,
+    StreamFigures,
+)
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.intake import Intake
 from optipmb_service.runtime.kept_tracks import RecentTracks
@@ -35,13 +40,13 @@ from optipmb_service.runtime.service_queries import ServiceQueries, members_of
 from optipmb_service.runtime.stream_queries import StreamQueries
 from optipmb_service.runtime.track_query import TrackQuery
 from optipmb_service.session.problems import problem_of
+from optipmb_service.session.values import SECOND
 from optipmb_service.zenoh import Transport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
-    from optipmb_service.observability.metrics import Value
     from optipmb_service.runtime.context import Actor
     from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.profiles import Profiles
@@ -131,7 +136,8 @@ class Service(Reporter):
             linger_s=settings.lease_s,
             idle_s=settings.idle_s,
         )
-        self._metrics.add(self._figures)
+        self._metrics.add(PROBLEM_METRICS | STREAM_METRICS, self._figures)
+        self._metrics.add(NETWORK_METRICS, self.client)
         self._stream_queries = StreamQueries(
             self._registry, TrackQuery([*logged, recent], settings.instance, settings.limits.limits())
         )
@@ -332,21 +338,16 @@ class Service(Reporter):
         )
         self._reporter.report(problem, time.monotonic_ns())
 
-    def _figures(self) -> Iterator[Value]:
-        """Read what `metrics` does not count itself."""
-        sessions = self._summaries(time.monotonic_ns())
-        densities = [session.density for actor in self._registry.actors() if (session := actor.session) is not None]
-        yield from collectors.of_problems(self._reporter.counts())
-        yield from collectors.of_totals(self._registry.totals())
-        yield from collectors.of_durability(
-            self._persistence.written,
-            self._persistence.complete_ns,
-            owned=len(sessions),
+    def _figures(self) -> StreamFigures:
+        now_ns = time.monotonic_ns()
+        sessions, complete_ns = self._summaries(now_ns), self._persistence.complete_ns
+        return StreamFigures(
+            self._reporter,
+            self._registry.totals(),
+            sessions,
+            sessions[: self._settings.http_streams],
+            [session.density for actor in self._registry.actors() if (session := actor.session) is not None],
             standing_by=self._intake.standing_by,
-            now_ns=time.monotonic_ns(),
+            checkpoints=self._persistence.written,
+            checkpoint_age_s=None if complete_ns is None else max(0, now_ns - complete_ns) / SECOND,
         )
-        client = self.client()
-        yield from collectors.of_network(client.key_numbers.declared, linked=client.linked())
-        yield from collectors.of_sessions(sessions)
-        yield from collectors.of_densities(densities)
-        yield from collectors.of_streams(sessions, self._settings.http_streams)

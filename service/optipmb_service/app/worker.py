@@ -125,7 +125,7 @@ async def _serve(
     health.report(service)
     settle()
     watching = loop.create_task(watch_keys(asked, lambda: service.key_numbers, settings.restart_keys))
-    with grpc_edge(settings, service.client, health.metrics.add):
+    with grpc_edge(settings, service.client(), health.metrics):
         # In this order: who sees the ready line may send at once, and finds this event before those of a session.
         log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
         if parent is None:

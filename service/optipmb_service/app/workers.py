@@ -34,6 +34,7 @@ from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import LATE_S, RESTART, SLICE_S, grpc_edge, say_ready, unless, watch_keys
 from optipmb_service.cluster.leases import ALIVE, instance_of
 from optipmb_service.observability.health import BEAT_S, Reporter
+from optipmb_service.observability.metrics import NETWORK_METRICS
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.requests import guarded, problem_with
 from optipmb_service.runtime.service_queries import TEXT, UNDRAINED, drain_asked, move_asked
@@ -293,7 +294,7 @@ class AggregateView(Reporter):
         self._asking = ThreadPoolExecutor(len(self._names), "asking")
         self._draining = ThreadPoolExecutor(len(self._names), "draining")  # takes long, and keeps no status waiting
         self._metrics = metrics
-        metrics.add(lambda: [("linked", (), not network.client().failure)])
+        metrics.add({"linked": NETWORK_METRICS["linked"]}, network.client)
         metrics.workers = self._samples
 
     def ends(self) -> None:
@@ -468,7 +469,7 @@ async def serve_workers(
         transport.watch()
         transport.serve_service(view.answer, QUERIES)
         transport.announce()
-        with grpc_edge(settings, transport.client, health.metrics.add):
+        with grpc_edge(settings, client, health.metrics):
             say_ready("instance", settings.instance, (*settings.endpoints, *settings.connect))
             log.info("ready", instance=settings.instance, listen=settings.endpoints, connect=settings.connect)
             await asked.wait()

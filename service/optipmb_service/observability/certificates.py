@@ -15,10 +15,8 @@ import structlog
 from optipmb_schemas.certificates import end_of, ended
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
     from pathlib import Path
-
-    from optipmb_service.observability.metrics import Value
 
 LOOK_S: Final = 5.0
 """Files are read again after so long."""
@@ -44,11 +42,10 @@ class Certificates:
         self._looked = -LOOK_S
         self._look()
 
-    def figures(self) -> Iterator[Value]:
-        """Return how many days each certificate still holds."""
+    def days(self) -> dict[str, float]:
+        """Return how many days each certificate still holds, by its use."""
         now = datetime.now(UTC)
-        for use, end in self._look().items():
-            yield "certificate_days", (use,), (end - now).total_seconds() / DAY_S
+        return {use: (end - now).total_seconds() / DAY_S for use, end in self._look().items()}
 
     @property
     def failure(self) -> str:
@@ -69,7 +66,7 @@ class Certificates:
             for why in now_ended - told:
                 log.error("certificate_ended", error=why)
             told = set(now_ended)
-            soon = {use: round(days, 1) for _, (use,), days in self.figures() if 0 < days < WARN_DAYS}
+            soon = {use: round(days, 1) for use, days in self.days().items() if 0 < days < WARN_DAYS}
             if soon and time.monotonic() - warned >= DAY_S:
                 warned = time.monotonic()
                 log.warning("certificate_ends", days=soon)

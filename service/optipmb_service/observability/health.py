@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
-from optipmb_service.observability import collectors
+from optipmb_service.observability.metrics import PROCESS_METRICS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -76,13 +76,14 @@ class ProcessHealth:
     """
 
     def __init__(self, instance: str, metrics: Metrics) -> None:
+        self.instance = instance
         self.metrics = metrics
         self.tls: Certificates | None = None
         """The certificates of the process; None while they are not read."""
         self._service: Reporter | None = None
         self._ending = False
         self._beat_ns = time.monotonic_ns()
-        metrics.add(lambda: collectors.of_process(instance, self.state()))
+        metrics.add(PROCESS_METRICS, lambda: self)
 
     def beat(self) -> None:
         """Note that the control loop turns."""
