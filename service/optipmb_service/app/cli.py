@@ -17,6 +17,7 @@ from inspect import Parameter, Signature, signature
 from pathlib import Path  # noqa: TC003 - typer reads the annotations at run time
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TypedDict, Unpack, get_type_hints
 
+import structlog
 import typer
 from optipmb_schemas.installation import install_command
 from typer.main import get_command
@@ -333,9 +334,11 @@ def _load(given: Mapping[str, Any], **defaults: Any) -> Loaded:
 def _begin(loaded: Loaded) -> Settings:
     """Let logs go where the settings want them."""
     logs.configure(loaded.settings.log_format, loaded.settings.log_level)
-    logs.unknown_environment(loaded.unknown)
+    log = structlog.get_logger("optipmb_service")
+    if loaded.unknown:
+        log.warning("unknown_environment", names=loaded.unknown)
     if loaded.settings.unprotected:
-        logs.unprotected(loaded.settings.unprotected)
+        log.warning("unprotected", addresses=loaded.settings.unprotected)
     return loaded.settings
 
 

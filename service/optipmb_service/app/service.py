@@ -281,60 +281,45 @@ class Service(Reporter):
                 summary = actor.summary(now_ns)
             except Exception as error:
                 log.exception("internal_error", stream=actor.stream)
-                self._report(actor.stream, "the line of a session in the status", f"{type(error).__name__}: {error}")
+                self._internal("the line of a session in the status", actor.stream, f"{type(error).__name__}: {error}")
             else:
                 summaries += [summary] if summary is not None else []
         return tuple(summaries)
 
+    def report_certificate(self, why: str) -> None:
+        """Report that a certificate has ended."""
+        self._report("certificate", "certificates that hold", why, message=why)
+
     def _report_returned(self, token: str, due: int, newest: int) -> None:
         expected, received = f"messages numbered from {due} on by Zenoh", f"numbers that began again, now {newest}"
-        problem = problem_of(
-            "numbers_back",
-            stream=schemas.Keys(self._settings.prefix).stream_of(token),
-            instance=self._settings.instance,
-            expected=expected,
-            received=received,
-            message=f"Publisher: expected {expected}, received {received}; remove `id` from its Zenoh configuration.",
-        )
-        self._reporter.report(problem, time.monotonic_ns())
+        message = f"Publisher: expected {expected}, received {received}; remove `id` from its Zenoh configuration."
+        stream = schemas.Keys(self._settings.prefix).stream_of(token)
+        self._report("numbers_back", expected, received, stream=stream, message=message)
 
     def _report_duplicate_name(self) -> None:
         name = self._settings.instance
-        problem = problem_of(
-            "duplicate_name",
-            stream="",
-            instance=name,
-            path="instance",
-            expected="a name that no other process has",
-            received=name,
-            message=f"Setting instance: another process is named {name}, too; give each a name of its own.",
-        )
-        self._reporter.report(problem, time.monotonic_ns())
-
-    def report_certificate(self, why: str) -> None:
-        """Report that a certificate has ended."""
-        problem = problem_of(
-            "certificate",
-            stream="",
-            instance=self._settings.instance,
-            expected="certificates that hold",
-            received=why,
-            message=why,
-        )
-        self._reporter.report(problem, time.monotonic_ns())
+        message = f"Setting instance: another process is named {name}, too; give each a name of its own."
+        self._report("duplicate_name", "a name that no other process has", name, path="instance", message=message)
 
     def _unkept(self, stream: str, why: str) -> None:
         """Report that the state of a stream cannot be kept."""
-        self._report(stream, "a state that can be written down", why)
+        self._internal("a state that can be written down", stream, why)
 
-    def _report(self, stream: str, expected: str, received: str) -> None:
+    def _internal(self, expected: str, stream: str, received: str) -> None:
+        message = f"Stream: expected {expected}, received {received}."
+        self._report("internal", expected, received, stream=stream, message=message)
+
+    def _report(
+        self, code: str, expected: str, received: str, *, message: str, stream: str = "", path: str = ""
+    ) -> None:
         problem = problem_of(
-            "internal",
+            code,
             stream=stream,
             instance=self._settings.instance,
+            path=path,
             expected=expected,
             received=received,
-            message=f"Stream: expected {expected}, received {received}.",
+            message=message,
         )
         self._reporter.report(problem, time.monotonic_ns())
 

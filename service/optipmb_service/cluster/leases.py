@@ -98,30 +98,6 @@ class Change(StrEnum):
     """Another member may continue its streams already: the states here are not the newest, and are not to be kept."""
 
 
-class WriteLease:
-    """The time during which a member may publish and save; read by any thread, written by one.
-
-    Args:
-        length_ns: how long a renewal holds, monotonic time.
-    """
-
-    def __init__(self, length_ns: int) -> None:
-        self._length_ns = length_ns
-        self._until_ns = 0
-
-    def valid(self, now_ns: int) -> bool:
-        """Whether the write lease holds."""
-        return now_ns < self._until_ns
-
-    def renew(self, now_ns: int) -> None:
-        """Let it hold from now."""
-        self._until_ns = now_ns + self._length_ns
-
-    def lapse(self) -> None:
-        """End it."""
-        self._until_ns = 0
-
-
 @dataclass(slots=True)
 class _Watched:
     revision: int

@@ -20,7 +20,6 @@ from optipmb_service.cluster.leases import (
     Change,
     LeaseTable,
     MemberLease,
-    WriteLease,
     instance_of,
     member_key,
     partition_key,
@@ -83,7 +82,8 @@ class Member:
         self._store = store
         self._clock = clock
         self._lease_ns = round(lease_s * SECOND)
-        self._write_lease = WriteLease(self._lease_ns // WRITE_LEASES_PER_LEASE)
+        self._may_write_until_ns = 0
+        """End of the write lease; read by any thread."""
         look_s = lease_s / LOOKS_PER_LEASE
         self._look_s = look_s if store.remote else min(look_s, LONGEST_LOOK_S)
         self._table = self._joining()
@@ -140,7 +140,7 @@ class Member:
     @property
     def failure(self) -> str:
         """Why nothing may be published at present; empty while it may."""
-        return "" if self._write_lease.valid(self._clock()) else f"leases: {self._error}"
+        return "" if self._clock() < self._may_write_until_ns else f"leases: {self._error}"
 
     @property
     def strained(self) -> bool:
@@ -150,7 +150,7 @@ class Member:
         """
         now_ns = self._clock()
         late = now_ns - self._renewed_ns > self._lease_ns // STRAINED
-        return late and not (self._slow and self._write_lease.valid(now_ns))
+        return late and not (self._slow and now_ns < self._may_write_until_ns)
 
     @property
     def partitions(self) -> set[int]:
@@ -168,7 +168,7 @@ class Member:
     def may_write(self, stream: str, fence: int | None) -> bool:
         """Whether what was made under a fence may be published and saved now."""
         held = self._table.held.get(partition_of(stream))
-        return fence is not None and fence == held and self._write_lease.valid(self._clock())
+        return fence is not None and fence == held and self._clock() < self._may_write_until_ns
 
     def look(self) -> None:
         """Have the member look soon: a state is kept."""
@@ -308,11 +308,11 @@ class Member:
             if found is None:
                 log.error("leases_gone", member=self._table.member, partitions=len(self._table.held))
                 self._gone = set(self._table.held)
-        was = self._write_lease.valid(self._clock())
+        was = self._clock() < self._may_write_until_ns
         if not self._unwritable:
             self._said = value
         self._revision, self._renewed_ns, self._error = revision, sent_ns, "its lease has lapsed"
-        self._write_lease.renew(sent_ns)
+        self._may_write_until_ns = sent_ns + self._lease_ns // WRITE_LEASES_PER_LEASE
         self._time_renewal(sent_ns)
         if self._failing:
             self._failing = False
@@ -363,7 +363,7 @@ class Member:
 
     def _lose(self) -> None:
         """Begin anew: another member has ended this one, and holds what it held, or will."""
-        self._write_lease.lapse()
+        self._may_write_until_ns = 0
         if self._table.held:
             log.error("lease_lost", member=self._table.member, partitions=len(self._table.held))
         self._error = "another member has taken over its partitions"
@@ -405,7 +405,7 @@ class Member:
 
     def _end(self) -> None:
         """Say that this member has ended: its partitions are free then. What is to be kept has been saved."""
-        self._write_lease.lapse()
+        self._may_write_until_ns = 0
         key = member_key(self._table.member)
         if self._revision and self._store.put(Write(key, ENDED, self._revision)) is None:
             found = self._store.get(key)

@@ -23,7 +23,14 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 import structlog
 from nats.errors import Error as NatsError
 
-from optipmb_service.cluster.nats_connection import NatsConnection, NobodyAnswersError, RefusedError, text_of, token
+from optipmb_service.cluster.nats_connection import (
+    ERRORS,
+    NatsConnection,
+    NobodyAnswersError,
+    RefusedError,
+    text_of,
+    token,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -358,8 +365,11 @@ def _found(topic: Topic, message: Msg) -> _Found:
 class LogReader:
     """The reader of one process.
 
+    Everything runs on the loop of the connection, a few streams at a time, each for a bounded time and up to a bounded
+    number of bytes.
+
     Args:
-        message_log: what is read; its connection is closed with the reader.
+        message_log: log to read; its connection is closed with the reader.
         back_s: how far a stream is read that has no position: so long before its newest message.
     """
 
@@ -387,7 +397,7 @@ class LogReader:
         """Read the tracks of a stream from a stamp on, without waiting for it.
 
         Args:
-            stream: whose.
+            stream: its name.
             from_ns: the stamp; some earlier ones may come, too.
             take: called, on a thread that must not be kept, with some of them, in the order of the log, until it says
                 that it has enough (False).
@@ -396,47 +406,42 @@ class LogReader:
         self._log.connection.start(self._tracks(stream, from_ns, take, end))
 
     def close(self, timeout: float) -> None:
-        """End."""
+        """Close the connection."""
         self._log.connection.close(timeout)
 
-    # On the loop
-
     async def _missed(self, wanted: Missed, take: Callable[[list[LogMessage]], None], again_s: Sequence[float]) -> None:
-        parts: dict[str, _Part] = {}
+        following: dict[str, int | None] = {}
         for number, pause_s in enumerate((0.0, *again_s)):
             await asyncio.sleep(pause_s)
-            messages = await self._look(wanted, parts)
+            messages: list[LogMessage] = []
+            try:
+                async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
+                    streams = set(wanted.streams)
+                    if wanted.node:
+                        streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.node)))
+                    for stream in sorted(streams):
+                        await self._read(stream, wanted.positions.get(stream), following, messages)
+            except ERRORS as error:
+                log.warning("log_unread", streams=sorted(wanted.streams), error=self._log.connection.described(error))
+            except Exception:
+                log.exception("internal_error", streams=sorted(wanted.streams))  # the session waits for what there is
             if messages or number == 0:
                 take(messages)
 
-    async def _look(self, wanted: Missed, parts: dict[str, _Part]) -> list[LogMessage]:
-        """Return what is new in the log; nothing where it cannot be read in time."""
-        messages: list[LogMessage] = []
-        try:
-            async with asyncio.timeout(WAIT_S), self._turns, asyncio.timeout(READ_S):
-                streams = set(wanted.streams)
-                if wanted.node:
-                    streams.update(filter(wanted.belongs, await self._log.streams("detections", wanted.node)))
-                for stream in sorted(streams):
-                    await self._read(parts.setdefault(stream, _Part(stream, wanted.positions.get(stream))), messages)
-        except (NatsError, RefusedError, TimeoutError, OSError) as error:
-            log.warning("log_unread", streams=sorted(wanted.streams), error=self._log.connection.described(error))
-        except Exception:
-            log.exception("internal_error", streams=sorted(wanted.streams))  # the session waits for whatever there is
-        return messages
-
-    async def _read(self, part: _Part, messages: list[LogMessage]) -> None:
-        """Append what is new of a stream."""
-        position = part.position
+    async def _read(
+        self, stream: str, position: Position | None, following: dict[str, int | None], messages: list[LogMessage]
+    ) -> None:
+        """Append the messages of a stream from the number on that follows the last read; note the next one."""
         before = (lambda _: False) if position is None else position.before
-        if part.next is None:
+        number = following.get(stream)
+        if number is None:
             back_s = max(OUTAGE_S, self._back_s) if position and position.tracked else self._back_s
-            part.next = await self._log.since("detections", part.stream, before, back_s)
+            number = await self._log.since("detections", stream, before, back_s)
         kept: deque[LogMessage] = deque()
         size = cut = 0
         try:
-            while part.next is not None and (found := await self._log.read("detections", part.stream, part.next)):
-                part.next = found[-1][0] + 1
+            while number is not None and (found := await self._log.read("detections", stream, number)):
+                number = found[-1][0] + 1
                 for _, message in found:
                     if before(message):
                         continue
@@ -446,9 +451,10 @@ class LogReader:
                         size -= len(kept.popleft().payload)
                         cut += 1
         finally:  # what was read before a failure is not read again
+            following[stream] = number
             messages.extend(kept)
         if cut:
-            log.warning("log_cut", stream=part.stream, frames=len(kept) + cut, kept=len(kept))
+            log.warning("log_cut", stream=stream, frames=len(kept) + cut, kept=len(kept))
 
     async def _tracks(
         self, stream: str, from_ns: int, take: Callable[[list[LogMessage]], bool], end: Callable[[str], None]
@@ -461,21 +467,12 @@ class LogReader:
                     number = found[-1][0] + 1
                     if not take([message for _, message in found]):
                         break
-        except (NatsError, RefusedError, TimeoutError, OSError) as error:
+        except ERRORS as error:
             failure = self._log.connection.described(error)
         except Exception as error:
             log.exception("internal_error", stream=stream)
             failure = f"{type(error).__name__}: {error}"
         end(failure)
-
-
-@dataclass(slots=True)
-class _Part:
-    """How far a stream has been read."""
-
-    stream: str
-    position: Position | None
-    next: int | None = None
 
 
 class LogWriter:
@@ -580,7 +577,7 @@ class LogWriter:
         try:
             for topic, keep in self._keep.items():
                 await self._log.ready(topic, keep)
-        except (NatsError, RefusedError, TimeoutError, OSError) as error:
+        except ERRORS as error:
             self._failed(error)
             return False
         return True
@@ -603,7 +600,7 @@ class LogWriter:
         for message, result in zip(batch, results, strict=True):
             if isinstance(result, NotKeptError):
                 self._lose(message, str(result))
-            elif isinstance(result, NatsError | RefusedError | TimeoutError | OSError):
+            elif isinstance(result, ERRORS):
                 self._failed(result)
                 failed.append(message)
             elif isinstance(result, BaseException):

@@ -77,6 +77,10 @@ class RefusedError(Exception):
         self.code = error.get("err_code")
 
 
+ERRORS: Final = (NatsError, RefusedError, TimeoutError, OSError)
+"""Failures of a request to the servers."""
+
+
 class NobodyAnswersError(NatsError):
     """There is no JetStream stream of a name, or none that answers now."""
 
@@ -161,7 +165,7 @@ class NatsConnection:
             raise StoreError("the connection is closed")
         try:
             return self.start(bounded()).result(bound_s + CALL_S)
-        except (NatsError, RefusedError, TimeoutError, CancelledError, OSError) as error:
+        except (*ERRORS, CancelledError) as error:
             raise StoreError(self.described(error)) from error
 
     def described(self, error: BaseException) -> str:

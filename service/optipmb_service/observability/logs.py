@@ -255,6 +255,10 @@ def configure(form: Literal["console", "json"], level: str, worker: int | None =
         level: the least that is logged.
         worker: number of the worker process, written into every line; None: it is none.
     """
+    global _writer  # noqa: PLW0603 - a process has one stderr
+    if _writer is None:
+        atexit.register(finish)
+    _writer = LineWriter(sys.stderr)
     processors: list[Processor] = [] if worker is None else [lambda _logger, _name, event: {**event, "worker": worker}]
     processors += [
         Limiter(),
@@ -271,18 +275,9 @@ def configure(form: Literal["console", "json"], level: str, worker: int | None =
     structlog.configure(
         processors=processors,
         wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
-        logger_factory=structlog.WriteLoggerFactory(file=_written()),
+        logger_factory=structlog.WriteLoggerFactory(file=cast("TextIO", _writer)),
     )
     logging.getLogger("optipmb").handlers = [_Library()]
-
-
-def _written() -> TextIO:
-    """Return what takes the lines of this process."""
-    global _writer  # noqa: PLW0603 - a process has one stderr
-    if _writer is None:
-        atexit.register(finish)
-    _writer = LineWriter(sys.stderr)
-    return cast("TextIO", _writer)
 
 
 class _Library(logging.Handler):
@@ -291,14 +286,3 @@ class _Library(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Log one of them."""
         structlog.get_logger("optipmb_service").warning("tracker_message", text=record.getMessage())
-
-
-def unknown_environment(names: tuple[str, ...]) -> None:
-    """Log environment variables that look like settings and are none: usually a typing error."""
-    if names:
-        structlog.get_logger("optipmb_service").warning("unknown_environment", names=names)
-
-
-def unprotected(addresses: tuple[str, ...]) -> None:
-    """Log addresses beyond this machine without TLS and access control."""
-    structlog.get_logger("optipmb_service").warning("unprotected", addresses=addresses)
