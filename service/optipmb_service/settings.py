@@ -76,7 +76,7 @@ def without_password(server: str) -> str:
 
 
 def _listed(value: Any) -> Any:
-    """Take a text for a list: JSON, or names separated by commas."""
+    """Return the list that a text holds: JSON, or names separated by commas."""
     if not isinstance(value, str):
         return value
     if not value.startswith("["):

@@ -123,7 +123,7 @@ class Options(GatewayOptions, LogOptions, total=False):
 
 
 def _taking(options: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Let a command with `**given` have the options of a class: typer reads a command's signature, and no `Unpack`."""
+    """Give a command with `**given` the options of a class: typer reads a command's signature, and no `Unpack`."""
 
     def spread(command: Callable[..., None]) -> Callable[..., None]:
         own = [
@@ -332,7 +332,7 @@ def _load(given: Mapping[str, Any], **defaults: Any) -> Loaded:
 
 
 def _begin(loaded: Loaded) -> Settings:
-    """Let logs go where the settings want them."""
+    """Configure the logs, and log what is wrong with the settings but allowed."""
     logs.configure(loaded.settings.log_format, loaded.settings.log_level)
     log = structlog.get_logger("optipmb_service")
     if loaded.unknown:

@@ -122,7 +122,7 @@ class _Work(Reporter):
         self._node.close()
 
     def work(self, seconds: float) -> None:
-        """Do what has come in, and what is due, for about so long."""
+        """Handle messages and timers for about so long."""
         ends = time.monotonic() + seconds
         while (left := ends - time.monotonic()) > 0:
             self._filled.wait(min(left, TICK_S))
@@ -159,7 +159,7 @@ class _Work(Reporter):
         self._node.publish(topic, self._types.write(message))
 
     def listened(self, topic: str) -> bool:
-        """Whether ROS has a subscription to a topic."""
+        """Return whether ROS has a subscription to a topic."""
         return self._node.listened(topic)
 
     def ask(self, stream: str, parameters: schemas.SessionParameters, then: Callable[[], None] | None = None) -> None:
@@ -188,38 +188,26 @@ class _Work(Reporter):
     def _wanted(self) -> list[tuple[Wanted, Callable[[Any], None] | None]]:
         """Return our endpoints, and what takes the messages of subscriptions; None for publishers."""
         ros2, bridge = self._settings.ros2, self._bridge
+
+        def one(kind: str, topic: str, type_name: str, qos: graph.Qos) -> Wanted:
+            return Wanted(kind, topic, type_name, self._types.hash_of(type_name), qos)
+
+        subscription, publisher = partial(one, graph.SUBSCRIPTION), partial(one, graph.PUBLISHER)
         ours: list[tuple[Wanted, Callable[[Any], None] | None]] = [
-            (self._one(graph.SUBSCRIPTION, "/tf", TF, MOVING), lambda one: bridge.take_transforms(one, static=False)),
-            (
-                self._one(graph.SUBSCRIPTION, "/tf_static", TF, STATIC),
-                lambda one: bridge.take_transforms(one, static=True),
-            ),
+            (subscription("/tf", TF, MOVING), partial(bridge.take_transforms, static=False)),
+            (subscription("/tf_static", TF, STATIC), partial(bridge.take_transforms, static=True)),
         ]
         if ros2.odometry:
-            ours.append((self._one(graph.SUBSCRIPTION, ros2.odometry, ODOMETRY, MOVING), bridge.take_odometry))
+            ours.append((subscription(ros2.odometry, ODOMETRY, MOVING), bridge.take_odometry))
         for name, stream in ros2.streams.items():
-            ours.append(
-                (
-                    self._one(graph.SUBSCRIPTION, stream.detections, stream.type, SENSOR),
-                    partial(bridge.take, name, "detections"),
-                )
-            )
+            take: Any = partial(bridge.take, name)
+            ours.append((subscription(stream.detections, stream.type, SENSOR), partial(take, "detections")))
             if stream.points:
-                ours.append(
-                    (
-                        self._one(graph.SUBSCRIPTION, stream.points, CLOUD, SENSOR),
-                        partial(bridge.take, name, "points"),
-                    )
-                )
-            base = stream.tracks_topic
-            for end, kind in TOPICS.items():
-                ours.append((self._one(graph.PUBLISHER, base + end, kind, OFFERED), None))
+                ours.append((subscription(stream.points, CLOUD, SENSOR), partial(take, "points")))
+            ours += [(publisher(stream.tracks_topic + end, kind, OFFERED), None) for end, kind in TOPICS.items()]
         if ros2.diagnostics:
-            ours.append((self._one(graph.PUBLISHER, ros2.diagnostics, DIAGNOSTICS, OFFERED), None))
+            ours.append((publisher(ros2.diagnostics, DIAGNOSTICS, OFFERED), None))
         return ours
-
-    def _one(self, kind: str, topic: str, type_name: str, qos: graph.Qos) -> Wanted:
-        return Wanted(kind, topic, type_name, self._types.hash_of(type_name), qos)
 
     def _reading(self, wanted: Wanted, receive: Callable[[Any], None]) -> Callable[[graph.TopicKey, bytes], None]:
         """Return what takes the bytes of a topic: those of the right type are read and handed over."""
@@ -232,7 +220,8 @@ class _Work(Reporter):
 
     def _read(self, wanted: Wanted, payload: bytes, receive: Callable[[Any], None]) -> None:
         try:
-            self._check_size(payload)
+            if len(payload) > (most := self._settings.limits.max_bytes):
+                raise schemas.MessageError("too_large", "", f"at most {most} bytes", f"{len(payload)} bytes")  # noqa: TRY301 - refused as what cannot be read
             receive(self._types.read(wanted.type, payload))
         except schemas.MessageError as error:
             for name, stream in self._settings.ros2.streams.items():
@@ -240,10 +229,6 @@ class _Work(Reporter):
                     self._bridge.refuse(name, error)
                     return
             log.warning("problem", topic=wanted.topic, message=str(error))
-
-    def _check_size(self, payload: bytes) -> None:
-        if len(payload) > (most := self._settings.limits.max_bytes):
-            raise schemas.MessageError("too_large", "", f"at most {most} bytes", f"{len(payload)} bytes")
 
     def _come_back(self, one: Message) -> None:
         try:

@@ -163,7 +163,7 @@ class Service(Reporter):
             self._transport.announce()
 
     def housekeeping(self) -> None:
-        """Do what is due about once a second."""
+        """Report silent streams and summaries of problems; to be called about once a second."""
         now_ns = time.monotonic_ns()
         self._registry.sweep(now_ns)
         self._transport.look_for_returned(self._report_returned)
@@ -173,7 +173,7 @@ class Service(Reporter):
         self._reporter.flush(now_ns)
 
     def stop(self, seconds: float = math.inf) -> bool:
-        """Let others go on, track what was received, within the grace, and close.
+        """Hand the streams over, track what was received, within the grace, and close.
 
         All of it takes a bounded time, so that whoever waits for the end kills nothing that is still being kept; but
         closing the network, before which all that is to be kept is written.

@@ -182,7 +182,7 @@ def _release_compiler() -> None:
 
 
 def main() -> int:
-    """Be a worker; returns the exit status."""
+    """Run a worker; return the exit status."""
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     line = sys.stdin.readline()
     if not line:

@@ -238,7 +238,7 @@ class Supervisor:
             self._settled.set()
 
     async def _keep(self, worker: Worker) -> None:
-        """Have a worker run until the end."""
+        """Run a worker until the end, again whenever it ends."""
         index, folder = worker.index, self._settings.folder  # one for all, wherever the workers connect
         settings = self._settings.model_copy(
             update={"instance": f"{self._settings.instance}-w{index}", "store": str(folder) if folder else "none"}

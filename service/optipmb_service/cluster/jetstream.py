@@ -99,7 +99,7 @@ class JetStream:
         return None if found is None else found[1]
 
     def expire(self, age_s: float) -> int:
-        """Do nothing: the server itself forgets a checkpoint that is old."""
+        """Return 0: the server itself forgets a checkpoint that is old."""
         del age_s
         return 0
 
@@ -120,7 +120,7 @@ class JetStream:
         self._there = False  # the server may come back without its files
 
     async def _ready(self) -> None:
-        """Have the JetStream stream there."""
+        """Create the JetStream stream, unless it is there."""
         client = self._connection.client()
         if not self._there:
             self.max_bytes = client.max_payload * 3 // 4 - 4096  # it is read as base64

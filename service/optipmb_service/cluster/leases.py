@@ -157,8 +157,8 @@ class LeaseTable:
     _done_when: str | None = None
     """Its state when there was nothing to write or to wait for; None: something has changed since."""
 
-    def take_in(self, records: Iterable[Record], now_ns: int) -> None:
-        """Take in what has changed, or that nothing has."""
+    def apply(self, records: Iterable[Record], now_ns: int) -> None:
+        """Apply new records."""
         if self._looked_ns is None or now_ns - self._looked_ns > self.lease_ns // WATCHED:
             # Nobody could renew, or it was not seen: the lease of each is counted from now.
             for one in self._members.values():
@@ -169,7 +169,7 @@ class LeaseTable:
             self.position = max(self.position, record.revision)
             kind, _, name = record.key.partition("/")
             if kind == "member":
-                changed |= self._take_in_member(name, record, now_ns)
+                changed |= self._apply_member(name, record, now_ns)
                 continue
             changed = True
             if kind == "wish":
@@ -190,8 +190,8 @@ class LeaseTable:
         for name in ended[: max(0, len(ended) - MAX_ENDED)]:
             del self._members[name]
 
-    def _take_in_member(self, name: str, record: Record, now_ns: int) -> bool:
-        """Take in the record of a member; return whether it is more than a renewal."""
+    def _apply_member(self, name: str, record: Record, now_ns: int) -> bool:
+        """Apply the record of a member; return whether it is more than a renewal."""
         known = self._members.get(name)
         if name == self.member or (known is not None and record.revision <= known.revision):
             return False
@@ -231,11 +231,11 @@ class LeaseTable:
         ]
 
     def holds(self, partition: int) -> bool:
-        """Whether sessions of a partition may begin here; may be called by any thread."""
+        """Return whether sessions of a partition may begin here; may be called by any thread."""
         return partition in self.held and partition not in self.leaving
 
     def taken(self, partition: int, instance: str | None = None) -> bool:
-        """Whether another living member holds a partition, of any instance or of one."""
+        """Return whether another living member holds a partition, of any instance or of one."""
         _, holder = self._partitions.get(partition, (0, NOBODY))
         known = self._members.get(holder)
         return known is not None and known.alive and instance in {None, instance_of(holder)}
@@ -300,7 +300,7 @@ class LeaseTable:
         ]
 
     def written(self, write: Write, revision: int | None) -> None:
-        """Take in what became of a write; None: refused, what is there instead comes with `take_in`."""
+        """Apply the result of a write; None: refused, the record that is there comes with `apply`."""
         if revision is None:
             return
         self._done_when = None
@@ -311,7 +311,7 @@ class LeaseTable:
             self._set(int(name), revision, write.value)
 
     def gone(self, key: str) -> None:
-        """Take in that the store has lost a record: the next write of it replaces none."""
+        """Note that the store has lost a record: the next write of it replaces none."""
         kind, _, name = key.partition("/")
         self._done_when = None
         if kind == "partition":

@@ -144,7 +144,7 @@ class Member:
 
     @property
     def strained(self) -> bool:
-        """Whether its record is renewed late: what can wait is not to begin now, for it would delay that more.
+        """Whether its renewals are late; optional work is to be deferred.
 
         Where every renewal takes so long, that is so only while nothing may be published.
         """
@@ -158,7 +158,7 @@ class Member:
         return set(self._table.held.copy())
 
     def holds(self, stream: str) -> bool:
-        """Whether a session of a stream may begin here."""
+        """Return whether a session of a stream may begin here."""
         return self._table.holds(partition_of(stream))
 
     def fence(self, stream: str) -> int | None:
@@ -166,16 +166,16 @@ class Member:
         return self._table.held.get(partition_of(stream))
 
     def may_write(self, stream: str, fence: int | None) -> bool:
-        """Whether what was made under a fence may be published and saved now."""
+        """Return whether the results of a fence may be published and saved now."""
         held = self._table.held.get(partition_of(stream))
         return fence is not None and fence == held and self._clock() < self._may_write_until_ns
 
     def look(self) -> None:
-        """Have the member look soon: a state is kept."""
+        """Wake the thread: a state is kept."""
         self._wake.set()
 
     def bring(self, stream: str, timeout: float) -> bool:
-        """Have the partition of a stream brought here, to stay; False when it has not come in time (s).
+        """Get the partition of a stream, to stay; return False when it has not come in time (s).
 
         Raises:
             StoreError: the wish could not be written.
@@ -262,7 +262,7 @@ class Member:
             return
         self._write_again()
         records, now_ns = self._store.follow(self._table.position), self._clock()
-        self._table.take_in(records, now_ns)
+        self._table.apply(records, now_ns)
         # At the same time: after a pause of the machine in between all the others would look frozen.
         for write in self._table.due(now_ns, self._occupied, self._store.gone):
             if not self._keep():
@@ -331,11 +331,11 @@ class Member:
                 self._table.written(write, revision)
                 self._renewed.add(partition)
             elif (found := self._store.get(write.key)) is not None:
-                self._table.take_in([found], self._clock())
+                self._table.apply([found], self._clock())
             self._gone.discard(partition)
 
     def _time_renewal(self, sent_ns: int) -> None:
-        """See whether a renewal that has just been answered was in time."""
+        """Note whether a renewal that has just been answered was in time."""
         now_ns = self._clock()
         if now_ns - sent_ns <= self._lease_ns // STRAINED:
             self._in_time_ns = now_ns
@@ -381,7 +381,7 @@ class Member:
         self._failing, self._error = True, error
 
     def _settle(self) -> None:
-        """Tell what has changed."""
+        """Report changes of partitions."""
         held, leaving = dict(self._table.held), set(self._table.leaving)
         reported, self._reported = self._reported, held
         if held != reported:
@@ -404,7 +404,7 @@ class Member:
             log.info("partitions_held", held=shown[1], of=PARTITIONS, members=[instance_of(name) for name in shown[0]])
 
     def _end(self) -> None:
-        """Say that this member has ended: its partitions are free then. What is to be kept has been saved."""
+        """Write that this member has ended: its partitions are free then. All checkpoints have been saved."""
         self._may_write_until_ns = 0
         key = member_key(self._table.member)
         if self._revision and self._store.put(Write(key, ENDED, self._revision)) is None:

@@ -190,12 +190,12 @@ class MessageLog:
         self._missing_until: dict[Topic, float] = {}
 
     def look_again(self) -> None:
-        """Have `ready` ask the servers again: they may have come back without their files."""
+        """Forget which logs are there: the servers may have come back without their files."""
         self._there.clear()
         self._missing_until.clear()
 
     async def ready(self, topic: Topic, keep: Retention) -> None:
-        """Have a log there that keeps so much.
+        """Create a log that keeps so much, or change one.
 
         Raises:
             NatsError: the servers cannot be reached, or do not answer.
@@ -520,7 +520,7 @@ class LogWriter:
         return self._connection.failure or self._failure
 
     def put(self, message: LogMessage) -> None:
-        """Have a message written; never waits."""
+        """Queue a message; never waits."""
         with self._lock:
             wakes = not self._waiting
             self._waiting.append(message)
@@ -534,7 +534,7 @@ class LogWriter:
             self._connection.soon(self._came.set)
 
     def idle(self) -> bool:
-        """Whether all that was put has been written, or lost."""
+        """Return whether all messages have been written, or lost."""
         with self._lock:
             return not self.held_bytes
 
@@ -543,7 +543,7 @@ class LogWriter:
         self._running.cancel()
 
     def _take(self) -> LogMessage:
-        """Take the oldest that waits; called with the lock."""
+        """Remove the oldest message from the queue; called with the lock."""
         message = self._waiting.popleft()
         self.held_bytes -= _size(message)
         return message
@@ -583,7 +583,7 @@ class LogWriter:
         return True
 
     def _next(self) -> list[LogMessage]:
-        """Take what is to be written at once; its bytes still count."""
+        """Remove the messages to write at once from the queue; their bytes still count."""
         with self._lock:
             return [self._waiting.popleft() for _ in range(min(self._at_once, len(self._waiting)))]
 
@@ -621,7 +621,7 @@ class LogWriter:
         return failed
 
     def _go_on(self) -> None:
-        """Take the servers for sound, unless what failed before may be among the messages that wait."""
+        """End the failure, unless the message that failed may still be in the queue."""
         if self._at_once == AT_ONCE or not self._waiting:
             self._works()
 

@@ -140,16 +140,16 @@ class NatsConnection:
         return "" if self._client.is_connected else self._why
 
     def soon(self, callback: Callable[[], object]) -> None:
-        """Have something called on the loop, without waiting for it."""
+        """Call something on the loop, without waiting for it."""
         with contextlib.suppress(RuntimeError):  # it has closed
             self._loop.call_soon_threadsafe(callback)
 
     def start(self, work: Coroutine[Any, Any, _T]) -> Future[_T]:
-        """Have the loop do something, without waiting for it."""
+        """Run a coroutine on the loop, without waiting for it."""
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def call(self, work: Coroutine[Any, Any, _T], calls: float = 1.0) -> _T:
-        """Have the loop do something that takes as long as so many calls, and wait for it.
+        """Run a coroutine on the loop that takes as long as so many calls, and wait for it.
 
         Raises:
             StoreError: it could not be done in time.

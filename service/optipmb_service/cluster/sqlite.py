@@ -101,7 +101,7 @@ class MemberLocks:
         self._file: IO[bytes] | None = None
 
     def is_free(self, member: str) -> bool:
-        """Whether nobody holds the lock of a member. A file that is missing says nothing about its process."""
+        """Return whether nobody holds the lock of a member. A file that is missing says nothing about its process."""
         if member == self._member or self._folder is None:
             return False
         try:
@@ -154,7 +154,7 @@ class MemberLocks:
 
 
 def in_use(path: Path) -> bool:
-    """Whether a member lives that keeps its leases beside a file of checkpoints."""
+    """Return whether a member lives that keeps its leases beside a file of checkpoints."""
     for lock in path.with_name(MEMBERS).glob("*"):
         with contextlib.suppress(OSError):  # it has gone meanwhile
             if _locked(lock):
@@ -272,7 +272,7 @@ class Database:
 
     @staticmethod
     def _begin_log(connection: sqlite3.Connection) -> None:
-        """Have the journal be a write-ahead log; SQLite itself does not wait there for a process that does the same."""
+        """Make the journal a write-ahead log; SQLite itself does not wait there for a process that does the same."""
         until_s = time.monotonic() + BUSY_S
         while True:
             try:
@@ -297,7 +297,7 @@ class Database:
 
     @contextlib.contextmanager
     def use(self) -> Iterator[sqlite3.Connection]:
-        """Have the connection for one's own.
+        """Use the connection exclusively.
 
         Raises:
             StoreError: whatever is wrong with it.
@@ -311,7 +311,7 @@ class Database:
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """Do all of it or nothing; the write lock is taken first, so that no reader has to become a writer halfway."""
+        """Open a transaction; the write lock is taken first, so that no reader has to become a writer halfway."""
         with self.use() as opened:
             connection = opened
             connection.execute("BEGIN IMMEDIATE")
@@ -330,7 +330,7 @@ class Database:
 
 
 def _is_damaged(file: Path) -> bool:
-    """Whether a file is no database, or not whole."""
+    """Return whether a file is no database, or not whole."""
     if not file.exists():
         return False
     with contextlib.closing(sqlite3.connect(file, timeout=BUSY_S)) as connection:
@@ -403,7 +403,7 @@ class SqliteStore:
         return int(last) + 1
 
     def gone(self, member: str) -> bool:
-        """Whether nobody holds the lock of a member. A file that is missing says nothing about its process."""
+        """Return whether nobody holds the lock of a member. A file that is missing says nothing about its process."""
         return self._locks.is_free(member)
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
@@ -485,7 +485,7 @@ class SqliteStore:
 
 
 def _some(left: Iterator[tuple[str, Fenced]]) -> list[tuple[str, Fenced]]:
-    """Take as many checkpoints as one transaction may have."""
+    """Return as many checkpoints as one transaction may have."""
     some: list[tuple[str, Fenced]] = []
     size = 0
     for one in islice(left, SLICE):

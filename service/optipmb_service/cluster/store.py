@@ -1,4 +1,4 @@
-"""Where leases and checkpoints are kept: the port `LeaseStore`; its adapters are `sqlite` and `jetstream`.
+"""Store of leases and checkpoints: the port `LeaseStore`; its adapters are `sqlite` and `jetstream`.
 
 A store holds records and bytes and knows nothing of what they mean. Of every stream it keeps the newest two
 checkpoints: when the newest turns out to be torn, it is set aside (kept for whoever wants to know why, never deleted by
@@ -69,7 +69,7 @@ class LeaseStore(Protocol):
         """Write a record; return its revision, None when the one to be replaced is not the newest."""
 
     def gone(self, member: str) -> bool:
-        """Whether the process of a member that has written its record has ended for certain."""
+        """Return whether the process of a member that has written its record has ended for certain."""
 
     def save(self, checkpoints: Mapping[str, Fenced]) -> frozenset[str]:
         """Write the newest checkpoints of streams; return those that were refused for their fence."""

@@ -132,7 +132,7 @@ class Limiter:
         self._dropped: Counter[str] = Counter()
 
     def __call__(self, _logger: WrappedLogger, _method: str, event: EventDict) -> EventDict:
-        """Let a line pass, or drop it.
+        """Return a line, or drop it.
 
         Raises:
             structlog.DropEvent: it is one too many.
