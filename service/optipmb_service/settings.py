@@ -4,8 +4,7 @@ A TOML file, over it the environment, over that the options of the command line.
 and the name in capitals, nested names after ``__`` (``OPTIPMB_LIMITS__MAX_BYTES``); lists are written with commas
 there, tables as JSON.
 
-Times are in seconds. Every setting is described where it stands; `docs/operation.md` prints the same table, and so does
-``optipmb-service config``.
+Times are in seconds. Every setting is described by its docstring, which `docs/operation.md` prints.
 """
 
 from __future__ import annotations
@@ -108,11 +107,16 @@ class LimitSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    max_bytes: int = Field(default=DEFAULT.max_bytes, ge=1024, le=2**30, description="bytes of a msgpack payload")
-    max_json_bytes: int = Field(default=2**21, ge=1024, le=2**30, description="bytes of a JSON payload")
-    max_values: int = Field(default=2**17, ge=64, description="values of one message, each number of a list among them")
-    max_points: int = Field(default=DEFAULT.max_points, ge=0, description="points of one cloud")
-    max_detections: int = Field(default=DEFAULT.max_detections, ge=1, description="detections of one frame")
+    max_bytes: int = Field(default=DEFAULT.max_bytes, ge=1024, le=2**30)
+    """bytes of a msgpack payload"""
+    max_json_bytes: int = Field(default=2**21, ge=1024, le=2**30)
+    """bytes of a JSON payload"""
+    max_values: int = Field(default=2**17, ge=64)
+    """values of one message, each number of a list among them"""
+    max_points: int = Field(default=DEFAULT.max_points, ge=0)
+    """points of one cloud"""
+    max_detections: int = Field(default=DEFAULT.max_detections, ge=1)
+    """detections of one frame"""
 
     def limits(self) -> Limits:
         """Return the limits for the decoder."""
@@ -127,19 +131,24 @@ class Ros2Stream(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    detections: Topic = Field(min_length=1, description="topic of the detections")
+    detections: Topic = Field(min_length=1)
+    """topic of the detections"""
     type: Literal[
         "vision_msgs/msg/Detection3DArray",
         "autoware_perception_msgs/msg/DetectedObjects",
         "autoware_auto_perception_msgs/msg/DetectedObjects",
-    ] = Field(default="vision_msgs/msg/Detection3DArray", description="type of the detections")
-    points: Topic = Field(default="", description="topic of the point clouds")
-    tracks: Topic = Field(
-        default="", description="topic of the tracks; default: `/tracks` below that of the detections"
-    )
-    classes: dict[str, str] = Field(default_factory=dict, description="class names by those in the messages")
-    covariance: bool = Field(default=False, description="use the covariances of the detections' positions")
-    fixed: bool = Field(default=False, description="the sensor does not move and its frame is the world")
+    ] = "vision_msgs/msg/Detection3DArray"
+    """type of the detections"""
+    points: Topic = ""
+    """topic of the point clouds"""
+    tracks: Topic = ""
+    """topic of the tracks; default: `/tracks` below that of the detections"""
+    classes: dict[str, str] = Field(default_factory=dict)
+    """class names by those in the messages"""
+    covariance: bool = False
+    """use the covariances of the detections' positions"""
+    fixed: bool = False
+    """the sensor does not move and its frame is the world"""
 
     @property
     def tracks_topic(self) -> str:
@@ -161,15 +170,20 @@ class Ros2Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    domain: int = Field(default=0, ge=0, le=232, description="`ROS_DOMAIN_ID` of the system")
-    node: str = Field(default="optipmb", pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="name of the ROS 2 node")
-    fixed_frame: str = Field(default="", description="frame of the tracks; default: the root of tf")
-    odometry: Topic = Field(default="", description="topic of `nav_msgs/Odometry`, for poses that tf has not")
-    tf_wait_s: float = Field(default=0.5, ge=0, le=60, description="longest wait of a message for its transform")
-    diagnostics: Topic = Field(default="/diagnostics", description="topic of `diagnostic_msgs/DiagnosticArray`")
-    streams: Annotated[dict[str, Ros2Stream], AfterValidator(_streams)] = Field(
-        default_factory=dict, description="topics by stream (`site/node/sensor`)"
-    )
+    domain: int = Field(default=0, ge=0, le=232)
+    """`ROS_DOMAIN_ID` of the system"""
+    node: str = Field(default="optipmb", pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")
+    """name of the ROS 2 node"""
+    fixed_frame: str = ""
+    """frame of the tracks; default: the root of tf"""
+    odometry: Topic = ""
+    """topic of `nav_msgs/Odometry`, for poses that tf has not"""
+    tf_wait_s: float = Field(default=0.5, ge=0, le=60)
+    """longest wait of a message for its transform"""
+    diagnostics: Topic = "/diagnostics"
+    """topic of `diagnostic_msgs/DiagnosticArray`"""
+    streams: Annotated[dict[str, Ros2Stream], AfterValidator(_streams)] = Field(default_factory=dict)
+    """topics by stream (`site/node/sensor`)"""
 
 
 def _default_instance() -> str:
@@ -199,243 +213,140 @@ class Settings(BaseSettings):
         frozen=True, extra="forbid", env_prefix=PREFIX, env_nested_delimiter="__", allow_inf_nan=False
     )
 
-    instance: str = Field(
-        default_factory=_default_instance,
-        pattern=r"^[A-Za-z0-9_.-]{1,64}$",
-        description="name of this instance; default: the host's name, the process number and six random digits",
-    )
-    prefix: Prefix = Field(default="optipmb/v1", description="first chunks of every key")
-    router: bool | None = Field(
-        default=None,
-        description="run a Zenoh router in this process; default: yes unless `connect` is given",
-    )
-    listen: Endpoints | None = Field(
-        default=None, description=f"endpoints to listen on; default: `{DEFAULT_LISTEN}` as a router, none as a client"
-    )
-    connect: Endpoints = Field(default=(), description="endpoints of routers to connect to; retried without end")
-    zenoh_config: Path | None = Field(
-        default=None,
-        description="Zenoh configuration file (JSON5): TLS, access control, limits of a router; settings override it",
-    )
-    shared_memory: bool = Field(
-        default=False,
-        description="Zenoh's shared memory: faster for clouds on one host, but may lose messages, and leaves files in"
-        " /dev/shm after a kill",
-    )
-    profile: str = Field(
-        default="generic", min_length=1, description="profile name or TOML file, where no pattern matches"
-    )
-    profiles: dict[str, str] = Field(
-        default_factory=dict,
-        description="profiles by stream pattern (as `site/*/lidar*`); the first match applies",
-    )
-    fuse: Patterns = Field(
-        default=(),
-        description="patterns of streams (as `site/*/lidar*`) that feed one session per node, `site/node/fused`",
-    )
-    cloud_wait_s: float = Field(default=0.1, ge=0, le=60, description="longest wait of a frame for its cloud")
-    cloud_memory_s: float = Field(
-        default=2.0,
-        ge=0,
-        le=3600,
-        description="frames without `has_points` wait for a cloud if one came within this time, in stamps",
-    )
-    gap_limit_s: float = Field(
-        default=5.0,
-        gt=0,
-        le=86400,
-        description="a larger step of the stamps, forward or back, on which three frames agree, restarts the session",
-    )
-    rewind_s: float = Field(
-        default=1.0,
-        ge=0,
-        le=60,
-        description="sensor time within which a late frame is inserted and tracks are corrected; 0: never",
-    )
-    late_clouds: bool = Field(
-        default=False, description="a cloud that comes after its frame was tracked corrects the tracks"
-    )
-    recovery_wait_s: float = Field(
-        default=2.0,
-        ge=0,
-        le=60,
-        description="longest wait for the publisher's cache after a restart",
-    )
-    max_speed: float = Field(
-        default=100.0,
-        ge=0,
-        le=1e6,
-        description="highest speed of a sensor, m/s; poses beyond it are refused; 0: no check",
-    )
-    queue_frames: int = Field(
-        default=1024,
-        ge=1,
-        le=65536,
-        description="frames waiting per stream, as many as a publisher's cache may send at once after an outage; then"
-        " the oldest is dropped",
-    )
-    queue_clouds: int = Field(
-        default=16,
-        ge=1,
-        le=1024,
-        description="clouds waiting per stream, and as many in its session; then the oldest is dropped",
-    )
-    workers: int = Field(default=1, ge=1, le=64, description="processes that share the streams; 1: this process alone")
-    max_pairs: int = Field(
-        default=20_000,
-        ge=100,
-        le=10_000_000,
-        description="pairs of nearby objects in a frame, a microsecond each; a frame with more is refused",
-    )
-    step_limit_s: float = Field(
-        default=0.5,
-        gt=0,
-        le=60,
-        description="processor time of a message; a stream that takes more is refused for nine times as long",
-    )
-    stream_mb: int = Field(
-        default=128,
-        ge=4,
-        le=65536,
-        description="megabytes per stream, a quarter each for waiting messages, clouds, held frames and the window;"
-        " then the oldest are dropped",
-    )
-    memory_mb: int = Field(
-        default=1024,
-        ge=16,
-        le=1_048_576,
-        description="megabytes of messages per process, half of them waiting; then messages are dropped, and the least"
-        " recently used sessions closed",
-    )
-    max_sessions: int = Field(
-        default=1000, ge=1, le=10_000, description="streams tracked at once; further ones are refused"
-    )
-    node_sessions: int = Field(
-        default=64, ge=0, le=100_000, description="the same of one node (`site/node`); 0: no limit"
-    )
-    node_rate: int = Field(default=2000, ge=0, le=1_000_000, description="messages a second of one node; 0: no limit")
-    node_mb_s: int = Field(default=500, ge=0, le=100_000, description="megabytes a second of one node; 0: no limit")
-    site_sessions: int = Field(default=0, ge=0, le=100_000, description="the same of one site; 0: no limit")
-    site_rate: int = Field(default=0, ge=0, le=1_000_000, description="messages a second of one site; 0: no limit")
-    site_mb_s: int = Field(default=0, ge=0, le=100_000, description="megabytes a second of one site; 0: no limit")
-    keep_days: float = Field(
-        default=30.0,
-        ge=0,
-        le=36_500,
-        description="checkpoints of a stream silent for this long are deleted; 0: never",
-    )
-    idle_s: float = Field(default=600.0, gt=0, description="a session without messages for this long is freed")
-    cluster: Servers = Field(
-        default=(),
-        description="NATS servers, as `nats://10.0.0.1:4222`, by which instances on many machines share streams",
-    )
-    cluster_tls: Path | None = Field(
-        default=None,
-        description="folder with `ca.pem`, the authority of `tls://` servers, and `cert.pem` and `key.pem` where they"
-        " ask for a certificate; default: the system's authorities",
-    )
-    cluster_credentials: Path | None = Field(
-        default=None,
-        description="file with the credentials of a NATS user (`.creds`), `user:password`, or a token",
-    )
-    store: str = Field(
-        default="",
-        description="folder of checkpoints and quarantined sessions; `none`: nothing is kept; default: one named after"
-        " prefix and endpoint in `$STATE_DIRECTORY`, else in `optipmb` under `$XDG_STATE_HOME` or `~/.local/state`",
-    )
-    checkpoint_s: float = Field(
-        default=1.0, ge=0.05, le=3600, description="time between checkpoints of a changed session"
-    )
-    lease_s: float = Field(
-        default=3.0,
-        ge=0.5,
-        le=60,
-        description="a process that is frozen or cut off for this long loses its streams to the others",
-    )
-    standby_s: float = Field(
-        default=10.0,
-        ge=0,
-        le=600,
-        description="how long messages of streams that others track are kept for a takeover; longer than `lease_s` and"
-        " `checkpoint_s` together; with `cluster` also how far back the log is read without a checkpoint",
-    )
-    standby_mb: int = Field(
-        default=256,
-        ge=1,
-        le=65536,
-        description="megabytes kept so; clouds are dropped first",
-    )
-    log_s: float = Field(
-        default=600.0,
-        ge=10,
-        le=864_000,
-        description="age up to which `optipmb-service log` keeps detections, for a successor",
-    )
-    log_mb: int = Field(default=1024, ge=16, le=1_048_576, description="megabytes of these; the oldest go first")
-    log_tracks_s: float = Field(
-        default=3600.0,
-        ge=0,
-        le=8_640_000,
-        description="age up to which it keeps tracks, for `q/tracks`; 0: none",
-    )
-    log_tracks_mb: int = Field(default=1024, ge=16, le=1_048_576, description="megabytes of these; the oldest go first")
-    stale_s: float = Field(default=2.0, gt=0, description="a stream without frames for this long is logged as stale")
-    stuck_s: float = Field(
-        default=5.0,
-        ge=1,
-        le=600,
-        description="a thread busy with one task, or a worker silent, for this long is stuck: the process is not"
-        " healthy, the worker is replaced",
-    )
-    restart_keys: int = Field(
-        default=50_000,
-        ge=100,
-        le=60_000,
-        description="keys declared on the network after which a process restarts, its sessions continue from the store:"
-        " Zenoh has 65,535 for the life of a process, and each stream that opens takes up to 5",
-    )
-    grace_s: float = Field(default=1.0, ge=0, le=60, description="at shutdown, time for frames already received")
-    http: Address = Field(
-        default="",
-        description="address of health, metrics and live page, as `127.0.0.1:8080`",
-    )
-    http_hosts: Names = Field(
-        default=(),
-        description="host names with a dot by which the page may be asked for, besides addresses and names without;"
-        " `*`: any",
-    )
-    http_streams: int = Field(
-        default=100, ge=0, le=10_000, description="streams with series of their own in the metrics, by name"
-    )
-    grpc: Address = Field(default="", description="address of the gRPC server, as `127.0.0.1:50051`")
-    grpc_tls: Path | None = Field(
-        default=None,
-        description="folder with `key.pem`, `cert.pem` and `ca.pem` for gRPC: callers need a certificate of that"
-        " authority, by whose name they have rights; default: no TLS, all may do everything",
-    )
-    grpc_names: Path | None = Field(
-        default=None, description="JSON list of the names that may call; default: all with a certificate or token"
-    )
-    grpc_tokens: str = Field(
-        default="",
-        pattern=r"^([A-Za-z_][\w.]*:[A-Za-z_]\w*)?$",
-        description="`module:function` that finds the caller's name in the metadata of a call",
-    )
-    grpc_calls: int = Field(
-        default=1000, ge=1, le=100_000, description="gRPC calls open at once; further ones are refused"
-    )
-    grpc_connections: int = Field(
-        default=10_000,
-        ge=1,
-        le=1_000_000,
-        description="gRPC connections open at once, fewer by the limit of open files; further ones are closed",
-    )
-    log_format: Literal["console", "json"] = Field(default="console", description="form of the log lines on stderr")
-    log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="lowest level that is logged"
-    )
-    ros2: Ros2Settings = Field(default=Ros2Settings(), description="topics of ROS 2, for `optipmb-service ros2`")
-    limits: LimitSettings = Field(default=LimitSettings(), description="bounds on what one message may hold")
+    instance: str = Field(default_factory=_default_instance, pattern=r"^[A-Za-z0-9_.-]{1,64}$")
+    """name of this instance; default: the host's name, the process number and six random digits"""
+    prefix: Prefix = "optipmb/v1"
+    """first chunks of every key"""
+    router: bool | None = None
+    """run a Zenoh router in this process; default: yes unless `connect` is given"""
+    listen: Endpoints | None = None
+    """endpoints to listen on; default: `tcp/127.0.0.1:7447` as a router, none as a client"""
+    connect: Endpoints = ()
+    """endpoints of routers to connect to; retried without end"""
+    zenoh_config: Path | None = None
+    """Zenoh configuration file (JSON5): TLS, access control, limits of a router; settings override it"""
+    shared_memory: bool = False
+    """Zenoh's shared memory: faster for clouds on one host, but may lose messages, and leaves files in /dev/shm after a
+    kill"""
+    profile: str = Field(default="generic", min_length=1)
+    """profile name or TOML file, where no pattern matches"""
+    profiles: dict[str, str] = Field(default_factory=dict)
+    """profiles by stream pattern (as `site/*/lidar*`); the first match applies"""
+    fuse: Patterns = ()
+    """patterns of streams (as `site/*/lidar*`) that feed one session per node, `site/node/fused`"""
+    cloud_wait_s: float = Field(default=0.1, ge=0, le=60)
+    """longest wait of a frame for its cloud"""
+    cloud_memory_s: float = Field(default=2.0, ge=0, le=3600)
+    """frames without `has_points` wait for a cloud if one came within this time, in stamps"""
+    gap_limit_s: float = Field(default=5.0, gt=0, le=86400)
+    """a larger step of the stamps, forward or back, on which three frames agree, restarts the session"""
+    rewind_s: float = Field(default=1.0, ge=0, le=60)
+    """sensor time within which a late frame is inserted and tracks are corrected; 0: never"""
+    late_clouds: bool = False
+    """a cloud that comes after its frame was tracked corrects the tracks"""
+    recovery_wait_s: float = Field(default=2.0, ge=0, le=60)
+    """longest wait for the publisher's cache after a restart"""
+    max_speed: float = Field(default=100.0, ge=0, le=1e6)
+    """highest speed of a sensor, m/s; poses beyond it are refused; 0: no check"""
+    queue_frames: int = Field(default=1024, ge=1, le=65536)
+    """frames waiting per stream, as many as a publisher's cache may send at once after an outage; then the oldest is
+    dropped"""
+    queue_clouds: int = Field(default=16, ge=1, le=1024)
+    """clouds waiting per stream, and as many in its session; then the oldest is dropped"""
+    workers: int = Field(default=1, ge=1, le=64)
+    """processes that share the streams; 1: this process alone"""
+    max_pairs: int = Field(default=20_000, ge=100, le=10_000_000)
+    """pairs of nearby objects in a frame, a microsecond each; a frame with more is refused"""
+    step_limit_s: float = Field(default=0.5, gt=0, le=60)
+    """processor time of a message; a stream that takes more is refused for nine times as long"""
+    stream_mb: int = Field(default=128, ge=4, le=65536)
+    """megabytes per stream, a quarter each for waiting messages, clouds, held frames and the window; then the oldest
+    are dropped"""
+    memory_mb: int = Field(default=1024, ge=16, le=1_048_576)
+    """megabytes of messages per process, half of them waiting; then messages are dropped, and the least recently used
+    sessions closed"""
+    max_sessions: int = Field(default=1000, ge=1, le=10_000)
+    """streams tracked at once; further ones are refused"""
+    node_sessions: int = Field(default=64, ge=0, le=100_000)
+    """the same of one node (`site/node`); 0: no limit"""
+    node_rate: int = Field(default=2000, ge=0, le=1_000_000)
+    """messages a second of one node; 0: no limit"""
+    node_mb_s: int = Field(default=500, ge=0, le=100_000)
+    """megabytes a second of one node; 0: no limit"""
+    site_sessions: int = Field(default=0, ge=0, le=100_000)
+    """the same of one site; 0: no limit"""
+    site_rate: int = Field(default=0, ge=0, le=1_000_000)
+    """messages a second of one site; 0: no limit"""
+    site_mb_s: int = Field(default=0, ge=0, le=100_000)
+    """megabytes a second of one site; 0: no limit"""
+    keep_days: float = Field(default=30.0, ge=0, le=36_500)
+    """checkpoints of a stream silent for this long are deleted; 0: never"""
+    idle_s: float = Field(default=600.0, gt=0)
+    """a session without messages for this long is freed"""
+    cluster: Servers = ()
+    """NATS servers, as `nats://10.0.0.1:4222`, by which instances on many machines share streams"""
+    cluster_tls: Path | None = None
+    """folder with `ca.pem`, the authority of `tls://` servers, and `cert.pem` and `key.pem` where they ask for a
+    certificate; default: the system's authorities"""
+    cluster_credentials: Path | None = None
+    """file with the credentials of a NATS user (`.creds`), `user:password`, or a token"""
+    store: str = ""
+    """folder of checkpoints and quarantined sessions; `none`: nothing is kept; default: one named after prefix and
+    endpoint in `$STATE_DIRECTORY`, else in `optipmb` under `$XDG_STATE_HOME` or `~/.local/state`"""
+    checkpoint_s: float = Field(default=1.0, ge=0.05, le=3600)
+    """time between checkpoints of a changed session"""
+    lease_s: float = Field(default=3.0, ge=0.5, le=60)
+    """a process that is frozen or cut off for this long loses its streams to the others"""
+    standby_s: float = Field(default=10.0, ge=0, le=600)
+    """how long messages of streams that others track are kept for a takeover; longer than `lease_s` and `checkpoint_s`
+    together; with `cluster` also how far back the log is read without a checkpoint"""
+    standby_mb: int = Field(default=256, ge=1, le=65536)
+    """megabytes kept so; clouds are dropped first"""
+    log_s: float = Field(default=600.0, ge=10, le=864_000)
+    """age up to which `optipmb-service log` keeps detections, for a successor"""
+    log_mb: int = Field(default=1024, ge=16, le=1_048_576)
+    """megabytes of these; the oldest go first"""
+    log_tracks_s: float = Field(default=3600.0, ge=0, le=8_640_000)
+    """age up to which it keeps tracks, for `q/tracks`; 0: none"""
+    log_tracks_mb: int = Field(default=1024, ge=16, le=1_048_576)
+    """megabytes of these; the oldest go first"""
+    stale_s: float = Field(default=2.0, gt=0)
+    """a stream without frames for this long is logged as stale"""
+    stuck_s: float = Field(default=5.0, ge=1, le=600)
+    """a thread busy with one task, or a worker silent, for this long is stuck: the process is not healthy, the worker
+    is replaced"""
+    restart_keys: int = Field(default=50_000, ge=100, le=60_000)
+    """keys declared on the network after which a process restarts, its sessions continue from the store: Zenoh has
+    65,535 for the life of a process, and each stream that opens takes up to 5"""
+    grace_s: float = Field(default=1.0, ge=0, le=60)
+    """at shutdown, time for frames already received"""
+    http: Address = ""
+    """address of health, metrics and live page, as `127.0.0.1:8080`"""
+    http_hosts: Names = ()
+    """host names with a dot by which the page may be asked for, besides addresses and names without; `*`: any"""
+    http_streams: int = Field(default=100, ge=0, le=10_000)
+    """streams with series of their own in the metrics, by name"""
+    grpc: Address = ""
+    """address of the gRPC server, as `127.0.0.1:50051`"""
+    grpc_tls: Path | None = None
+    """folder with `key.pem`, `cert.pem` and `ca.pem` for gRPC: callers need a certificate of that authority, by whose
+    name they have rights; default: no TLS, all may do everything"""
+    grpc_names: Path | None = None
+    """JSON list of the names that may call; default: all with a certificate or token"""
+    grpc_tokens: str = Field(default="", pattern=r"^([A-Za-z_][\w.]*:[A-Za-z_]\w*)?$")
+    """`module:function` that finds the caller's name in the metadata of a call"""
+    grpc_calls: int = Field(default=1000, ge=1, le=100_000)
+    """gRPC calls open at once; further ones are refused"""
+    grpc_connections: int = Field(default=10_000, ge=1, le=1_000_000)
+    """gRPC connections open at once, fewer by the limit of open files; further ones are closed"""
+    log_format: Literal["console", "json"] = "console"
+    """form of the log lines on stderr"""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """lowest level that is logged"""
+    ros2: Ros2Settings = Ros2Settings()
+    """topics of ROS 2, for `optipmb-service ros2`"""
+    limits: LimitSettings = LimitSettings()
+    """bounds on what one message may hold"""
 
     @property
     def is_router(self) -> bool:
