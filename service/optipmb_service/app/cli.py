@@ -50,10 +50,7 @@ NATS: Final = "nats-server"
 NATS_PAYLOAD_MB: Final = 8
 """Largest message; a checkpoint may have three quarters of it. NATS' default, one, is too little for many objects."""
 
-app = typer.Typer(
-    add_completion=False,
-    rich_markup_mode=None,
-)
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 class RouterOptions(TypedDict, total=False):
@@ -218,29 +215,27 @@ def router_command(**given: Unpack[RouterOptions]) -> None:
 @_taking(GatewayOptions)
 def grpc_command(**given: Unpack[GatewayOptions]) -> None:
     """Run a gRPC gateway alone, a client of routers. Prints one line, `ready …`; SIGINT and SIGTERM end it."""
-    settings = _begin(_load(given, grpc=DEFAULT_GRPC, connect=[DEFAULT_LISTEN]))
+    settings = _client(given, grpc=DEFAULT_GRPC)
     _needed("optipmb_service.grpc.server", "grpc")
-    leave_or_restart(asyncio.run(edges.run_gateway(settings.model_copy(update={"router": False, "listen": ()}))))
+    leave_or_restart(asyncio.run(edges.run_gateway(settings)))
 
 
 @app.command("ros2")
 @_taking(RouterOptions)
 def ros2_command(**given: Unpack[RouterOptions]) -> None:
     """Run a bridge to ROS 2 (rmw_zenoh) alone, a client of routers. SIGINT and SIGTERM end it. See docs/ros2.md."""
-    settings = _begin(_load(given, connect=[DEFAULT_LISTEN]))
+    settings = _client(given)
     if not settings.ros2.streams:
         _wrong("setting ros2.streams: expected a table of streams and their topics in --settings, received none")
-    run = _needed("optipmb_service.app.ros2", "ros2").run
-    leave_or_restart(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+    leave_or_restart(asyncio.run(_needed("optipmb_service.app.ros2", "ros2").run(settings)))
 
 
 @app.command("log")
 @_taking(LogOptions)
 def log_command(**given: Unpack[LogOptions]) -> None:
     """Put detections and tracks into the log of a cluster, a client of routers. SIGINT and SIGTERM end it."""
-    settings = _begin(_load(given, connect=[DEFAULT_LISTEN], cluster=[f"nats://{DEFAULT_NATS}"]))
-    run = _needed("optipmb_service.app.log_bridge", "cluster").run
-    leave_or_restart(asyncio.run(run(settings.model_copy(update={"router": False, "listen": ()}))))
+    settings = _client(given, cluster=[f"nats://{DEFAULT_NATS}"])
+    leave_or_restart(asyncio.run(_needed("optipmb_service.app.log_bridge", "cluster").run(settings)))
 
 
 @app.command("nats")
@@ -340,6 +335,12 @@ def _begin(loaded: Loaded) -> Settings:
     if loaded.settings.unprotected:
         log.warning("unprotected", addresses=loaded.settings.unprotected)
     return loaded.settings
+
+
+def _client(given: Mapping[str, Any], **defaults: Any) -> Settings:
+    """Return the settings of a process that is a client of routers."""
+    settings = _begin(_load(given, connect=[DEFAULT_LISTEN], **defaults))
+    return settings.model_copy(update={"router": False, "listen": ()})
 
 
 def _needed(module: str, extra: str) -> Any:

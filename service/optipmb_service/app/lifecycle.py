@@ -26,7 +26,7 @@ import threading
 import time
 import traceback
 from concurrent.futures import Future
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar
 
 import structlog
 from optipmb_schemas.installation import install_command
@@ -196,7 +196,7 @@ class Steps:
         return bool(names)
 
 
-def leave_or_restart(status: int) -> None:
+def leave_or_restart(status: int) -> NoReturn:
     """End the process, or begin it again in its place, with its id and what it was started with."""
     if status == RESTART:
         sys.stdout.flush()
@@ -205,7 +205,7 @@ def leave_or_restart(status: int) -> None:
     leave(status)
 
 
-def leave(status: int) -> None:
+def leave(status: int) -> NoReturn:
     """End the process; at once where a daemon thread is left.
 
     It may be stuck in machine code, which would crash an orderly end. The thread of a bound is among them: after an

@@ -76,7 +76,6 @@ CREATE TABLE IF NOT EXISTS aside (
     number INTEGER PRIMARY KEY, stream TEXT NOT NULL, reason TEXT NOT NULL, data BLOB NOT NULL
 );
 CREATE TABLE IF NOT EXISTS written (stream TEXT PRIMARY KEY, at REAL NOT NULL);
-DROP TABLE IF EXISTS records;
 """
 
 _OLD_MEMBERS: Final = """
@@ -244,9 +243,7 @@ class Database:
         if path is None or self._found() == self._opened:
             return connection
         path.parent.mkdir(parents=True, exist_ok=True)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            fcntl.flock(folder, fcntl.LOCK_EX)  # of several processes one makes it
+        with _exclusive(path.parent):  # of several processes one makes it
             if self._found() is None:
                 copy = path.with_name(f"{path.name}.new")
                 for one in (copy, *(path.with_name(f"{path.name}{end}") for end in ("-wal", "-shm"))):
@@ -259,8 +256,6 @@ class Database:
                     connection.execute("ROLLBACK")
             connection.close()
             self._open()
-        finally:
-            os.close(folder)
         log.warning("store_deleted", file=str(path))
         self._restored()
         return self._connected()
@@ -451,11 +446,9 @@ class SqliteStore:
         return tuple(row[0] for row in rows)
 
     def expire(self, age_s: float) -> int:
-        """Forget some streams of which nothing was saved for so long; one of an earlier version counts from now."""
-        now_s = self._clock()
+        """Forget some streams of which nothing was saved for so long; return how many."""
         with self._checkpoints.transaction() as connection:
-            connection.execute("INSERT OR IGNORE INTO written SELECT DISTINCT stream, ? FROM checkpoints", (now_s,))
-            old = connection.execute(_SILENT, (now_s - age_s, SLICE)).fetchall()
+            old = connection.execute(_SILENT, (self._clock() - age_s, SLICE)).fetchall()
             connection.executemany("DELETE FROM checkpoints WHERE stream = ?", old)
             connection.executemany("DELETE FROM written WHERE stream = ?", old)
         return len(old)
@@ -505,17 +498,22 @@ def _leases_beside(path: Path, restored: Callable[[], None]) -> Database:
     file, members = path.with_name(LEASES), path.with_name(MEMBERS)
     try:
         members.mkdir(exist_ok=True)
-        folder = os.open(members, os.O_RDONLY)
-    except OSError as error:
-        raise StoreError(f"{members}: {error}") from error
-    try:
-        fcntl.flock(folder, fcntl.LOCK_EX)  # of two that begin, one looks and replaces
-        if _is_damaged(file) and not in_use(path):
-            log.warning("leases_damaged", file=str(file))
-            for one in (file, *(file.with_name(f"{LEASES}{end}") for end in ("-wal", "-shm"))):
-                one.unlink(missing_ok=True)
-        return Database(file, _RECORDS, "OFF", restored=restored)
+        with _exclusive(members):  # of two that begin, one looks and replaces
+            if _is_damaged(file) and not in_use(path):
+                log.warning("leases_damaged", file=str(file))
+                for one in (file, *(file.with_name(f"{LEASES}{end}") for end in ("-wal", "-shm"))):
+                    one.unlink(missing_ok=True)
+            return Database(file, _RECORDS, "OFF", restored=restored)
     except OSError as error:
         raise StoreError(f"{file}: {error}") from error
+
+
+@contextlib.contextmanager
+def _exclusive(folder: Path) -> Iterator[None]:
+    """Lock a folder against other processes that do the same."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
     finally:
-        os.close(folder)
+        os.close(descriptor)
