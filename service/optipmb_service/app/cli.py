@@ -26,7 +26,6 @@ from optipmb_service import __version__
 from optipmb_service.app import edges, health_command
 from optipmb_service.app.lifecycle import leave_or_restart
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.observability import logs
 from optipmb_service.settings import (
     DEFAULT_GRPC,
     DEFAULT_LISTEN,
@@ -39,6 +38,7 @@ from optipmb_service.settings import (
     state_home,
     without_password,
 )
+from optipmb_service.telemetry import logs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

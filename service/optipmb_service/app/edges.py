@@ -13,14 +13,14 @@ import structlog
 
 from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import say_ready, settle
-from optipmb_service.observability.health import Reporter
-from optipmb_service.observability.metrics import GATEWAY_METRICS
+from optipmb_service.telemetry.health import Reporter
+from optipmb_service.telemetry.metrics import GATEWAY_METRICS
 from optipmb_service.zenoh import Router
 
 if TYPE_CHECKING:
     from optipmb_service.app.lifecycle import StopRequest
-    from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")

@@ -33,11 +33,11 @@ from optipmb_schemas.installation import install_command
 
 from optipmb_service import __version__
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.observability import logs
-from optipmb_service.observability.certificates import Certificates
-from optipmb_service.observability.health import BEAT_S, ProcessHealth
-from optipmb_service.observability.metrics import GATEWAY_METRICS, NETWORK_METRICS, TLS_METRICS, Metrics
 from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.telemetry import logs
+from optipmb_service.telemetry.certificates import Certificates
+from optipmb_service.telemetry.health import BEAT_S, ProcessHealth
+from optipmb_service.telemetry.metrics import GATEWAY_METRICS, NETWORK_METRICS, TLS_METRICS, Metrics
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.connection import LISTENING, certificates_of
 

@@ -18,17 +18,17 @@ from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import say_ready, settle
 from optipmb_service.app.storage import nats_access
 from optipmb_service.cluster.message_log import LogMessage, LogWriter, MessageLog, Retention
-from optipmb_service.observability.health import Reporter
-from optipmb_service.observability.metrics import LOG_METRICS, PROBLEM_METRICS
-from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.kept_tracks import order_of
 from optipmb_service.session.problems import problem_of
+from optipmb_service.telemetry.health import Reporter
+from optipmb_service.telemetry.metrics import LOG_METRICS, PROBLEM_METRICS
+from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 
 if TYPE_CHECKING:
     from optipmb_service.app.lifecycle import StopRequest
     from optipmb_service.cluster.message_log import Topic
-    from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.zenoh.client import Client, Message
 
 log = structlog.get_logger("optipmb_service")

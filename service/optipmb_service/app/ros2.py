@@ -21,20 +21,20 @@ from optipmb_schemas.ros2.types import own_types
 
 from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import say_ready, unless
-from optipmb_service.observability.health import BEAT_S, STUCK_S, Reporter
 from optipmb_service.ros2 import graph
 from optipmb_service.ros2.bridge import Bridge
 from optipmb_service.ros2.diagnostics import DIAGNOSTICS, diagnostics
 from optipmb_service.ros2.matching import Matching, Wanted
 from optipmb_service.runtime.ports import TransportError
+from optipmb_service.telemetry.health import BEAT_S, STUCK_S, Reporter
 from optipmb_service.zenoh.ros2 import Ros2Node
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.app.lifecycle import StopRequest
-    from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.health import ProcessHealth
     from optipmb_service.zenoh.client import Message, Outgoing
     from optipmb_service.zenoh.subscription import Subscription
 

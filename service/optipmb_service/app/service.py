@@ -21,15 +21,6 @@ from optipmb_service import __version__
 from optipmb_service.app.lifecycle import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
 from optipmb_service.app.storage import open_log, open_store
 from optipmb_service.cluster.member import Member
-from optipmb_service.observability.health import Reporter
-from optipmb_service.observability.metrics import (
-    NETWORK_METRICS,
-    PROBLEM_METRICS,
-    STREAM_METRICS,
-    Metrics,
-    StreamFigures,
-)
-from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.intake import Intake
 from optipmb_service.runtime.kept_tracks import RecentTracks
 from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter, NoPersistence
@@ -41,6 +32,15 @@ from optipmb_service.runtime.stream_queries import StreamQueries
 from optipmb_service.runtime.track_query import TrackQuery
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import SECOND
+from optipmb_service.telemetry.health import Reporter
+from optipmb_service.telemetry.metrics import (
+    NETWORK_METRICS,
+    PROBLEM_METRICS,
+    STREAM_METRICS,
+    Metrics,
+    StreamFigures,
+)
+from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.zenoh import Transport
 
 if TYPE_CHECKING:

@@ -29,14 +29,14 @@ import optipmb
 from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import grpc_edge, leave, say_ready, settle, unless, watch_keys
 from optipmb_service.app.service import Service
-from optipmb_service.observability import logs
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.settings import Settings
+from optipmb_service.telemetry import logs
 
 if TYPE_CHECKING:
     from optipmb_service.app.lifecycle import StopRequest
-    from optipmb_service.observability.health import ProcessHealth
     from optipmb_service.runtime.context import Actor
+    from optipmb_service.telemetry.health import ProcessHealth
 
 log = structlog.get_logger("optipmb_service")
 

@@ -33,21 +33,21 @@ from optipmb_service import __version__
 from optipmb_service.app import lifecycle
 from optipmb_service.app.lifecycle import LATE_S, RESTART, SLICE_S, grpc_edge, say_ready, unless, watch_keys
 from optipmb_service.cluster.leases import ALIVE, instance_of
-from optipmb_service.observability.health import BEAT_S, Reporter
-from optipmb_service.observability.metrics import NETWORK_METRICS
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.requests import guarded, problem_with
 from optipmb_service.runtime.service_queries import TEXT, UNDRAINED, drain_asked, move_asked
+from optipmb_service.telemetry.health import BEAT_S, Reporter
+from optipmb_service.telemetry.metrics import NETWORK_METRICS
 from optipmb_service.zenoh import Transport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from optipmb_service.app.lifecycle import StopRequest
-    from optipmb_service.observability.health import ProcessHealth
-    from optipmb_service.observability.metrics import Metrics
     from optipmb_service.runtime.ports import Request
     from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.health import ProcessHealth
+    from optipmb_service.telemetry.metrics import Metrics
 
 log = structlog.get_logger("optipmb_service")
 

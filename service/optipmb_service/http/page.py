@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from starlette.requests import Request
     from starlette.types import Receive, Scope, Send
 
-    from optipmb_service.observability.health import ProcessHealth
+    from optipmb_service.telemetry.health import ProcessHealth
 
 PERIOD_S: Final = 0.1
 """A viewer gets no more than one frame in this time."""

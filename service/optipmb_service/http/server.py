@@ -23,8 +23,8 @@ from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from optipmb_service.http.page import page
-from optipmb_service.observability.metrics import CONTENT_TYPE
 from optipmb_service.runtime.ports import HttpError
+from optipmb_service.telemetry.metrics import CONTENT_TYPE
 
 if TYPE_CHECKING:
     import asyncio
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from starlette.requests import Request
     from starlette.types import ASGIApp, Receive, Scope, Send
 
-    from optipmb_service.observability.health import ProcessHealth
+    from optipmb_service.telemetry.health import ProcessHealth
 
 GRACE_S: Final = 1
 """How long an answer under way may take at the end."""

@@ -8,8 +8,8 @@ from typing import Any
 
 from optipmb_schemas import DrainRequest, Keys, encode, encoding_of
 from optipmb_service.app.workers import AggregateView, Worker
-from optipmb_service.observability.metrics import Metrics
 from optipmb_service.settings import load
+from optipmb_service.telemetry.metrics import Metrics
 
 KEYS = Keys()
 HANGS_S = 60.0

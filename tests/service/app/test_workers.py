@@ -13,9 +13,9 @@ import pytest
 from optipmb_service.app import workers
 from optipmb_service.app.lifecycle import EndBound, StopRequest
 from optipmb_service.app.workers import Supervisor, Worker, serve_workers
-from optipmb_service.observability.health import ProcessHealth
-from optipmb_service.observability.metrics import Metrics
 from optipmb_service.settings import load
+from optipmb_service.telemetry.health import ProcessHealth
+from optipmb_service.telemetry.metrics import Metrics
 from unbounded import NO_BOUND
 
 if TYPE_CHECKING:

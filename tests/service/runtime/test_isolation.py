@@ -28,8 +28,6 @@ from optipmb_service.app.storage import STORE_FILE
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.cluster.member import Member
 from optipmb_service.cluster.sqlite import SqliteStore
-from optipmb_service.observability.health import ProcessHealth
-from optipmb_service.observability.metrics import Metrics
 from optipmb_service.runtime import persistence, stream_queries
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.mailbox import Mailbox
@@ -40,6 +38,8 @@ from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import MAX_COUNT, SECOND
 from optipmb_service.settings import LimitSettings
+from optipmb_service.telemetry.health import ProcessHealth
+from optipmb_service.telemetry.metrics import Metrics
 from router import Node, Sensor, until
 
 import optipmb

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.observability.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
-from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
@@ -19,6 +17,8 @@ from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session.pending import CloudBuffer
 from optipmb_service.session.problems import problem_of
 from optipmb_service.settings import SettingsInvalidError, load
+from optipmb_service.telemetry.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
+from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Sensor
 
 import optipmb

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from optipmb_service.observability.metrics import METRICS, SECONDS, Collected, Metrics, families
+from optipmb_service.telemetry.metrics import METRICS, SECONDS, Collected, Metrics, families
 from prometheus_client import CollectorRegistry, Histogram, generate_latest
 
 DURATIONS = (0.0, 1e-9, 0.0005, 0.00051, 0.001, 0.0999, 0.1, 1.0, 5.0, 5.1, 1e9)

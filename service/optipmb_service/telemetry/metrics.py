@@ -24,7 +24,7 @@ from prometheus_client.metrics_core import Metric
 from prometheus_client.samples import Sample
 
 from optipmb_service import __version__
-from optipmb_service.observability.logs import lines_dropped
+from optipmb_service.telemetry.logs import lines_dropped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     import optipmb
-    from optipmb_service.observability.problem_reporter import ProblemReporter
     from optipmb_service.session.values import MessageCounters
+    from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 log = structlog.get_logger("optipmb_service")
 

@@ -10,15 +10,15 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
-from optipmb_service.observability.metrics import PROCESS_METRICS
+from optipmb_service.telemetry.metrics import PROCESS_METRICS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     import optipmb_schemas as schemas
 
-    from optipmb_service.observability.certificates import Certificates
-    from optipmb_service.observability.metrics import Metrics
+    from optipmb_service.telemetry.certificates import Certificates
+    from optipmb_service.telemetry.metrics import Metrics
 
 
 BEAT_S: Final = 0.5
