@@ -34,9 +34,7 @@ from pydantic_settings import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-PREFIX: Final = "OPTIPMB_"
-"""Of environment variables."""
-
+PREFIX: Final = "OPTIPMB_"  # of environment variables
 RUN: Final = secrets.token_hex(3)
 """Tells this process from one with its number in another container that has the host's name."""
 

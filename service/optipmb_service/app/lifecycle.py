@@ -49,46 +49,20 @@ if TYPE_CHECKING:
     from optipmb_service.settings import Settings
     from optipmb_service.zenoh.key_numbers import KeyCount
 
-HANDOVER_S: Final = 4.0
-"""At the end, how long other members may take to have the streams; it takes a second."""
-
-CLOSE_S: Final = 3.0
-"""At the end, how long a process may take to close, beyond handover and grace."""
-
-SPARE_S: Final = 1.0
-"""Beyond these, before a process that has not ended is ended."""
-
-LAST_S: Final = 0.5
-"""Part of the bound that is kept for logging what hung."""
-
-STEP_S: Final = 1.0
-"""How long the other steps of an end wait for one that may hang."""
-
-SLICE_S: Final = 0.25
-"""The time of an end is counted in slices of so long."""
-
-LATE_S: Final = 2.0
-"""What wakes up so late was frozen, or starved, with all of its process."""
-
-END_HUNG: Final = 1
-"""Exit status of a process in which a step of the end hung."""
-
-RESTART: Final = 75
-"""Exit status of a process that has ended in order to begin again (sysexits.h: try again)."""
-
-SWITCH_S: Final = 0.0005
-"""By default it is ten times as long, and a frame that meets two other threads waits 10 ms."""
-
-KEYS_S: Final = 1.0
-"""Period of the check of declared keys."""
-
-GAINED: Final = 0.1
-"""Share of the declared keys that a restart gives back at least."""
-
+HANDOVER_S: Final = 4.0  # at the end, how long other members may take to have the streams; it takes a second
+CLOSE_S: Final = 3.0  # at the end, how long a process may take to close, beyond handover and grace
+SPARE_S: Final = 1.0  # beyond these, before a process that has not ended is ended
+LAST_S: Final = 0.5  # part of the bound that is kept for logging what hung
+STEP_S: Final = 1.0  # how long the other steps of an end wait for one that may hang
+SLICE_S: Final = 0.25  # the time of an end is counted in slices of so long
+LATE_S: Final = 2.0  # what wakes up so late was frozen, or starved, with all of its process
+END_HUNG: Final = 1  # exit status of a process in which a step of the end hung
+RESTART: Final = 75  # exit status of a process that has ended in order to begin again (sysexits.h: try again)
+SWITCH_S: Final = 0.0005  # by default it is ten times as long, and a frame that meets two other threads waits 10 ms
+KEYS_S: Final = 1.0  # period of the check of declared keys
+GAINED: Final = 0.1  # share of the declared keys that a restart gives back at least
 STDERR: Final = 2
-CALLS: Final = 6
-"""Calls that are logged of a thread: the innermost one, and those of this package."""
-
+CALLS: Final = 6  # calls that are logged of a thread: the innermost one, and those of this package
 PACKAGE: Final = __name__.partition(".")[0]
 
 log = structlog.get_logger("optipmb_service")

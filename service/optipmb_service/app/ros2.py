@@ -39,12 +39,8 @@ if TYPE_CHECKING:
     from optipmb_service.zenoh.subscription import Subscription
 
 QUEUE: Final = 2048
-QUEUE_BYTES: Final = 2**28
-"""Messages that wait for the working thread, and their bytes."""
-
-CACHE: Final = 400
-"""Detections of a stream kept for a service that restarts: 10 s at 20 Hz."""
-
+QUEUE_BYTES: Final = 2**28  # messages that wait for the working thread, and their bytes
+CACHE: Final = 400  # detections of a stream kept for a service that restarts: 10 s at 20 Hz
 DIAGNOSTICS_S: Final = 1.0
 TICK_S: Final = 0.02
 QUERY_S: Final = 2.0

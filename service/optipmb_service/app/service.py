@@ -58,14 +58,9 @@ log = structlog.get_logger("optipmb_service")
 
 DRAIN_POLL_S: Final = 0.01
 JOIN_S: Final = 0.3
-SAVE_S: Final = 0.5
-"""The last checkpoints have so long even where messages took all the time."""
-
-NAME_CHECK_NS: Final = 10_000_000_000
-"""How often another process of the same name is looked for."""
-
-LEASES_S: Final = 1.0
-"""What is left at the end to say that the leases are free, however long the checkpoints take."""
+SAVE_S: Final = 0.5  # the last checkpoints have so long even where messages took all the time
+NAME_CHECK_NS: Final = 10_000_000_000  # how often another process of the same name is looked for
+LEASES_S: Final = 1.0  # what is left at the end to say that the leases are free, however long the checkpoints take
 
 
 class Service(Reporter):

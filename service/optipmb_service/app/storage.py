@@ -31,8 +31,7 @@ STORE_FILE: Final = "sessions.db"
 CLOSE_S: Final = 5.0
 REACH_S: Final = 10.0
 AGAIN_S: Final = 0.05
-COPIED_AT_ONCE: Final = 32
-"""Checkpoints in memory while they are copied."""
+COPIED_AT_ONCE: Final = 32  # checkpoints in memory while they are copied
 
 
 def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, str | None]:

@@ -42,9 +42,7 @@ log = structlog.get_logger("optipmb_service")
 
 HOUSEKEEPING_S: Final = 0.5
 WRONG_USE: Final = 2
-LOCK: Final = "lock"
-"""File that one worker at a time holds while it compiles."""
-
+LOCK: Final = "lock"  # file that one worker at a time holds while it compiles
 UNUSED: Final = "scipy.linalg"
 COMPILER: Final = "libllvmlite"
 MAPS: Final = Path("/proc/self/maps")

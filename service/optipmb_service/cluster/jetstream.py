@@ -24,18 +24,12 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-BATCH: Final = 1024
-"""Records read at once."""
-
+BATCH: Final = 1024  # records read at once
 SAVED_AT_ONCE: Final = 8
 SAVED_IN_A_CALL: Final = 32
-MEMBER_TTL_S: Final = 3600
-"""Age at which the server forgets the record of a member that has ended."""
-
+MEMBER_TTL_S: Final = 3600  # age at which the server forgets the record of a member that has ended
 NOT_THE_NEWEST: Final = 10071
-UNDECIDED: Final = 10164
-"""Several servers have not agreed yet on a write that was asked for before."""
-
+UNDECIDED: Final = 10164  # several servers have not agreed yet on a write that was asked for before
 NOTHING_THERE: Final = 10037
 AGAIN_S: Final = 0.05
 

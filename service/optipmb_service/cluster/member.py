@@ -36,18 +36,10 @@ if TYPE_CHECKING:
 log = structlog.get_logger("optipmb_service")
 
 SECOND: Final = 1_000_000_000
-LOOKS_PER_LEASE: Final = 8
-"""Each with a renewal: a request to a store elsewhere takes a millisecond of processor."""
-
-LONGEST_LOOK_S: Final = 0.1
-"""Of a store on the same machine: how late a killed member may be noticed."""
-
-SHORT_LOOK_S: Final = 0.02
-"""While partitions change hands: each is held by nobody for as long."""
-
-RENEWALS_PER_LEASE: Final = 2 * LOOKS_PER_LEASE
-"""At most: so each look that is not a short one renews."""
-
+LOOKS_PER_LEASE: Final = 8  # each with a renewal: a request to a store elsewhere takes a millisecond of processor
+LONGEST_LOOK_S: Final = 0.1  # of a store on the same machine: how late a killed member may be noticed
+SHORT_LOOK_S: Final = 0.02  # while partitions change hands: each is held by nobody for as long
+RENEWALS_PER_LEASE: Final = 2 * LOOKS_PER_LEASE  # at most: so each look that is not a short one renews
 STRAINED: Final = 4
 """Part of a lease without a renewal from which on it is late; half a lease is the end of the write lease."""
 
@@ -58,11 +50,8 @@ UNLINKED_PER_LEASE: Final = 4
 """Part of a lease without a router from which on others are to have the partitions: most routers are back before."""
 
 WRITE_LEASES_PER_LEASE: Final = 2
-RETRY_S: Final = 0.1
-"""At the end, between two tries to say so."""
-
-FIRST_TURNS: Final = 3
-"""Turns in which who begins has ended those that are gone, and has all that is free."""
+RETRY_S: Final = 0.1  # at the end, between two tries to say so
+FIRST_TURNS: Final = 3  # turns in which who begins has ended those that are gone, and has all that is free
 
 
 class Member:

@@ -51,9 +51,7 @@ BACK_S: Final = 8.0
 """How far a reader looks back at first; four times as far each time, until what it finds is old enough."""
 
 FURTHER: Final = 4.0
-NEAR_S: Final = 2.0
-"""How near to the first message that is wanted a reader begins."""
-
+NEAR_S: Final = 2.0  # how near to the first message that is wanted a reader begins
 BATCH: Final = 128
 BATCH_BYTES: Final = 2**21
 MISSING_S: Final = 0.1
@@ -61,57 +59,36 @@ MISSING_S: Final = 0.1
 
 NO_LOG: Final = 10059
 TOO_LARGE: Final = 10054
-WRITTEN_NOW: Final = 10158
-"""Another bridge writes the same message, and several servers have not agreed on it yet."""
-
+WRITTEN_NOW: Final = 10158  # another bridge writes the same message, and several servers have not agreed on it yet
 AGAIN_S: Final = 0.05
-TRIES: Final = 40
-"""It is asked about so often before that is a failure."""
-
+TRIES: Final = 40  # it is asked about so often before that is a failure
 ID: Final = "Nats-Msg-Id"
 FRAME: Final = "Optipmb-Frame"
 ENCODING: Final = "Optipmb-Encoding"
 HEADERS: Final = len(b"NATS/1.0\r\n\r\n")
 
 
-READ_AT_ONCE: Final = 16
-"""Streams that are read at once."""
-
-READ_S: Final = 3.0
-"""Longest time for one stream, from its turn on."""
-
-WAIT_S: Final = 30.0
-"""Longest time in all, with what it waits for its turn."""
-
+READ_AT_ONCE: Final = 16  # streams that are read at once
+READ_S: Final = 3.0  # longest time for one stream, from its turn on
+WAIT_S: Final = 30.0  # longest time in all, with what it waits for its turn
 OUTAGE_S: Final = 30.0
 """How far a stream is read at most that has a position, by the log's own times, unless one without has it longer.
 
 To track more than that would keep the newest frames waiting for as long as they are of use.
 """
 
-MOST_BYTES: Final = 2**25
-"""Bytes of a stream that are given at once at most; the oldest frames go."""
-
+MOST_BYTES: Final = 2**25  # bytes of a stream that are given at once at most; the oldest frames go
 MOST_FRAMES: Final = 1024
 """Frames of a stream that are given at once at most: as many as a session holds while some are missing."""
 
 LOOK_AGAIN_S: Final = (0.3, 0.7)
 """When the log is read again for what was not there yet, after the first time and after that."""
 
-AT_ONCE: Final = 256
-"""Messages on their way to the servers at once."""
-
-HELD_BYTES: Final = 2**28
-"""Bytes that are held at most; the oldest messages go first."""
-
-OVERHEAD: Final = 512
-"""What a message takes beside its payload, nearly."""
-
-RETRY_S: Final = 0.5
-"""Between two tries."""
-
-ALONE_TRIES: Final = 5
-"""How often a message is tried alone that is not written by servers that work."""
+AT_ONCE: Final = 256  # messages on their way to the servers at once
+HELD_BYTES: Final = 2**28  # bytes that are held at most; the oldest messages go first
+OVERHEAD: Final = 512  # what a message takes beside its payload, nearly
+RETRY_S: Final = 0.5  # between two tries
+ALONE_TRIES: Final = 5  # how often a message is tried alone that is not written by servers that work
 
 
 class NotKeptError(Exception):

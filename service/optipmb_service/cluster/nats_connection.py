@@ -36,22 +36,13 @@ log = structlog.get_logger("optipmb_service")
 
 _T = TypeVar("_T")
 
-CALL_S: Final = 1.0
-"""How long the servers may take to answer; they take milliseconds."""
-
+CALL_S: Final = 1.0  # how long the servers may take to answer; they take milliseconds
 CONNECT_S: Final = 1
-RETRY_S: Final = 1
-"""Both in whole seconds, as NATS' client has them typed."""
-
-MANY: Final = 3
-"""Servers from which on everything is kept by three of them."""
-
-LEAST: Final = (2, 12)
-"""First version of the server that refuses a checkpoint for its fence."""
-
+RETRY_S: Final = 1  # both in whole seconds, as NATS' client has them typed
+MANY: Final = 3  # servers from which on everything is kept by three of them
+LEAST: Final = (2, 12)  # first version of the server that refuses a checkpoint for its fence
 EXISTS: Final = 10058
-ENDS: Final = frozenset({"204", "404"})
-"""Status that ends a batch: that was all, or there is nothing."""
+ENDS: Final = frozenset({"204", "404"})  # status that ends a batch: that was all, or there is nothing
 NOBODY: Final = "503"
 
 
@@ -61,8 +52,7 @@ KEY: Final = "key.pem"
 
 _JWT: Final = re.compile(r"-+BEGIN NATS USER JWT-+\s+(\S+)\s+-+END")
 _SEED: Final = re.compile(r"-+BEGIN USER NKEY SEED-+\s+(\S+)\s+-+END")
-_SEED_BYTES: Final = 36
-"""Of a user's seed: two that say what it is, the seed, a checksum."""
+_SEED_BYTES: Final = 36  # of a user's seed: two that say what it is, the seed, a checksum
 
 
 class RefusedError(Exception):
@@ -77,8 +67,7 @@ class RefusedError(Exception):
         self.code = error.get("err_code")
 
 
-ERRORS: Final = (NatsError, RefusedError, TimeoutError, OSError)
-"""Failures of a request to the servers."""
+ERRORS: Final = (NatsError, RefusedError, TimeoutError, OSError)  # failures of a request to the servers
 
 
 class NobodyAnswersError(NatsError):

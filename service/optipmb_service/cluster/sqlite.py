@@ -36,35 +36,19 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
-MEMBERS: Final = "members"
-"""Folder of the files whose locks say that members live."""
-
-BUSY_S: Final = 5.0
-"""How long a transaction waits for those of other processes; each takes milliseconds."""
-
+MEMBERS: Final = "members"  # folder of the files whose locks say that members live
+BUSY_S: Final = 5.0  # how long a transaction waits for those of other processes; each takes milliseconds
 BUSY_PAUSE_S: Final = 0.01
 
-LOG_BYTES: Final = 4 * 2**20
-"""Size of the write-ahead log from which its pages go into the file, and it begins anew."""
-
-ASIDE: Final = 64
-"""Torn checkpoints kept in all; beyond it the oldest go."""
-
-LEASES: Final = "leases.db"
-"""File of the records."""
-
+LOG_BYTES: Final = 4 * 2**20  # size of the write-ahead log from which its pages go into the file, and it begins anew
+ASIDE: Final = 64  # torn checkpoints kept in all; beyond it the oldest go
+LEASES: Final = "leases.db"  # file of the records
 ENDED_KEPT: Final = 64
 """Records of ended members that are kept; who has followed none of the later ones was ended itself."""
 
-SLICE: Final = 64
-"""Streams of one transaction."""
-
-SLICE_BYTES: Final = 4 * 2**20
-"""Bytes of checkpoints of one transaction; one checkpoint may have more."""
-
-PAGE_BYTES: Final = 32768
-"""Pages of the file of the checkpoints, each of which has tens of thousands of bytes."""
-
+SLICE: Final = 64  # streams of one transaction
+SLICE_BYTES: Final = 4 * 2**20  # bytes of checkpoints of one transaction; one checkpoint may have more
+PAGE_BYTES: Final = 32768  # pages of the file of the checkpoints, each of which has tens of thousands of bytes
 _RECORDS: Final = """
 CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, value TEXT NOT NULL, revision INTEGER NOT NULL) WITHOUT ROWID;
 """

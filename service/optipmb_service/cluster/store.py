@@ -13,11 +13,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-KEPT: Final = 2
-"""Checkpoints kept per stream."""
-
-ENDED: Final = "ended"
-"""What the record of a member says at last."""
+KEPT: Final = 2  # checkpoints kept per stream
+ENDED: Final = "ended"  # what the record of a member says at last
 
 
 class StoreError(Exception):

@@ -32,18 +32,12 @@ if TYPE_CHECKING:
 
     from optipmb_service.telemetry.health import ProcessHealth
 
-PERIOD_S: Final = 0.1
-"""A viewer gets no more than one frame in this time."""
-
+PERIOD_S: Final = 0.1  # a viewer gets no more than one frame in this time
 KEEP_ALIVE_S: Final = 5.0
 """A silent stream gets a sign of life, so that nobody in between takes the connection for dead."""
 
-RETRY_MS: Final = 15_000
-"""A viewer whose stream cannot be subscribed to comes back after so long."""
-
-VIEWERS: Final = 16
-"""Those who look at the same time; more are asked to come back."""
-
+RETRY_MS: Final = 15_000  # a viewer whose stream cannot be subscribed to comes back after so long
+VIEWERS: Final = 16  # those who look at the same time; more are asked to come back
 POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -59,14 +53,9 @@ FILES: Final = {"/": "index.html", "/look.js": "look.js", "/look.css": "look.css
 TYPES: Final = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
 
 
-_SENSORS: Final = 8
-"""Detections of so many sensors are kept for a viewer of tracks that several share."""
-
-_BYTES: Final = 2**22
-"""And so many bytes of them, or one message."""
-
-_MOST: Final = 1000
-"""Tracks, and detections, in one frame at most."""
+_SENSORS: Final = 8  # detections of so many sensors are kept for a viewer of tracks that several share
+_BYTES: Final = 2**22  # and so many bytes of them, or one message
+_MOST: Final = 1000  # tracks, and detections, in one frame at most
 
 Sample = tuple[bytes, str]
 """Payload and encoding."""

@@ -35,18 +35,10 @@ if TYPE_CHECKING:
 
     from optipmb_service.telemetry.health import ProcessHealth
 
-GRACE_S: Final = 1
-"""How long an answer under way may take at the end."""
-
-CONNECTIONS: Final = 256
-"""Open connections; a further one closes an idle one."""
-
-REQUESTS: Final = 64
-"""Requests answered at once, beside those of probes; more than the viewers of the page."""
-
-HEAD_S: Final = 5.0
-"""Longest time from the begin of a connection until its first request is complete."""
-
+GRACE_S: Final = 1  # how long an answer under way may take at the end
+CONNECTIONS: Final = 256  # open connections; a further one closes an idle one
+REQUESTS: Final = 64  # requests answered at once, beside those of probes; more than the viewers of the page
+HEAD_S: Final = 5.0  # longest time from the begin of a connection until its first request is complete
 KEEP_ALIVE_S: Final = 5
 HEAD_BYTES: Final = 16 * 1024
 
@@ -54,11 +46,8 @@ UNAVAILABLE: Final = 503
 MISDIRECTED: Final = 421
 ANY: Final = "*"
 
-PROBES: Final = frozenset({"/healthz", "/readyz"})
-"""Paths that are answered however many other requests are."""
-
-MONITORING: Final = PROBES | {"/metrics"}
-"""Paths that programs ask for, by whatever name the service has for them."""
+PROBES: Final = frozenset({"/healthz", "/readyz"})  # paths that are answered however many other requests are
+MONITORING: Final = PROBES | {"/metrics"}  # paths that programs ask for, by whatever name the service has for them
 
 
 def application(health: ProcessHealth, names: Collection[str] = ()) -> ASGIApp:

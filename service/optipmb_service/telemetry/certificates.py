@@ -18,9 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-LOOK_S: Final = 5.0
-"""Files are read again after so long."""
-
+LOOK_S: Final = 5.0  # files are read again after so long
 WARN_DAYS: Final = 7.0
 DAY_S: Final = 86_400.0
 

@@ -22,9 +22,7 @@ if TYPE_CHECKING:
 
 
 BEAT_S: Final = 0.5
-STUCK_S: Final = 10.0
-"""A loop that has not turned for so long is stuck."""
-
+STUCK_S: Final = 10.0  # a loop that has not turned for so long is stuck
 USABLE: Final = frozenset({"ready", "degraded"})
 
 

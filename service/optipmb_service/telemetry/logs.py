@@ -109,11 +109,8 @@ EVENTS: Final = {
 """Every event that is logged, and what an operator makes of it."""
 
 
-BURST: Final = 50
-"""Lines of one event that are written at once."""
-
-LINES_PER_SECOND: Final = 5.0
-"""Lines of one event that are written in the long run."""
+BURST: Final = 50  # lines of one event that are written at once
+LINES_PER_SECOND: Final = 5.0  # lines of one event that are written in the long run
 
 
 class Limiter:
@@ -151,11 +148,8 @@ class Limiter:
         return event
 
 
-QUEUE_BYTES: Final = 4 * 2**20
-"""Lines that wait for the reader of stderr."""
-
-CLOSE_S: Final = 0.5
-"""How long the end of a process waits for the last lines to be written."""
+QUEUE_BYTES: Final = 4 * 2**20  # lines that wait for the reader of stderr
+CLOSE_S: Final = 0.5  # how long the end of a process waits for the last lines to be written
 
 
 class LineWriter:

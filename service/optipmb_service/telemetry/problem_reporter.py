@@ -22,12 +22,8 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
-MAX_KINDS: Final = 4096
-"""Kinds of problems remembered for their rate."""
-
-NEWEST: Final = 20
-"""Problems kept for the status."""
-
+MAX_KINDS: Final = 4096  # kinds of problems remembered for their rate
+NEWEST: Final = 20  # problems kept for the status
 SECOND: Final = 1_000_000_000
 PUBLISH_EVERY_NS: Final = SECOND
 LOG_EVERY_NS: Final = 10 * SECOND
