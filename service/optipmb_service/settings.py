@@ -35,9 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 PREFIX: Final = "OPTIPMB_"  # of environment variables
-RUN: Final = secrets.token_hex(3)
-"""Tells this process from one with its number in another container that has the host's name."""
-
+RUN: Final = secrets.token_hex(3)  # tells this process from one with its number in a container of the same host name
 HOST_CHARACTERS: Final = 40
 
 DEFAULT_LISTEN: Final = "tcp/127.0.0.1:7447"

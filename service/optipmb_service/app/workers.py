@@ -54,9 +54,7 @@ log = structlog.get_logger("optipmb_service")
 FIRST_PAUSE_S: Final = 0.5
 LONGEST_PAUSE_S: Final = 30.0
 STEADY_S: Final = 10.0  # a worker that has lived for so long is started again at once if it dies
-START_S: Final = 900.0
-"""How long a worker may take to start: where the kernels are compiled, one compiles them and the others wait."""
-
+START_S: Final = 900.0  # longest start of a worker: one compiles the kernels, and the others wait
 WORKERS_S: Final = 2.0  # how much longer the end of a parent may take than that of its workers
 OWN_END_S: Final = 0.5  # how long a parent may take to end without workers: what is left of them before is killed
 ORDERLY: Final = frozenset({0, RESTART, -signal.SIGINT, -signal.SIGTERM})
@@ -65,9 +63,7 @@ ORDERLY: Final = frozenset({0, RESTART, -signal.SIGINT, -signal.SIGTERM})
 LINE_BYTES: Final = 1 << 20  # longest line between worker and parent
 ANSWER_S: Final = 1.0  # how long a worker may take to answer for its part
 MOVE_S: Final = 20.0  # how long a worker may take to have a stream brought to it
-QUERIES: Final = ("status", "metrics", "move", "drain")
-"""Queries that the parent answers for all workers; they answer the rest."""
-
+QUERIES: Final = ("status", "metrics", "move", "drain")  # answered for all workers; they answer the rest
 PROBLEMS: Final = 100
 SESSIONS: Final = 10_000
 

@@ -43,12 +43,8 @@ DRAINING: Final = "draining"  # what the record of a member says that gives its 
 UNLINKED: Final = "unlinked"  # the same of a member that has no router, so it neither receives nor publishes
 NOBODY: Final = ""
 
-LEAVE_LEASES: Final = 4
-"""Leases within which the sessions of a partition that is left must have been kept; then it is left without them."""
-
-WATCHED: Final = 2
-"""A pause between two looks at the records that is longer than a lease divided by this does not count as watching."""
-
+LEAVE_LEASES: Final = 4  # longest wait for the checkpoints of a partition that is left
+WATCHED: Final = 2  # a longer pause between looks than a lease divided by this is not watching
 LEFT_AT_ONCE: Final = 8  # partitions that a member leaves at the same time
 MAX_ENDED: Final = 1024  # members that have ended and are remembered
 

@@ -40,15 +40,9 @@ LOOKS_PER_LEASE: Final = 8  # each with a renewal: a request to a store elsewher
 LONGEST_LOOK_S: Final = 0.1  # of a store on the same machine: how late a killed member may be noticed
 SHORT_LOOK_S: Final = 0.02  # while partitions change hands: each is held by nobody for as long
 RENEWALS_PER_LEASE: Final = 2 * LOOKS_PER_LEASE  # at most: so each look that is not a short one renews
-STRAINED: Final = 4
-"""Part of a lease without a renewal from which on it is late; half a lease is the end of the write lease."""
-
-SLOW_LEASES: Final = 2
-"""Leases in which no renewal was in time: then it is the store that is slow, and waiting does not help."""
-
-UNLINKED_PER_LEASE: Final = 4
-"""Part of a lease without a router from which on others are to have the partitions: most routers are back before."""
-
+STRAINED: Final = 4  # part of a lease without a renewal from which on it is late
+SLOW_LEASES: Final = 2  # leases without a renewal in time: then the store is slow, and waiting does not help
+UNLINKED_PER_LEASE: Final = 4  # part of a lease without a router, before the partitions are given up
 WRITE_LEASES_PER_LEASE: Final = 2
 RETRY_S: Final = 0.1  # at the end, between two tries to say so
 FIRST_TURNS: Final = 3  # turns in which who begins has ended those that are gone, and has all that is free

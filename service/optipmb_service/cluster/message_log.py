@@ -44,19 +44,13 @@ log = structlog.get_logger("optipmb_service")
 
 Topic = Literal["detections", "tracks"]
 
-REPEATED_S: Final = 120
-"""Time within which the server drops a message that it has; later a copy is kept, which does no harm."""
-
-BACK_S: Final = 8.0
-"""How far a reader looks back at first; four times as far each time, until what it finds is old enough."""
-
+REPEATED_S: Final = 120  # window in which the server drops a copy; later ones are kept and do no harm
+BACK_S: Final = 8.0  # first look back of a reader; four times as far each time, until a message is old enough
 FURTHER: Final = 4.0
 NEAR_S: Final = 2.0  # how near to the first message that is wanted a reader begins
 BATCH: Final = 128
 BATCH_BYTES: Final = 2**21
-MISSING_S: Final = 0.1
-"""How long a log that is not there is not looked for again: without one, every new session would ask for it."""
-
+MISSING_S: Final = 0.1  # a missing log is not looked for again for so long: every new session would ask
 NO_LOG: Final = 10059
 TOO_LARGE: Final = 10054
 WRITTEN_NOW: Final = 10158  # another bridge writes the same message, and several servers have not agreed on it yet
@@ -78,12 +72,8 @@ To track more than that would keep the newest frames waiting for as long as they
 """
 
 MOST_BYTES: Final = 2**25  # bytes of a stream that are given at once at most; the oldest frames go
-MOST_FRAMES: Final = 1024
-"""Frames of a stream that are given at once at most: as many as a session holds while some are missing."""
-
-LOOK_AGAIN_S: Final = (0.3, 0.7)
-"""When the log is read again for what was not there yet, after the first time and after that."""
-
+MOST_FRAMES: Final = 1024  # frames given at once at most, as many as a session holds while some are missing
+LOOK_AGAIN_S: Final = (0.3, 0.7)  # pauses before the log is read again for what has come since
 AT_ONCE: Final = 256  # messages on their way to the servers at once
 HELD_BYTES: Final = 2**28  # bytes that are held at most; the oldest messages go first
 OVERHEAD: Final = 512  # what a message takes beside its payload, nearly

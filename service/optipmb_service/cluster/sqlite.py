@@ -43,9 +43,7 @@ BUSY_PAUSE_S: Final = 0.01
 LOG_BYTES: Final = 4 * 2**20  # size of the write-ahead log from which its pages go into the file, and it begins anew
 ASIDE: Final = 64  # torn checkpoints kept in all; beyond it the oldest go
 LEASES: Final = "leases.db"  # file of the records
-ENDED_KEPT: Final = 64
-"""Records of ended members that are kept; who has followed none of the later ones was ended itself."""
-
+ENDED_KEPT: Final = 64  # records of ended members; who has followed none of the later ones was ended itself
 SLICE: Final = 64  # streams of one transaction
 SLICE_BYTES: Final = 4 * 2**20  # bytes of checkpoints of one transaction; one checkpoint may have more
 PAGE_BYTES: Final = 32768  # pages of the file of the checkpoints, each of which has tens of thousands of bytes

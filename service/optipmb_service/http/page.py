@@ -33,9 +33,7 @@ if TYPE_CHECKING:
     from optipmb_service.telemetry.health import ProcessHealth
 
 PERIOD_S: Final = 0.1  # a viewer gets no more than one frame in this time
-KEEP_ALIVE_S: Final = 5.0
-"""A silent stream gets a sign of life, so that nobody in between takes the connection for dead."""
-
+KEEP_ALIVE_S: Final = 5.0  # period of signs of life of a silent stream, for what is in between
 RETRY_MS: Final = 15_000  # a viewer whose stream cannot be subscribed to comes back after so long
 VIEWERS: Final = 16  # those who look at the same time; more are asked to come back
 POLICY: Final = (
