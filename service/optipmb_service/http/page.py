@@ -138,13 +138,15 @@ class _Viewers:
         if release is None:
             return
         try:
+            heard = time.monotonic()
             yield ": hello\n\n"  # the headers go with the first piece: the viewer knows that it is connected
             while self._health.state() != "stopping":
                 if not await newest.came(PERIOD_S):
-                    if newest.silent_s > KEEP_ALIVE_S:
-                        newest.heard()
+                    if time.monotonic() - heard > KEEP_ALIVE_S:
+                        heard = time.monotonic()
                         yield ": silent\n\n"
                     continue
+                heard = time.monotonic()
                 text = live_frame(*newest.take())
                 if text is not None:
                     yield f"data: {text}\n\n"
@@ -174,7 +176,6 @@ class Newest:
         self._tracks: Sample | None = None
         self._detections: deque[Sample] = deque(maxlen=_SENSORS)
         self._event = asyncio.Event()
-        self._heard = time.monotonic()
 
     def put(self, topic: str, payload: bytes, encoding: str) -> None:
         """Take a message, on any thread."""
@@ -199,20 +200,10 @@ class Newest:
 
     def take(self) -> tuple[Sample | None, *tuple[Sample, ...]]:
         """Return the newest tracks, once, and the newest detections, the latest first."""
-        self.heard()
         with self._lock:
             self._event.clear()
             tracks, self._tracks = self._tracks, None
             return tracks, *self._detections
-
-    def heard(self) -> None:
-        """Begin to count silence anew."""
-        self._heard = time.monotonic()
-
-    @property
-    def silent_s(self) -> float:
-        """Seconds since something was taken."""
-        return time.monotonic() - self._heard
 
 
 def live_frame(tracks: Sample | None, *detections: Sample) -> str | None:
