@@ -20,7 +20,6 @@ import structlog
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from nats.aio.client import Client
 from nats.errors import Error as NatsError
-from nats.errors import NoRespondersError
 
 from optipmb_service.cluster.store import StoreError
 
@@ -119,11 +118,6 @@ class NatsConnection:
         self._connecting = self.start(self._connect())
 
     @property
-    def replicas(self) -> int:
-        """How many servers are to keep a JetStream stream."""
-        return MANY if len(self._servers) >= MANY else 1
-
-    @property
     def failure(self) -> str:
         """Why the servers cannot be reached; empty while they can."""
         return "" if self._client.is_connected else self._why
@@ -205,8 +199,9 @@ class NatsConnection:
 
     async def create(self, config: Mapping[str, Any]) -> None:
         """Create a JetStream stream, unless there is one of that name."""
+        replicas = MANY if len(self._servers) >= MANY else 1
         try:
-            await self.ask(f"STREAM.CREATE.{config['name']}", {**config, "num_replicas": self.replicas})
+            await self.ask(f"STREAM.CREATE.{config['name']}", {**config, "num_replicas": replicas})
         except RefusedError as refused:
             if refused.code != EXISTS:  # somebody who runs the servers may have changed it
                 raise
@@ -231,27 +226,24 @@ class NatsConnection:
     async def read(self, name: str, request: Mapping[str, Any]) -> list[Msg]:
         """Return the messages of a JetStream stream that a request names, from the server that is nearest."""
         client = self.client()
-        if "batch" not in request:
-            try:
-                return _answered(
-                    await client.request(f"$JS.API.DIRECT.GET.{name}", json.dumps(request).encode(), timeout=CALL_S)
-                )
-            except NoRespondersError as error:
-                raise NobodyAnswersError(f"nobody answers for {name}") from error
         inbox = client.new_inbox()
         subscription = await client.subscribe(inbox)
         messages: list[Msg] = []
         try:
             await client.publish(f"$JS.API.DIRECT.GET.{name}", json.dumps(request).encode(), reply=inbox)
-            while True:
+            while not messages or "batch" in request:
                 message = await subscription.next_msg(CALL_S)
-                if (message.headers or {}).get("Status") == NOBODY:
+                status = (message.headers or {}).get("Status")
+                if status in ENDS:
+                    break
+                if status == NOBODY:
                     raise NobodyAnswersError(f"nobody answers for {name}")
-                if not (found := _answered(message)):
-                    return messages
-                messages += found
+                if status is not None:
+                    raise NatsError(f"status {status}")
+                messages.append(message)
         finally:
             await subscription.unsubscribe()
+        return messages
 
     async def _connect(self) -> None:
         await self._client.connect(
@@ -272,20 +264,6 @@ class NatsConnection:
 
     async def _disconnected(self) -> None:
         self._lost()
-
-
-def _answered(message: Msg) -> list[Msg]:
-    """Return the message of an answer; none where its status says that there are no more.
-
-    Raises:
-        NatsError: the status says something else.
-    """
-    status = (message.headers or {}).get("Status")
-    if status is None:
-        return [message]
-    if status not in ENDS:
-        raise NatsError(f"status {status}")
-    return []
 
 
 def access(tls: Path | None, credentials: Path | None) -> dict[str, Any]:
