@@ -209,11 +209,7 @@ def _calls(frame: FrameType) -> str:
 
 
 class StopRequest:
-    """Request to end this process, by SIGINT, SIGTERM or a caller; to be made inside the loop.
-
-    Args:
-        bound: on the end, from when it is asked for.
-    """
+    """Request to end this process, by SIGINT, SIGTERM or a caller; begins the bound. To be made inside the loop."""
 
     def __init__(self, bound: EndBound) -> None:
         self.bound = bound
@@ -282,11 +278,6 @@ async def watch_keys(asked: StopRequest, used: Callable[[], KeyCount], most: int
     """Have the process begin again before its network session has no number for keys any more.
 
     It does not where that would give it few: what is open when it ends needs as many again.
-
-    Args:
-        asked: the end.
-        used: returns how many numbers are used.
-        most: how many may be used up.
     """
     while not asked.is_set():
         keys = used()
@@ -343,12 +334,7 @@ def _monitoring(settings: Settings, health: ProcessHealth) -> Iterator[None]:
 
 @contextlib.contextmanager
 def grpc_edge(settings: Settings, client: Client, metrics: Metrics) -> Iterator[None]:
-    """Serve gRPC beside a process, where that is asked for.
-
-    Args:
-        settings: address and certificates.
-        client: network.
-        metrics: of the process; get those of gRPC.
+    """Serve gRPC beside a process, where that is asked for, and add its metrics.
 
     Raises:
         EdgeError: it cannot be served.

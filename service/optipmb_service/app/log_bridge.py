@@ -40,12 +40,7 @@ MEGABYTE: Final = 2**20
 
 
 class LogBridge(Reporter):
-    """From a network into the log.
-
-    Args:
-        settings: what is kept, and for how long.
-        client: the network; closed by the caller, after this.
-    """
+    """From a network into the log; the client is closed by the caller, after this."""
 
     def __init__(self, settings: Settings, client: Client) -> None:
         self._client = client

@@ -49,12 +49,7 @@ MAPS: Final = Path("/proc/self/maps")
 
 
 class Parent:
-    """The parent, as a worker sees it.
-
-    Args:
-        index: which worker.
-        private: folder that the workers share.
-    """
+    """The parent, as the worker `index` sees it; `private` is a folder that the workers share."""
 
     def __init__(self, index: int, private: Path) -> None:
         self.index = index

@@ -140,13 +140,7 @@ class Worker:
 
 
 class Supervisor:
-    """The workers of one instance.
-
-    Args:
-        settings: settings of the workers, but for their names.
-        asked: the end.
-        private: folder that the workers share.
-    """
+    """The workers of one instance, with these settings but for their names, and a folder that they share."""
 
     def __init__(self, settings: Settings, asked: StopRequest, private: Path) -> None:
         self.workers = [Worker(index, self._change) for index in range(settings.workers)]
@@ -255,13 +249,7 @@ class Supervisor:
 class AggregateView(Reporter):
     """All workers of one instance: status and metrics asked of each and put together, and the moves.
 
-    A worker that does not answer in time is left out and makes the state `degraded`.
-
-    Args:
-        settings: of the instance.
-        supervisor: knows how the workers are.
-        network: where the workers are asked.
-        metrics: of the parent; get those of the workers.
+    A worker that does not answer in time is left out and makes the state `degraded`. Its metrics go to the parent's.
     """
 
     def __init__(self, settings: Settings, supervisor: Supervisor, network: Transport, metrics: Metrics) -> None:
@@ -465,12 +453,7 @@ async def serve_workers(
 
 
 def divided(settings: Settings, socket: str) -> tuple[Settings, Settings]:
-    """Return the settings of the parent and those of its workers, which have no names yet.
-
-    Args:
-        settings: of the whole.
-        socket: endpoint where the parent's router listens for the workers, where it is one.
-    """
+    """Return the settings of the parent, whose router listens at `socket`, and those of its workers without names."""
     router = settings.is_router
     own = settings.model_copy(update={"listen": (*settings.endpoints, socket) if router else settings.endpoints})
     workers = settings.model_copy(

@@ -70,11 +70,7 @@ _SILENT: Final = "SELECT stream FROM written WHERE at < ? LIMIT ?"
 
 
 class MemberLocks:
-    """The lock of the member of this process, and those of others.
-
-    Args:
-        folder: where they are; None: there are no others.
-    """
+    """The lock of the member of this process, and those of others, in a folder; None: there are no others."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder

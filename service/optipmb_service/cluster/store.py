@@ -91,14 +91,7 @@ _Torn = TypeVar("_Torn", bound=Exception)
 def load_newest(
     store: LeaseStore, stream: str, read: Callable[[bytes], _T], torn: type[_Torn], on_torn: Callable[[_Torn], None]
 ) -> _T | None:
-    """Return the newest checkpoint of a stream that can be read; what cannot is set aside.
-
-    Args:
-        store: where to look.
-        stream: whose.
-        read: makes the checkpoint of the bytes.
-        torn: what `read` raises.
-        on_torn: called with the error, each time.
+    """Return the newest checkpoint of a stream that `read` can read; one for which it raises `torn` is set aside.
 
     Raises:
         StoreError: the store cannot be read.

@@ -164,11 +164,7 @@ def _undo(tapped: asyncio.Future[Callable[[], None] | None]) -> None:
 
 
 class Newest:
-    """Keeps the newest message of each topic for one reader on an event loop; what nobody took is replaced.
-
-    Args:
-        loop: of the reader.
-    """
+    """The newest message of each topic for one reader on an event loop; what nobody took is replaced."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop

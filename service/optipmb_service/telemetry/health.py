@@ -66,12 +66,7 @@ class Reporter:
 
 
 class ProcessHealth:
-    """Health of one process; every method may be called by any thread and answers at once.
-
-    Args:
-        instance: name of the instance.
-        metrics: of the process.
-    """
+    """Health of one process; every method may be called by any thread and answers at once."""
 
     def __init__(self, instance: str, metrics: Metrics) -> None:
         self.instance = instance

@@ -117,9 +117,6 @@ class Limiter:
     """Drops lines of an event that comes too often; the next one that is written says how many (`suppressed`).
 
     A thousand streams that fall silent together must neither fill a disk nor hide what else happens.
-
-    Args:
-        clock: seconds, monotonic.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
