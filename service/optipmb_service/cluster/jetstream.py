@@ -118,18 +118,7 @@ class JetStream:
         client = self._connection.client()
         if not self._there:
             self.max_bytes = client.max_payload * 3 // 4 - 4096  # it is read as base64
-            await self._connection.create(
-                {
-                    "name": self._name,
-                    "subjects": [f"{self._name}.>"],
-                    "storage": "file",
-                    "retention": "limits",
-                    "discard": "old",
-                    "max_msgs_per_subject": KEPT,
-                    "allow_direct": True,
-                    "allow_msg_ttl": True,
-                }
-            )
+            await self._connection.create(self._name, {"max_msgs_per_subject": KEPT, "allow_msg_ttl": True})
             self._there = True
 
     async def _follow(self, after: int) -> list[Record]:

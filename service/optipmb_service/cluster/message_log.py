@@ -176,17 +176,7 @@ class MessageLog:
             "max_bytes": keep.size,
             "duplicate_window": round(min(REPEATED_S, keep.age_s or REPEATED_S) * 1e9),
         }
-        await self.connection.create(
-            {
-                "name": name,
-                "subjects": [f"{name}.>"],
-                "storage": "file",
-                "retention": "limits",
-                "discard": "old",
-                "allow_direct": True,
-                **bounds,
-            }
-        )
+        await self.connection.create(name, bounds)
         config = (await self.connection.ask(f"STREAM.INFO.{name}", {}))["config"]
         if any(config.get(one) != value for one, value in bounds.items()):
             await self.connection.ask(f"STREAM.UPDATE.{name}", {**config, **bounds})
@@ -202,11 +192,8 @@ class MessageLog:
         """
         subject, headers = self._subject(message.topic, message.stream), message.headers
         # The server closes the connection over a message that is too large with its headers; the client counts without.
-        size = (
-            len(message.payload)
-            + HEADERS
-            + sum(len(f"{name}: {value}\r\n".encode()) for name, value in headers.items())
-        )
+        size = HEADERS + len(message.payload)
+        size += sum(len(f"{name}: {value}\r\n".encode()) for name, value in headers.items())
         if size > (most := self.connection.client().max_payload):
             raise NotKeptError(f"{size} bytes with its headers, and the servers take {most} at once")
         for _ in range(TRIES):

@@ -197,11 +197,19 @@ class NatsConnection:
             raise NatsError(f"NATS {'.'.join(map(str, LEAST))} or newer is needed, this is {version}")
         return client
 
-    async def create(self, config: Mapping[str, Any]) -> None:
-        """Create a JetStream stream, unless there is one of that name."""
-        replicas = MANY if len(self._servers) >= MANY else 1
+    async def create(self, name: str, bounds: Mapping[str, Any]) -> None:
+        """Create a JetStream stream of what is published below its name, unless there is one."""
+        config = {
+            "name": name,
+            "subjects": [f"{name}.>"],
+            "storage": "file",
+            "retention": "limits",
+            "discard": "old",
+            "allow_direct": True,
+            "num_replicas": MANY if len(self._servers) >= MANY else 1,
+        }
         try:
-            await self.ask(f"STREAM.CREATE.{config['name']}", {**config, "num_replicas": replicas})
+            await self.ask(f"STREAM.CREATE.{name}", {**config, **bounds})
         except RefusedError as refused:
             if refused.code != EXISTS:  # somebody who runs the servers may have changed it
                 raise
