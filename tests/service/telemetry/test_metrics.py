@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from optipmb_service.observability.metrics import SECONDS, Collected, Metrics, families
+from optipmb_service.telemetry.metrics import METRICS, SECONDS, Collected, Metrics, families
 from prometheus_client import CollectorRegistry, Histogram, generate_latest
 
 DURATIONS = (0.0, 1e-9, 0.0005, 0.00051, 0.001, 0.0999, 0.1, 1.0, 5.0, 5.1, 1e9)
@@ -22,7 +23,9 @@ def filled() -> Metrics:
         metrics.tracks(started=2, ended=1)
     metrics.received("points", 10_000)
     metrics.restored()
-    metrics.add(lambda: [("stream_frames_total", ('a/b/"c\\\n',), 3), ("queue_frames", (), float("inf"))])
+    stream = SimpleNamespace(stream='a/b/"c\\\n', frames=3, queue=float("inf"))
+    table = {name: METRICS[name] for name in ("stream_frames_total", "queue_frames")}
+    metrics.add(table, lambda: SimpleNamespace(sessions=[stream], listed=[stream]))
     return metrics
 
 

@@ -109,20 +109,14 @@ EVENTS: Final = {
 """Every event that is logged, and what an operator makes of it."""
 
 
-BURST: Final = 50
-"""Lines of one event that are written at once."""
-
-LINES_PER_SECOND: Final = 5.0
-"""Lines of one event that are written in the long run."""
+BURST: Final = 50  # lines of one event that are written at once
+LINES_PER_SECOND: Final = 5.0  # lines of one event that are written in the long run
 
 
 class Limiter:
     """Drops lines of an event that comes too often; the next one that is written says how many (`suppressed`).
 
     A thousand streams that fall silent together must neither fill a disk nor hide what else happens.
-
-    Args:
-        clock: seconds, monotonic.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -132,7 +126,7 @@ class Limiter:
         self._dropped: Counter[str] = Counter()
 
     def __call__(self, _logger: WrappedLogger, _method: str, event: EventDict) -> EventDict:
-        """Let a line pass, or drop it.
+        """Return a line, or drop it.
 
         Raises:
             structlog.DropEvent: it is one too many.
@@ -151,11 +145,8 @@ class Limiter:
         return event
 
 
-QUEUE_BYTES: Final = 4 * 2**20
-"""Lines that wait for the reader of stderr."""
-
-CLOSE_S: Final = 0.5
-"""How long the end of a process waits for the last lines to be written."""
+QUEUE_BYTES: Final = 4 * 2**20  # lines that wait for the reader of stderr
+CLOSE_S: Final = 0.5  # how long the end of a process waits for the last lines to be written
 
 
 class LineWriter:
@@ -255,6 +246,10 @@ def configure(form: Literal["console", "json"], level: str, worker: int | None =
         level: the least that is logged.
         worker: number of the worker process, written into every line; None: it is none.
     """
+    global _writer  # noqa: PLW0603 - a process has one stderr
+    if _writer is None:
+        atexit.register(finish)
+    _writer = LineWriter(sys.stderr)
     processors: list[Processor] = [] if worker is None else [lambda _logger, _name, event: {**event, "worker": worker}]
     processors += [
         Limiter(),
@@ -271,18 +266,9 @@ def configure(form: Literal["console", "json"], level: str, worker: int | None =
     structlog.configure(
         processors=processors,
         wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
-        logger_factory=structlog.WriteLoggerFactory(file=_written()),
+        logger_factory=structlog.WriteLoggerFactory(file=cast("TextIO", _writer)),
     )
     logging.getLogger("optipmb").handlers = [_Library()]
-
-
-def _written() -> TextIO:
-    """Return what takes the lines of this process."""
-    global _writer  # noqa: PLW0603 - a process has one stderr
-    if _writer is None:
-        atexit.register(finish)
-    _writer = LineWriter(sys.stderr)
-    return cast("TextIO", _writer)
 
 
 class _Library(logging.Handler):
@@ -291,14 +277,3 @@ class _Library(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Log one of them."""
         structlog.get_logger("optipmb_service").warning("tracker_message", text=record.getMessage())
-
-
-def unknown_environment(names: tuple[str, ...]) -> None:
-    """Log environment variables that look like settings and are none: usually a typing error."""
-    if names:
-        structlog.get_logger("optipmb_service").warning("unknown_environment", names=names)
-
-
-def unprotected(addresses: tuple[str, ...]) -> None:
-    """Log addresses beyond this machine without TLS and access control."""
-    structlog.get_logger("optipmb_service").warning("unprotected", addresses=addresses)

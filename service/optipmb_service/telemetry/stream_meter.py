@@ -11,12 +11,9 @@ import optipmb_schemas as schemas
 
 LATENCIES: Final = 512
 ARRIVALS: Final = 1024
-RATE_NS: Final = 5_000_000_000
-"""The rate is that of the frames of this time; of a slower stream that of its last two frames."""
-SILENT_PERIODS: Final = 3
-"""After so many periods without a frame the rate falls, and the stream is silent."""
-LAST: Final = 5
-"""Frames whose largest distance is the period by which silence is judged."""
+RATE_NS: Final = 5_000_000_000  # the rate is that of the frames of this time, or of the last two frames
+SILENT_PERIODS: Final = 3  # after so many periods without a frame the rate falls, and the stream is silent
+LAST: Final = 5  # frames whose largest distance is the period by which silence is judged
 
 
 class StreamMeter:

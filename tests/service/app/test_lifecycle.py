@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from optipmb_schemas import Keys, SessionState
-from optipmb_service.app.ending import LAST_S, EndBound, Steps, _calls, longest_end_s
-from optipmb_service.app.loops import StopRequest
-from optipmb_service.app.supervisor import WORKERS_S
+from optipmb_service.app.lifecycle import LAST_S, EndBound, Steps, StopRequest, _calls, longest_end_s
+from optipmb_service.app.workers import WORKERS_S
 from processes import descendants, wait_until_ended
 from router import Node, Sensor
 from routers import free_endpoint, open_router

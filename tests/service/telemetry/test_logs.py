@@ -16,7 +16,7 @@ import pytest
 import structlog
 from hypothesis import given
 from hypothesis import strategies as st
-from optipmb_service.observability.logs import BURST, LINES_PER_SECOND, QUEUE_BYTES, Limiter, LineWriter, configure
+from optipmb_service.telemetry.logs import BURST, LINES_PER_SECOND, QUEUE_BYTES, Limiter, LineWriter, configure
 from router import Node, Sensor, until
 from routers import free_endpoint
 

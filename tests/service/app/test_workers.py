@@ -9,16 +9,17 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-import optipmb_service.app.supervisor
 import pytest
-from optipmb_service.app.ending import EndBound
-from optipmb_service.app.loops import StopRequest
-from optipmb_service.app.supervisor import Supervisor, _supervised
-from optipmb_service.settings.loading import load
+from optipmb_service.app import workers
+from optipmb_service.app.lifecycle import EndBound, StopRequest
+from optipmb_service.app.workers import Supervisor, Worker, serve_workers
+from optipmb_service.settings import load
+from optipmb_service.telemetry.health import ProcessHealth
+from optipmb_service.telemetry.metrics import Metrics
 from unbounded import NO_BOUND
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
 
 @pytest.mark.parametrize(("status", "failed"), [(-9, 1), (0, 1), (3, 3)])
@@ -27,18 +28,14 @@ async def test_a_worker_that_ends_in_its_first_start_ends_the_command(
 ) -> None:
     """The exit status is the worker's, and 1 for one that was killed, or ended without a reason."""
 
-    class Ending:
-        def __init__(self, *_: object) -> None:
-            pass
+    async def run(*_: object) -> int:
+        return status
 
-        async def run(self, *_: object) -> int:
-            return status
-
-    monkeypatch.setattr(optipmb_service.app.supervisor, "WorkerProcess", Ending)
+    monkeypatch.setattr(Worker, "run", run)
     supervisor = Supervisor(
         load(None, {"workers": 2, "store": "none"}).settings, StopRequest(EndBound(60.0)), Path("unused")
     )
-    await supervisor._kept(0)
+    assert not await supervisor.start()
     assert supervisor.failed == failed
 
 
@@ -51,20 +48,11 @@ async def test_a_worker_that_is_killed_in_its_end_is_no_orderly_end(
     """One that crashes while it writes its last checkpoints counts; one that a SIGTERM to all met early does not."""
     asked = StopRequest(NO_BOUND)
 
-    class Ending:
-        def __init__(self, *_: object) -> None:
-            pass
+    async def run(*_: object) -> int:
+        asked.ask("test")
+        return status
 
-        async def run(self, *_: object) -> int:
-            asked.ask("test")
-            return status
-
-        def end(self) -> None:
-            pass
-
-        kill = end
-
-    monkeypatch.setattr(optipmb_service.app.supervisor, "WorkerProcess", Ending)
+    monkeypatch.setattr(Worker, "run", run)
     supervisor = Supervisor(load(None, {"workers": 1, "store": "none"}).settings, asked, Path("unused"))
     assert not await supervisor.start()
     assert await supervisor.stop() is orderly
@@ -75,38 +63,32 @@ async def test_workers_hear_of_the_end_before_grpc_closes(monkeypatch: pytest.Mo
     happened: list[str] = []
     asked = StopRequest(NO_BOUND)
 
-    class Ending:
-        def __init__(self, _: int, event: Callable[[dict[str, Any]], None]) -> None:
-            self._event = event
-            self._ended = asyncio.Event()
+    ended = asyncio.Event()
 
-        async def run(self, *_: object) -> int:
-            self._event({"event": "ready"})
-            await self._ended.wait()
-            return 0
+    async def run(worker: Worker, *_: object) -> int:
+        worker.hear({"event": "ready"})
+        await ended.wait()
+        return 0
 
-        def end(self) -> None:
-            asyncio.get_running_loop().call_soon(self._close)  # as a pipe is closed
+    def close() -> None:
+        happened.append("told")
+        ended.set()
 
-        def _close(self) -> None:
-            happened.append("told")
-            self._ended.set()
-
-        def kill(self) -> None:
-            pass
+    monkeypatch.setattr(Worker, "run", run)
+    monkeypatch.setattr(Worker, "end", lambda _: asyncio.get_running_loop().call_soon(close))  # as a pipe is closed
 
     @contextlib.contextmanager
     def grpc(*_: object) -> Iterator[None]:
         yield
         happened.append("closed")
 
-    nothing = {name: lambda *_: None for name in ("watch", "serve_service", "announce", "client", "close")}
+    nothing = {name: lambda *_: None for name in ("watch", "serve_service", "announce", "client")}
     settings = load(None, {"workers": 1, "store": "none"}).settings
-    monkeypatch.setattr(optipmb_service.app.supervisor, "WorkerProcess", Ending)
-    monkeypatch.setattr(optipmb_service.app.supervisor, "grpc_edge", grpc)
-    monkeypatch.setattr(optipmb_service.app.supervisor, "say_ready", lambda *_: asked.ask("test"))
+    monkeypatch.setattr(workers, "grpc_edge", grpc)
+    monkeypatch.setattr(workers, "say_ready", lambda *_: asked.ask("test"))
     transport: Any = SimpleNamespace(**nothing)
-    assert await _supervised(settings, settings, transport, asked, Path("unused")) == 0
+    supervisor, health = Supervisor(settings, asked, Path("unused")), ProcessHealth("test", Metrics())
+    assert await serve_workers(settings, supervisor, transport, asked, health)
     assert happened[:2] == ["told", "closed"]
 
 
@@ -115,15 +97,15 @@ async def test_a_worker_that_hangs_while_it_starts_is_killed(
     monkeypatch: pytest.MonkeyPatch, silent_s: float, *, killed: bool
 ) -> None:
     """A start may take much longer than `stuck_s`, but not for ever."""
-    monkeypatch.setattr(optipmb_service.app.supervisor, "BEAT_S", 0.0)
+    monkeypatch.setattr(workers, "BEAT_S", 0.0)
     settings = load(None, {"workers": 2, "store": "none"}).settings
     supervisor = Supervisor(settings, StopRequest(EndBound(60.0)), Path("unused"))
-    ended: list[bool] = []
-    child: Any = SimpleNamespace(kill=lambda: ended.append(True))
-    supervisor._children[0], supervisor.states[0] = child, "starting"
-    supervisor._heard[0] = time.monotonic() - silent_s
+    ended: list[Worker] = []
+    monkeypatch.setattr(Worker, "kill", lambda one: ended.append(one))  # noqa: PLW0108 - bound to the worker
+    worker = supervisor.workers[0]
+    worker.state, worker.heard = "starting", time.monotonic() - silent_s
     watching = asyncio.create_task(supervisor._watch())
     for _ in range(20):
         await asyncio.sleep(0)
     watching.cancel()
-    assert bool(ended) is killed
+    assert ended == ([worker] if killed else [])

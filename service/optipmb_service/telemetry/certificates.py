@@ -14,20 +14,12 @@ from typing import TYPE_CHECKING, Final
 import structlog
 from optipmb_schemas.certificates import end_of, ended
 
-from optipmb_service.zenoh.connection import LISTENING, certificates_of
-
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Mapping
+    from pathlib import Path
 
-    from optipmb_service.observability.metrics import Value
-    from optipmb_service.settings.model import Settings
-
-LOOK_S: Final = 5.0
-"""Files are read again after so long."""
-
+LOOK_S: Final = 5.0  # files are read again after so long
 WARN_DAYS: Final = 7.0
-WARN_S: Final = 86_400.0
-
 DAY_S: Final = 86_400.0
 
 log = structlog.get_logger("optipmb_service")
@@ -37,26 +29,21 @@ class Certificates:
     """The certificates of one process.
 
     Args:
-        settings: which name them.
-
-    Raises:
-        TransportError: the Zenoh configuration cannot be read.
+        files: certificates by use.
+        fixed: the use whose certificate stays the one of the start.
     """
 
-    def __init__(self, settings: Settings) -> None:
-        self._files = certificates_of(settings)
-        for use, folder in (("grpc", settings.grpc_tls if settings.grpc else None), ("cluster", settings.cluster_tls)):
-            if folder is not None:
-                self._files |= {use: folder / "cert.pem", f"{use}_authority": folder / "ca.pem"}
+    def __init__(self, files: Mapping[str, Path], fixed: str) -> None:
+        self._files = files
+        self._fixed = fixed
         self._ends: dict[str, datetime] = {}
         self._looked = -LOOK_S
         self._look()
 
-    def figures(self) -> Iterator[Value]:
-        """Return how many days each certificate still holds."""
+    def days(self) -> dict[str, float]:
+        """Return how many days each certificate still holds, by its use."""
         now = datetime.now(UTC)
-        for use, end in self._look().items():
-            yield "certificate_days", (use,), (end - now).total_seconds() / DAY_S
+        return {use: (end - now).total_seconds() / DAY_S for use, end in self._look().items()}
 
     @property
     def failure(self) -> str:
@@ -70,15 +57,15 @@ class Certificates:
 
     async def watch(self) -> None:
         """Log certificates that end soon once a day, and each that has ended, for ever."""
-        warned = -WARN_S
+        warned = -DAY_S
         told: set[str] = set()
         while True:
             now_ended = self._ended().keys()
             for why in now_ended - told:
                 log.error("certificate_ended", error=why)
             told = set(now_ended)
-            soon = {use: round(days, 1) for _, (use,), days in self.figures() if 0 < days < WARN_DAYS}
-            if soon and time.monotonic() - warned >= WARN_S:
+            soon = {use: round(days, 1) for use, days in self.days().items() if 0 < days < WARN_DAYS}
+            if soon and time.monotonic() - warned >= DAY_S:
                 warned = time.monotonic()
                 log.warning("certificate_ends", days=soon)
             await asyncio.sleep(LOOK_S)
@@ -90,6 +77,6 @@ class Certificates:
     def _look(self) -> dict[str, datetime]:
         if (now := time.monotonic()) - self._looked >= LOOK_S:
             found = {use: end for use, file in self._files.items() if (end := end_of(file)) is not None}
-            kept = {use: end for use, end in self._ends.items() if use == LISTENING}
+            kept = {use: end for use, end in self._ends.items() if use == self._fixed}
             self._ends, self._looked = found | kept, now
         return self._ends

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final
 
 import structlog
 from optipmb_schemas import Keys
 
-from optipmb_service.cluster.copying import copy_sessions
-from optipmb_service.cluster.member_locks import in_use
-from optipmb_service.cluster.sqlite import SqliteStore
-from optipmb_service.cluster.store import StoreError
+from optipmb_service.cluster.leases import NOBODY, PARTITIONS, partition_key, partition_of
+from optipmb_service.cluster.sqlite import SqliteStore, in_use
+from optipmb_service.cluster.store import Fenced, StoreError, Write
 from optipmb_service.runtime.fusion import Fusion
 from optipmb_service.runtime.kept_tracks import LoggedTracks
 from optipmb_service.runtime.missed_frames import LoggedFrames, NoLog
@@ -20,12 +20,10 @@ from optipmb_service.runtime.persistence import DAY_S
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from optipmb_service.cluster.copying import Copied
-    from optipmb_service.cluster.nats_access import NatsAccess
     from optipmb_service.cluster.store import LeaseStore
     from optipmb_service.runtime.kept_tracks import KeptTracks
     from optipmb_service.runtime.missed_frames import MissedFrames
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
 
@@ -33,6 +31,7 @@ STORE_FILE: Final = "sessions.db"
 CLOSE_S: Final = 5.0
 REACH_S: Final = 10.0
 AGAIN_S: Final = 0.05
+COPIED_AT_ONCE: Final = 32  # checkpoints in memory while they are copied
 
 
 def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, str | None]:
@@ -51,8 +50,7 @@ def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, st
     if settings.cluster:
         from optipmb_service.cluster.jetstream import JetStream  # noqa: PLC0415 - an extra
 
-        access = nats_access(settings)
-        return JetStream(settings.cluster, settings.prefix, settings.keep_days * DAY_S, access), None
+        return JetStream(settings.cluster, settings.prefix, settings.keep_days * DAY_S, nats_access(settings)), None
     folder, why = settings.folder, ""
     if folder is not None:
         try:
@@ -67,15 +65,22 @@ def open_store(settings: Settings, private: Path | None) -> tuple[LeaseStore, st
     return SqliteStore(private and private / STORE_FILE), why
 
 
-def nats_access(settings: Settings) -> NatsAccess:
-    """Return what the servers of `cluster` want to see."""
-    from optipmb_service.cluster.nats_access import NatsAccess  # noqa: PLC0415 - an extra
+def nats_access(settings: Settings) -> dict[str, Any]:
+    """Return the options that let NATS' client in at the servers of `cluster`.
 
-    return NatsAccess(settings.cluster_tls, settings.cluster_credentials)
+    Raises:
+        StoreError: a file cannot be read, or holds something else.
+    """
+    from optipmb_service.cluster.nats_connection import access  # noqa: PLC0415 - an extra
+
+    return access(settings.cluster_tls, settings.cluster_credentials)
 
 
-def copy_folder(settings: Settings) -> Copied:
-    """Copy the sessions of the folder `store` into the store of `cluster`.
+def copy_folder(settings: Settings) -> tuple[int, int]:
+    """Copy the sessions of the folder `store` into the store of `cluster`, in which nobody tracks yet.
+
+    Returns:
+        Sessions that were copied, and those that were not: the cluster has a session of the same stream.
 
     Raises:
         StoreError: either cannot be used, or a member uses it.
@@ -91,11 +96,48 @@ def copy_folder(settings: Settings) -> Copied:
         target, _ = open_store(settings, None)
         try:
             _reach(target)
-            return copy_sessions(source, target)
+            return _copy(source, target)
         finally:
             target.close(CLOSE_S)
     finally:
         source.close()
+
+
+def _copy(source: SqliteStore, target: LeaseStore) -> tuple[int, int]:
+    """Copy the newest checkpoint of each stream that the target has none of; interrupted, it may be begun again.
+
+    Every partition gets a record that says that nobody holds it, and its revision is the fence of what is copied: a
+    member that takes a partition meanwhile makes the copy fail, and not the other way round.
+    """
+    fences: dict[int, int] = {}
+    for partition in range(PARTITIONS):
+        key = partition_key(partition)
+        record = target.get(key)
+        if record is not None and record.value != NOBODY:
+            raise _held(record.value)
+        fence = target.put(Write(key, NOBODY, record.revision if record else 0))
+        if fence is None:
+            raise _held("a member that has just begun")
+        fences[partition] = fence
+    copied = known = 0
+    streams = iter(source.streams())
+    while some := list(islice(streams, COPIED_AT_ONCE)):
+        batch: dict[str, Fenced] = {}
+        for stream in some:
+            data = source.load(stream)
+            if target.load(stream) is not None:
+                known += 1
+            elif data is not None:
+                partition = partition_of(stream)
+                batch[stream] = Fenced(partition_key(partition), fences[partition], data)
+        if target.save(batch):
+            raise _held("a member that has just begun")
+        copied += len(batch)
+    return copied, known
+
+
+def _held(member: str) -> StoreError:
+    return StoreError(f"{member} tracks in the cluster: end its members, copy, and start them again")
 
 
 def _reach(store: LeaseStore) -> None:
@@ -120,8 +162,7 @@ def open_log(settings: Settings) -> tuple[MissedFrames, list[KeptTracks]]:
     """Return where frames are that a session has missed, and tracks: in the log, where there is a cluster."""
     if not settings.cluster:
         return NoLog(), []
-    from optipmb_service.cluster.log_reader import LogReader  # noqa: PLC0415 - an extra
-    from optipmb_service.cluster.message_log import MessageLog  # noqa: PLC0415 - an extra
+    from optipmb_service.cluster.message_log import LogReader, MessageLog  # noqa: PLC0415 - an extra
 
     reader = LogReader(MessageLog(settings.cluster, settings.prefix, nats_access(settings)), settings.standby_s)
     return LoggedFrames(reader, Keys(settings.prefix), Fusion(settings.fuse)), [LoggedTracks(reader)]

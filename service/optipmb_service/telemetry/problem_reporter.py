@@ -22,12 +22,8 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
-MAX_KINDS: Final = 4096
-"""Kinds of problems remembered for their rate."""
-
-NEWEST: Final = 20
-"""Problems kept for the status."""
-
+MAX_KINDS: Final = 4096  # kinds of problems remembered for their rate
+NEWEST: Final = 20  # problems kept for the status
 SECOND: Final = 1_000_000_000
 PUBLISH_EVERY_NS: Final = SECOND
 LOG_EVERY_NS: Final = 10 * SECOND
@@ -44,15 +40,6 @@ class _Kind:
     gathered: int = 0
     unlogged: int = 0
     last: schemas.Problem | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _Summary:
-    """A problem, and how many it stands for where it is published and where it is logged; 0: it is not."""
-
-    problem: schemas.Problem
-    published: int
-    logged: int
 
 
 class _Budget:
@@ -112,20 +99,20 @@ class ProblemReporter:
             kind.gathered += problem.count
             kind.unlogged += problem.count
             kind.last = problem
-            summary = self._due(kind, now_ns)
-        self._send(summary)
+            due = self._due(kind, now_ns)
+        self._send(*due)
 
     def flush(self, now_ns: int) -> None:
         """Send the summaries that are due; to be called about once a second."""
-        due: list[_Summary | None] = []
+        due = []
         with self._lock:
             for key, kind in list(self._kinds.items()):
                 if kind.gathered or kind.unlogged:
                     due.append(self._due(kind, now_ns))
                 elif now_ns - kind.logged_ns >= LOG_EVERY_NS:
                     del self._kinds[key]
-        for summary in due:
-            self._send(summary)
+        for one in due:
+            self._send(*one)
 
     def newest(self) -> tuple[schemas.Problem, ...]:
         """Return the newest problems, the oldest first."""
@@ -137,32 +124,29 @@ class ProblemReporter:
         with self._lock:
             return dict(self._counts)
 
-    def _due(self, kind: _Kind, now_ns: int) -> _Summary | None:
-        """Take what may be reported of a kind now; called with the lock."""
-        problem = kind.last
+    def _due(self, kind: _Kind, now_ns: int) -> tuple[schemas.Problem | None, int, int]:
+        """Take what may be reported of a kind now, called with the lock: how many to publish and how many to log."""
         publish = bool(kind.gathered) and now_ns - kind.published_ns >= PUBLISH_EVERY_NS
         log = bool(kind.unlogged) and now_ns - kind.logged_ns >= LOG_EVERY_NS
         publish = publish and self._published.take(now_ns)
         log = log and self._logged.take(now_ns)
-        if problem is None or not (publish or log):
-            return None
-        problem = problem.model_copy(update={"reported_ns": self._wall()})
-        summary = _Summary(problem, published=kind.gathered if publish else 0, logged=kind.unlogged if log else 0)
+        if kind.last is None or not (publish or log):
+            return None, 0, 0
+        problem = kind.last.model_copy(update={"reported_ns": self._wall()})
+        published, logged = kind.gathered if publish else 0, kind.unlogged if log else 0
         if publish:
             kind.gathered, kind.published_ns = 0, now_ns
-            self._newest.append(summary.problem.model_copy(update={"count": summary.published}))
+            self._newest.append(problem.model_copy(update={"count": published}))
         if log:
             kind.unlogged, kind.logged_ns = 0, now_ns
-        return summary
+        return problem, published, logged
 
-    def _send(self, summary: _Summary | None) -> None:
+    def _send(self, problem: schemas.Problem | None, published: int, logged: int) -> None:
         """Publish and log outside the lock: both may take a while."""
-        if summary is None:
-            return
-        if summary.published:
-            self._publish(summary.problem.model_copy(update={"count": summary.published}))
-        if summary.logged:
-            self._log(summary.problem, summary.logged)
+        if problem is not None and published:
+            self._publish(problem.model_copy(update={"count": published}))
+        if problem is not None and logged:
+            self._log(problem, logged)
 
 
 def log_problem(problem: schemas.Problem, count: int) -> None:
