@@ -47,7 +47,7 @@ from gateway import GatewayProcess, resident
 from optipmb_schemas import encode
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
-from optipmb_service.settings.model import Settings
+from optipmb_service.settings import Settings
 from optipmb_service.zenoh.client import Client
 from routers import open_client
 from service_process import ServiceProcess

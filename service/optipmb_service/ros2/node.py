@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from optipmb_client.zenoh.handles import Sender
 
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 MESSAGES: Final = 1024
 CLOUDS: Final = 8

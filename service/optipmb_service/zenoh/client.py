@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from optipmb_client.incoming import Arrival
     from optipmb_client.zenoh.handles import Reading, Sender
 
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 NEW_STREAMS: Final = 4000
 """Publishers and subscriptions that edges have declared at once."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from optipmb_client.zenoh.session import Opened
 
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 WAIT_BEFORE_CLOSE_US: Final = 30_000_000
 """How long a client waits to declare something where its router is slow to read, before Zenoh closes the link.

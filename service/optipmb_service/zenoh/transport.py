@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.runtime.intake import Kind
     from optipmb_service.runtime.ports import Request
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 MOST_OPEN: Final = 256
 """Queries of one key expression that may be open; those beyond are refused."""

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 from optipmb_client.zenoh.session import KeyNumbers
-from optipmb_service.app.loops import StopRequest, watch_keys
+from optipmb_service.app.lifecycle import StopRequest, watch_keys
 from unbounded import NO_BOUND
 
 MOST = 1000

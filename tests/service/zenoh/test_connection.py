@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import Keys, Tracks, encoding_of
-from optipmb_service.settings.loading import load
+from optipmb_service.settings import load
 from optipmb_service.zenoh.client import Client
 from router import until
 from routers import free_endpoint, open_client, open_router

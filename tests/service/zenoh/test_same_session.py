@@ -14,7 +14,7 @@ import pytest
 from optipmb_client.zenoh.handles import Channel
 from optipmb_client.zenoh.session import Session
 from optipmb_schemas import Keys
-from optipmb_service.settings.loading import load
+from optipmb_service.settings import load
 from optipmb_service.zenoh.inputs import Topic
 from optipmb_service.zenoh.transport import Transport
 from router import until
