@@ -6,7 +6,7 @@ The command `optipmb` does everything that needs no programming.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
@@ -31,12 +31,18 @@ __all__ = [
     "kept_tracks",
 ]
 
+# Imported on first use: offline commands need no Zenoh, and the service no publisher.
+_MODULES = {
+    "errors": ("ClientError", "ConnectionFailed", "ServiceRefused", "ServiceUnavailable", "UsageError"),
+    "publisher": ("Publisher",),
+    "sessions": ("kept_tracks",),
+    "subscriber": ("Missed", "Received", "Statistics", "Subscriber"),
+    "zenoh": ("DEFAULT_ENDPOINT", "Connection"),
+}
 
-def __getattr__(name: str) -> object:
-    """Import what is asked for: the service and offline commands use parts of this package, without the network's."""
-    if name in __all__:
-        for module in ("errors", "publisher", "sessions", "subscriber", "zenoh"):
-            found = import_module(f"optipmb_client.{module}")
-            if name in found.__all__:
-                return getattr(found, name)
-    raise AttributeError(f"module {__name__} has no attribute {name}")
+
+def __getattr__(name: str) -> Any:
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
