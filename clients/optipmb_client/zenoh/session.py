@@ -14,11 +14,11 @@ from typing import Any, TypeAlias, TypeVar
 import zenoh
 import zenoh.ext
 from optipmb_schemas import Detections, Keys, Points, Problem, encoding_of
-from optipmb_schemas.late_join import ANSWER_S, CacheQueries, LateJoin
 
 from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Answer, Arrival
 from optipmb_client.zenoh.handles import CLOSE_S, Channel, Declared, Query, Reading, Sender, directly, reason, usable
+from optipmb_client.zenoh.late_join import ANSWER_S, CacheQueries, LateJoin
 
 __all__ = ["EVERYTHING", "NEWEST", "KeyNumbers", "Opened", "Sample", "Session", "opened"]
 

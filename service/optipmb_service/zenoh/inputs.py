@@ -18,8 +18,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import structlog
+from optipmb_client.zenoh.late_join import CacheQueries, LateJoin
 from optipmb_client.zenoh.session import NEWEST
-from optipmb_schemas.late_join import CacheQueries, LateJoin
 
 from optipmb_service.runtime.intake import ALL
 
