@@ -20,9 +20,8 @@ from optipmb_service.cluster.leases import ALIVE, instance_of
 from optipmb_service.observability import collectors
 from optipmb_service.observability.health import STUCK_S
 from optipmb_service.observability.metrics import Collected, ReadOnDemand, families
-from optipmb_service.runtime.fusion import Fusion
-from optipmb_service.runtime.requests import guarded, problem_with
-from optipmb_service.runtime.service_queries import UNDRAINED, drain_asked, move_asked
+from optipmb_service.runtime.profiles import Fusion
+from optipmb_service.runtime.queries import UNDRAINED, drain_asked, guarded, move_asked, problem_with
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

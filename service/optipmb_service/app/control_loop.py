@@ -21,11 +21,11 @@ from optipmb_service.app.loops import say_ready, settle, unless, watch_keys
 from optipmb_service.app.service import Service
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from optipmb_service.app.loops import StopRequest
     from optipmb_service.observability.health import ProcessHealth
-    from optipmb_service.runtime.context import Actor
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.settings.model import Settings
 
@@ -114,9 +114,9 @@ async def _serve(
     loop = asyncio.get_running_loop()
     parent.begin(asked)
 
-    def arm(actor: Actor, at_ns: int) -> None:
+    def arm(wake: Callable[[], None], at_ns: int) -> None:
         # The loop's time and the deadlines are one clock, the monotonic one.
-        loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, actor.wake)
+        loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, wake)
 
     await unless(asked, parent.warm_up)
     if asked.is_set():

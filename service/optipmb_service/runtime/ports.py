@@ -1,4 +1,4 @@
-"""What the service needs of the network, as plain values and protocols; `transport` implements them over Zenoh."""
+"""Values and protocols between streams and the network; `transport` implements them over Zenoh."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     import optipmb_schemas as schemas
 
 
 PACKET_BYTES: Final = 512
-"""What a message takes beside its payload, nearly."""
+"""Bytes of a message beside its payload, nearly."""
 
 
 @dataclass(slots=True)
@@ -27,6 +25,7 @@ class Packet:
         wall_ns: arrival by the wall clock, ns since 1970; only reported, never decided by.
         now_ns: arrival by the monotonic clock, ns.
         origin: what tells the stream: the key without its topic.
+        frame: whether it holds detections.
         held: bytes that it takes while it waits.
     """
 
@@ -37,32 +36,13 @@ class Packet:
     wall_ns: int
     now_ns: int
     origin: str = field(init=False)
+    frame: bool = field(init=False)
     held: int = field(init=False)
 
     def __post_init__(self) -> None:
-        self.origin = self.key.rpartition("/")[0]
+        self.origin, _, topic = self.key.rpartition("/")
+        self.frame = topic == "detections"
         self.held = PACKET_BYTES + (0 if self.payload is None else self.size)
-
-
-class Caches(Protocol):
-    """What publishers keep of their detections."""
-
-    def awaited(self, session: str, sensors: Iterable[str]) -> dict[str, bool]:
-        """Return the streams of a session whose caches may hold something, each with whether its publisher is there.
-
-        Args:
-            session: its name.
-            sensors: streams that were there before; their publishers may come back.
-        """
-
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
-        """Call `then` soon, on a thread that it must not keep, with what the caches of a stream hold, all frames.
-
-        It is called, too, with whether all caches have answered in time.
-
-        Raises:
-            TransportError: the network is closed.
-        """
 
 
 class Publisher(Protocol):
@@ -73,16 +53,6 @@ class Publisher(Protocol):
 
     def release(self) -> None:
         """Withdraw the publisher."""
-
-
-class MessageSink(Protocol):
-    """Where results go."""
-
-    def open_publisher(self, stream: str) -> Publisher:
-        """Open the publisher of a stream that this instance owns."""
-
-    def publish_problem(self, problem: schemas.Problem) -> None:
-        """Send a problem on its stream's key; never waits for a receiver."""
 
 
 class Request(Protocol):
