@@ -12,10 +12,9 @@ from optipmb_service.cluster.copying import copy_sessions
 from optipmb_service.cluster.member_locks import in_use
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.runtime.kept_tracks import LoggedTracks
 from optipmb_service.runtime.persistence import DAY_S
 from optipmb_service.runtime.profiles import Fusion
-from optipmb_service.runtime.recovery import DetectionsLog
+from optipmb_service.runtime.recovery import Log
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from optipmb_service.cluster.copying import Copied
     from optipmb_service.cluster.nats_access import NatsAccess
     from optipmb_service.cluster.store import LeaseStore
-    from optipmb_service.runtime.kept_tracks import KeptTracks
     from optipmb_service.settings.model import Settings
 
 log = structlog.get_logger("optipmb_service")
@@ -115,12 +113,12 @@ def _reach(store: LeaseStore) -> None:
             return
 
 
-def open_log(settings: Settings) -> tuple[DetectionsLog | None, list[KeptTracks]]:
-    """Return where frames are that a session has missed, and tracks: in the log, where there is a cluster."""
+def open_log(settings: Settings) -> Log | None:
+    """Return the log of frames and tracks, where there is a cluster."""
     if not settings.cluster:
-        return None, []
+        return None
     from optipmb_service.cluster.log_reader import LogReader  # noqa: PLC0415 - an extra
     from optipmb_service.cluster.message_log import MessageLog  # noqa: PLC0415 - an extra
 
     reader = LogReader(MessageLog(settings.cluster, settings.prefix, nats_access(settings)), settings.standby_s)
-    return DetectionsLog(reader, Keys(settings.prefix), Fusion(settings.fuse)), [LoggedTracks(reader)]
+    return Log(reader, Keys(settings.prefix), Fusion(settings.fuse))

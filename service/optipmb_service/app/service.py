@@ -25,7 +25,7 @@ from optipmb_service.observability import collectors
 from optipmb_service.observability.metrics import Metrics
 from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.intake import Intake
-from optipmb_service.runtime.kept_tracks import RecentTracks, TrackQuery
+from optipmb_service.runtime.kept_tracks import TrackQuery
 from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter
 from optipmb_service.runtime.ports import TransportError
 from optipmb_service.runtime.queries import ServiceQueries, StreamQueries, members_of
@@ -101,8 +101,7 @@ class Service:
         self._checkpoints = CheckpointWriter(
             store, settings.checkpoint_s, self._member, self._unkept, settings.keep_days * DAY_S, keeps_nothing
         )
-        recent = RecentTracks(self._transport.recent_tracks, settings.limits.limits())
-        self._log, logged = open_log(settings)
+        self._log = open_log(settings)
         self._streams = Streams(
             settings,
             profiles,
@@ -125,9 +124,8 @@ class Service:
             idle_s=settings.idle_s,
         )
         self._metrics.add(self._figures)
-        self._stream_queries = StreamQueries(
-            self._streams, TrackQuery([*logged, recent], settings.instance, settings.limits.limits())
-        )
+        tracks = TrackQuery(self._log, self._transport.recent_tracks, settings.instance, settings.limits.limits())
+        self._stream_queries = StreamQueries(self._streams, tracks)
         self._service_queries = ServiceQueries(
             self._streams,
             status=self.status,

@@ -1,4 +1,4 @@
-"""Tracks of a time that has passed: from the log, or from what is kept for subscribers that come late.
+"""Answers to `q/tracks`: tracks of a range of stamps, from the log or from publishers' caches.
 
 Messages are given as they were published. Of a frame that was published several times the tracks that hold are given.
 """
@@ -18,8 +18,8 @@ from optipmb_service.session.problems import problem_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from optipmb_service.cluster.log_reader import LogReader
     from optipmb_service.runtime.ports import Request
+    from optipmb_service.runtime.recovery import Log
 
 log = structlog.get_logger("optipmb_service")
 
@@ -36,50 +36,27 @@ LATE_NS: Final = 5_000_000_000
 """How much later in the log the tracks of a frame may be corrected; by stamps. Frames are inserted for a second."""
 
 
-class Published(Protocol):
-    """Tracks as they were published, and what they are of."""
+class _Published(Protocol):
+    """Tracks as they were published; the higher `order` of a frame holds."""
 
     @property
-    def epoch(self) -> bytes:
-        """Epoch of the frame."""
-
+    def epoch(self) -> bytes: ...
     @property
-    def seq(self) -> int:
-        """Number of the frame."""
-
+    def seq(self) -> int: ...
     @property
-    def sensor(self) -> str:
-        """Whose frame it is, in a session of several sensors; else empty."""
-
+    def sensor(self) -> str: ...
     @property
-    def stamp_ns(self) -> int:
-        """Stamp of the frame."""
-
+    def stamp_ns(self) -> int: ...
     @property
-    def order(self) -> tuple[int, int]:
-        """Higher in the tracks of a frame that hold."""
-
+    def order(self) -> tuple[int, int]: ...
     @property
-    def payload(self) -> bytes:
-        """Their bytes."""
-
+    def payload(self) -> bytes: ...
     @property
-    def encoding(self) -> str:
-        """Their Zenoh encoding."""
-
-
-class KeptTracks(Protocol):
-    """Where tracks are kept."""
-
-    def find(self, stream: str, wanted: TracksRange, then: Callable[[str], None]) -> None:
-        """Put what is kept into a range, and call `then` with the reason when it cannot be read.
-
-        It is called on a thread that it must not keep.
-        """
+    def encoding(self) -> str: ...
 
 
 class TracksRange:
-    """The tracks with stamps from one to another, as many as an answer takes.
+    """Tracks with stamps from one to another, as many as an answer takes.
 
     Args:
         from_ns: first stamp.
@@ -97,9 +74,9 @@ class TracksRange:
         self._to_ns = to_ns
         self._most = most
         self._most_bytes = most_bytes
-        self._frames: dict[tuple[bytes, int, str], Published] = {}
+        self._frames: dict[tuple[bytes, int, str], _Published] = {}
 
-    def add(self, messages: Iterable[Published]) -> bool:
+    def add(self, messages: Iterable[_Published]) -> bool:
         """Take messages in the order of their publication; False: no later one belongs here."""
         latest_ns = 0
         for one in messages:
@@ -114,7 +91,7 @@ class TracksRange:
         self._cut()
         return self._to_ns is None or latest_ns <= self._to_ns + LATE_NS
 
-    def messages(self) -> list[Published]:
+    def messages(self) -> list[_Published]:
         """Return the messages by their stamps."""
         return sorted(self._frames.values(), key=lambda one: (one.stamp_ns, one.sensor, one.seq))
 
@@ -131,52 +108,6 @@ class TracksRange:
                 return
 
 
-class RecentTracks:
-    """What is kept for subscribers that come late: the newest tracks of those who track the stream now.
-
-    Args:
-        recent: returns what the caches hold for a stream, each message with its encoding.
-        limits: of messages.
-    """
-
-    def __init__(self, recent: Callable[[str], Sequence[tuple[bytes, str]]], limits: schemas.Limits) -> None:
-        self._recent = recent
-        self._limits = limits
-
-    def find(self, stream: str, wanted: TracksRange, then: Callable[[str], None]) -> None:
-        """Ask the caches."""
-        try:
-            found = [self._read(*one) for one in self._recent(stream)]
-        except TransportError as error:
-            then(str(error))
-            return
-        wanted.add(one for one in found if one is not None)
-        then("")
-
-    def _read(self, payload: bytes, encoding: str) -> _Recent | None:
-        try:
-            tracks = schemas.decode(payload, schemas.Tracks, encoding=encoding, limits=self._limits)
-        except schemas.MessageError:  # of somebody else
-            return None
-        frame = tracks.epoch, tracks.seq, tracks.sensor or "", tracks.stamp_ns
-        return _Recent(*frame, order_of(tracks), payload, encoding)
-
-
-class LoggedTracks:
-    """What is in the log.
-
-    Args:
-        reader: reads the log.
-    """
-
-    def __init__(self, reader: LogReader) -> None:
-        self._reader = reader
-
-    def find(self, stream: str, wanted: TracksRange, then: Callable[[str], None]) -> None:
-        """Read the log."""
-        self._reader.tracks(stream, max(0, wanted.from_ns - LATE_NS), wanted.add, then)
-
-
 class _Recent(NamedTuple):
     epoch: bytes
     seq: int
@@ -188,21 +119,29 @@ class _Recent(NamedTuple):
 
 
 def order_of(tracks: schemas.Tracks) -> tuple[int, int]:
-    """Return what is higher in the tracks of a frame that hold."""
+    """Return the order among the tracks of one frame: the highest hold."""
     return tracks.delivery.run if tracks.delivery else 0, tracks.revision
 
 
 class TrackQuery:
-    """Answers queries for tracks of a range of stamps.
+    """Answers queries for tracks, on a thread that neither tracks nor sorts queries.
 
     Args:
-        kept: where tracks are kept; each is asked where those before it know nothing of the stream.
+        logged: the log, if there is one.
+        recent: returns what caches hold for a stream, each message with its encoding; asked where the log has nothing.
         instance: name of the service.
         limits: of messages.
     """
 
-    def __init__(self, kept: Sequence[KeptTracks], instance: str, limits: schemas.Limits) -> None:
-        self._kept = kept
+    def __init__(
+        self,
+        logged: Log | None,
+        recent: Callable[[str], Sequence[tuple[bytes, str]]],
+        instance: str,
+        limits: schemas.Limits,
+    ) -> None:
+        self._logged = logged
+        self._recent = recent
         self._instance = instance
         self._limits = limits
         self._pool = ThreadPoolExecutor(1, "tracks")
@@ -213,56 +152,47 @@ class TrackQuery:
         try:
             asked = self._asked(request)
         except schemas.MessageError as error:
-            self._refuse(request, stream, error)
-            return
-        if not self._room.acquire(blocking=False):
-            many = schemas.MessageError("too_large", "key", f"at most {AT_ONCE} such queries at a time", "more")
-            self._refuse(request, stream, many)
+            self._finish(request, self._problem(error.code, stream, error.path, error.expected, error.received))
             return
         wanted = TracksRange(asked.from_ns, asked.to_ns)
-        self._pool.submit(self._find, request, stream, asked, wanted, self._kept)
 
-    def _find(
-        self,
-        request: Request,
-        stream: str,
-        asked: schemas.TracksRequest,
-        wanted: TracksRange,
-        kept: Sequence[KeptTracks],
-    ) -> None:
-        def found(failure: str) -> None:
-            if failure or wanted.known or not kept[1:]:
-                self._pool.submit(self._reply, request, stream, asked, wanted, failure)
-            else:
-                self._pool.submit(self._find, request, stream, asked, wanted, kept[1:])
+        def answer(failure: str) -> None:
+            self._pool.submit(self._answer, request, stream, asked, wanted, failure)
 
-        try:
-            kept[0].find(stream, wanted, found)
-        except Exception as error:
-            log.exception("internal_error", stream=stream)
-            found(f"{type(error).__name__}: {error}")
+        if self._logged is None:
+            answer("")
+        else:
+            from_ns = max(0, wanted.from_ns - LATE_NS)
+            self._pool.submit(self._guarded, stream, answer, self._logged.tracks, stream, from_ns, wanted.add, answer)
 
     def _asked(self, request: Request) -> schemas.TracksRequest:
-        """Return what a query asks for.
-
-        Raises:
-            MessageError: it is no such query.
-        """
-        if not request.payload:
-            return schemas.TracksRequest()
-        asked = schemas.decode(request.payload, schemas.TracksRequest, encoding=request.encoding, limits=self._limits)
+        """Return what a query asks for, and take the room for its answer."""
+        asked, payload = schemas.TracksRequest(), request.payload
+        if payload:
+            asked = schemas.decode(payload, schemas.TracksRequest, encoding=request.encoding, limits=self._limits)
         if asked.to_ns is not None and asked.to_ns < asked.from_ns:
             raise schemas.MessageError("invalid_value", "to_ns", "`from_ns` or later", str(asked.to_ns))
+        if not self._room.acquire(blocking=False):
+            raise schemas.MessageError("too_large", "key", f"at most {AT_ONCE} such queries at a time", "more")
         return asked
 
-    def _refuse(self, request: Request, stream: str, error: schemas.MessageError) -> None:
-        self._finish(request, self._problem(error.code, stream, error.path, error.expected, error.received))
+    @staticmethod
+    def _guarded(stream: str, failed: Callable[[str], object], work: Callable[..., None], *arguments: object) -> None:
+        try:
+            work(*arguments)
+        except Exception as error:
+            log.exception("internal_error", stream=stream)
+            failed(f"{type(error).__name__}: {error}")
 
-    def _reply(
+    def _answer(
         self, request: Request, stream: str, asked: schemas.TracksRequest, wanted: TracksRange, failure: str
     ) -> None:
+        """Answer with what the log has, or caches where it knows nothing of the stream."""
+        failures = [failure] if failure else []
+        if not (failure or wanted.known):
+            self._guarded(stream, failures.append, self._add_recent, stream, wanted, failures)
         self._room.release()
-        last = None
+        failure, last = "".join(failures), None
         try:
             for one in () if failure else wanted.messages():
                 request.answer_text(request.key, one.payload, one.encoding)
@@ -276,6 +206,22 @@ class TrackQuery:
             received = f"more, from the stamp {wanted.cut_ns} on"
             last = self._problem("cut", stream, "", "as many tracks as one answer takes", received, wanted.cut_ns)
         self._finish(request, last)
+
+    def _add_recent(self, stream: str, wanted: TracksRange, failures: list[str]) -> None:
+        try:
+            found = [self._read(*one) for one in self._recent(stream)]
+        except TransportError as error:
+            failures.append(str(error))
+        else:
+            wanted.add(one for one in found if one is not None)
+
+    def _read(self, payload: bytes, encoding: str) -> _Recent | None:
+        try:
+            tracks = schemas.decode(payload, schemas.Tracks, encoding=encoding, limits=self._limits)
+        except schemas.MessageError:  # of somebody else
+            return None
+        frame = tracks.epoch, tracks.seq, tracks.sensor or "", tracks.stamp_ns
+        return _Recent(*frame, order_of(tracks), payload, encoding)
 
     def _finish(self, request: Request, problem: schemas.Problem | None) -> None:
         try:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import structlog
 
@@ -21,7 +21,7 @@ from optipmb_service.session.timeline import number_of
 from optipmb_service.session.values import MAX_SENSORS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     import optipmb_schemas as schemas
 
@@ -43,8 +43,8 @@ MOST: Final = 4 * MAX_SENSORS
 """Complete caches that are remembered; when there are more, those are forgotten whose publishers have gone."""
 
 
-class DetectionsLog:
-    """Frames in the log.
+class Log:
+    """Frames and tracks in the log.
 
     Args:
         reader: reads it; closed with this.
@@ -84,6 +84,12 @@ class DetectionsLog:
         positions = newest_of(checkpoint)
         wanted = Missed(tuple(positions), node="", belongs=lambda _: False, positions=positions)
         self._reader.missed(wanted, lambda messages: then(self._packets(messages)), again_s=())
+
+    def tracks(
+        self, stream: str, from_ns: int, take: Callable[[Sequence[LogMessage]], bool], end: Callable[[str], None]
+    ) -> None:
+        """Read the tracks of a stream from a stamp on; see `LogReader.tracks`."""
+        self._reader.tracks(stream, from_ns, take, end)
 
     def close(self, timeout: float) -> None:
         """Close the connection."""
@@ -166,34 +172,6 @@ class LogCheck:
         self.under_way = False
 
 
-class Caches(Protocol):
-    """Publishers' caches of detections."""
-
-    def awaited(self, session: str, sensors: Iterable[str]) -> dict[str, bool]:
-        """Return the sensors of a session whose caches may hold something, each with whether its publisher is there.
-
-        Args:
-            session: its name.
-            sensors: those that were there before; their publishers may come back.
-        """
-
-    def ask_cache(self, stream: str, then: Callable[[list[Packet], bool], None]) -> None:
-        """Call `then` soon with what the caches of a stream hold, and with whether all have answered in time.
-
-        It is called on a thread that it must not keep.
-
-        Raises:
-            TransportError: the network is closed.
-        """
-
-
-class TakeCached(Protocol):
-    """Takes the content of a stream's cache."""
-
-    def __call__(self, stream: str, packets: list[Packet], *, complete: bool) -> None:
-        """Take it; called on any thread."""
-
-
 class CacheRecovery:
     """Publishers' caches that one session waits for; for the tracking thread alone.
 
@@ -229,20 +207,21 @@ class CacheRecovery:
         self._asked.clear()
         self._most = MOST
 
-    def awaited(self, session: Session, take: TakeCached) -> bool:
-        """Return whether caches may hold what has not come; ask those that were not."""
+    def awaited(self, session: Session, take: Callable[[str, list[Packet], bool], None]) -> bool:
+        """Return whether caches may hold what has not come; ask those that were not.
+
+        Args:
+            session: has the sensors.
+            take: called on any thread with a stream, what its cache held, and whether it has answered in full.
+        """
         caches = self._streams.caches
         awaited = caches.awaited(self._session, session.sensors)
         for stream, is_there in awaited.items():
             if is_there and stream not in self._asked:
                 self._asked.add(stream)
                 with contextlib.suppress(TransportError):  # the end
-                    caches.ask_cache(stream, partial(_take, take, stream))
+                    caches.ask_cache(stream, partial(take, stream))
         # Tokens of sensors that a young session does not know may be on their way.
         young_ns = session.young_since_ns
         is_young = young_ns is not None and time.monotonic_ns() - young_ns < BACK_NS
         return is_young or not awaited.keys() <= self._answered
-
-
-def _take(take: TakeCached, stream: str, packets: list[Packet], complete: bool) -> None:  # noqa: FBT001 - as the network calls it
-    take(stream, packets, complete=complete)

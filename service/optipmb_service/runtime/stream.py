@@ -342,7 +342,7 @@ class Stream:
             self._changed = True
             self.deliver(session.recovered(time.monotonic_ns()))
 
-    def _take_cached(self, stream: str, packets: list[Packet], *, complete: bool) -> None:
+    def _take_cached(self, stream: str, packets: list[Packet], complete: bool) -> None:  # noqa: FBT001 - as the network calls it
         """Take what a cache held; one that has not answered is asked again. Called on any thread."""
         self.backlog.recover(packets)
         then = partial(self.on_caches_answered if complete else self._caches.ask_again, stream)

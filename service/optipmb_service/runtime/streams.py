@@ -29,10 +29,11 @@ if TYPE_CHECKING:
     from optipmb_service.cluster.member import Member
     from optipmb_service.observability.metrics import Metrics
     from optipmb_service.observability.problem_reporter import ProblemReporter
+    from optipmb_service.runtime.intake import Intake
     from optipmb_service.runtime.persistence import CheckpointWriter
     from optipmb_service.runtime.ports import Packet, Publisher
     from optipmb_service.runtime.profiles import Profiles
-    from optipmb_service.runtime.recovery import Caches, DetectionsLog
+    from optipmb_service.runtime.recovery import Log
     from optipmb_service.runtime.scheduler import Scheduler
     from optipmb_service.session.values import Incarnation
     from optipmb_service.settings.model import Settings
@@ -93,7 +94,7 @@ class Streams:
         tracker: makes the trackers of sessions.
     """
 
-    caches: Caches
+    caches: Intake
     """Publishers' caches; set before anything is received."""
 
     def __init__(  # noqa: PLR0913 - the parts that it brings together
@@ -106,7 +107,7 @@ class Streams:
         scheduler: Scheduler,
         member: Member,
         checkpoints: CheckpointWriter,
-        log: DetectionsLog | None,
+        log: Log | None,
         arm: Callable[[Callable[[], None], int], None],
         metrics: Metrics,
         tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,

@@ -15,7 +15,7 @@ from optipmb_service.cluster.log_position import Missed, Position
 from optipmb_service.cluster.log_reader import LogReader
 from optipmb_service.cluster.message_log import LogMessage, MessageLog, Retention
 from optipmb_service.runtime.profiles import Fusion
-from optipmb_service.runtime.recovery import DetectionsLog
+from optipmb_service.runtime.recovery import Log
 from optipmb_service.session.checkpoint import forgotten
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
@@ -115,7 +115,7 @@ def test_a_session_begins_whatever_the_log_says(filled: MessageLog, monkeypatch:
 
     found: list[Sequence[object]] = []
     monkeypatch.setattr(reader, "missed", Mock(side_effect=ValueError("a mistake")))
-    DetectionsLog(reader, Keys(), Fusion(())).fetch(STREAM, None, found.append, found.append)
+    Log(reader, Keys(), Fusion(())).fetch(STREAM, None, found.append, found.append)
     assert found == [[]]
 
 
@@ -130,7 +130,7 @@ def test_what_was_closed_does_not_come_back(filled: MessageLog) -> None:
         found.append(packets)
         came.set()
 
-    frames = DetectionsLog(LogReader(filled, 600.0), Keys(), Fusion(("a/*/*",)))
+    frames = Log(LogReader(filled, 600.0), Keys(), Fusion(("a/*/*",)))
     for checkpoint in (None, closed):
         came.clear()
         frames.fetch("a/b/fused", checkpoint, take, lambda _: None)

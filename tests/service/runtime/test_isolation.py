@@ -178,7 +178,7 @@ def test_catching_up_from_the_log_keeps_no_other_waiting(
                 assert gate.wait(60)
             return self._tracker.step(density, frame)
 
-    monkeypatch.setattr("optipmb_service.app.service.open_log", lambda _: (Log(), []))
+    monkeypatch.setattr("optipmb_service.app.service.open_log", lambda _: Log())
     service, endpoint = start(tracker=Noted)
     with Node(endpoint) as node:
         node.send(CAREFUL.detections(0))

@@ -20,7 +20,9 @@ from optipmb_schemas import Keys, Limits, Tracks, TracksRequest, decode, encode,
 from optipmb_service.cluster.log_reader import LogReader
 from optipmb_service.cluster.message_log import MessageLog
 from optipmb_service.runtime import kept_tracks as service_tracks
-from optipmb_service.runtime.kept_tracks import LATE_NS, LoggedTracks, RecentTracks, TracksRange
+from optipmb_service.runtime.kept_tracks import LATE_NS, TracksRange
+from optipmb_service.runtime.profiles import Fusion
+from optipmb_service.runtime.recovery import Log
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_client, open_router
 
@@ -156,8 +158,8 @@ def test_a_search_that_fails_takes_no_room(monkeypatch: pytest.MonkeyPatch) -> N
     """A query that fails by an error that nobody foresaw is answered, and so is the next."""
     monkeypatch.setattr(service_tracks, "AT_ONCE", 1)
     kept, refused = Mock(), queue.SimpleQueue[Any]()
-    kept.find.side_effect = ValueError("a mistake")
-    query = service_tracks.TrackQuery([kept], "test", Limits())
+    kept.tracks.side_effect = ValueError("a mistake")
+    query = service_tracks.TrackQuery(kept, Mock(), "test", Limits())
     for _ in range(service_tracks.AT_ONCE + 1):
         query.answer(Mock(payload=b"", refuse=refused.put), SENSOR.stream)
         problem = refused.get(timeout=60.0)
@@ -176,8 +178,7 @@ def test_caches_that_do_not_answer_keep_nothing_of_the_log_waiting(tmp_path: Pat
     with NatsProcess(tmp_path) as nats:
         reader = LogReader(log := MessageLog([nats.url], KEYS.prefix), 1.0)
         until(lambda: not log.connection.failure, "it is connected")
-        kept = [LoggedTracks(reader), RecentTracks(recent, Limits())]
-        query = service_tracks.TrackQuery(kept, "test", Limits())
+        query = service_tracks.TrackQuery(Log(reader, KEYS, Fusion()), recent, "test", Limits())
         try:
             query.answer(Mock(payload=b"", finish=finished.set), SENSOR.stream)
             assert asked.wait(60.0)
