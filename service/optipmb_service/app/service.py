@@ -131,7 +131,6 @@ class Service:
             status=self.status,
             metrics=self._metrics.text,
             samples=self._metrics.samples,
-            member=self._member,
             hand_over=self._intake.hand_over,
             workers=settings.workers,
         )

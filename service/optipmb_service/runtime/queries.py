@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from optipmb_service.cluster.leases import MemberLease
-    from optipmb_service.cluster.member import Member
     from optipmb_service.runtime.kept_tracks import TrackQuery
     from optipmb_service.runtime.ports import Packet, Request
     from optipmb_service.runtime.stream import Stream
@@ -66,16 +66,27 @@ _Command: TypeAlias = "Callable[[Stream, Request], _State | None]"
 """Answers a request, or returns the state that is to be answered."""
 
 
-def guarded(request: Request, answer: Callable[[], Future[None] | None]) -> None:
+def guarded(
+    request: Request, answer: Callable[[], Future[None] | None], *, instance: str = "", stream: str = ""
+) -> None:
     """Answer, and finish the request whatever happens: an asker must not wait for its timeout.
 
     Args:
-        request: what is asked.
-        answer: answers it, or returns what will do so, and finish it, on another thread.
+        request: the query.
+        answer: answers it, or returns what will do so, and finish it, on another thread. A `MessageError` or
+            `RefusedError` that it raises is the answer.
+        instance: name of the service, for problems.
+        stream: whose problem it is.
     """
     began_ns, later = time.monotonic_ns(), None
     try:
-        later = answer()
+        try:
+            later = answer()
+        except schemas.MessageError as error:
+            request.refuse(problem_with(error, instance=instance, stream=stream))
+        except RefusedError as error:
+            refused = schemas.MessageError("invalid_value", error.path, error.expected, error.received)
+            request.refuse(problem_with(refused, instance=instance, stream=stream, code="refused"))
     except TransportError as error:
         log.warning("reply_failed", key=request.key, error=str(error))
     finally:
@@ -85,7 +96,7 @@ def guarded(request: Request, answer: Callable[[], Future[None] | None]) -> None
 
 
 def problem_with(error: schemas.MessageError, *, instance: str, stream: str = "", code: str = "") -> schemas.Problem:
-    """Return what is answered to a query that is refused, by default with the code of its error."""
+    """Return the answer to a query that is refused, by default with the code of its error."""
     return problem_of(
         code or error.code,
         stream=stream,
@@ -111,63 +122,65 @@ class StreamQueries:
         self._keys = streams.keys
         self._digests = ThreadPoolExecutor(1, "digest")
         self._room_for_wildcards = threading.Semaphore(MOST_WILDCARDS)
-
-    def answer(self, request: Request) -> None:
-        """Answer what concerns sessions, here or by the stream."""
-        name = request.key.rpartition("/")[2]
-        if "*" in request.key:
-            self._answer_many(request)
-            return
-        stream = request.key.removeprefix(f"{self._keys.prefix}/").removesuffix(f"/q/{name}")
-        try:
-            self._keys.tracks(stream)
-        except schemas.MessageError as error:
-            nowhere = self._problem("", error)
-            guarded(request, lambda: request.refuse(nowhere))
-            return
-        session = self._streams.fusion.session_of(stream)
-        if self._streams.elsewhere(session):
-            request.finish()  # another instance tracks the stream, and answers
-            return
-        if session != stream:
-            shared = schemas.MessageError("invalid_value", "key", f"{session}, the session that it shares", stream)
-            guarded(request, lambda: request.refuse(self._problem(stream, shared)))
-            return
-        if name == "tracks":
-            self._tracks.answer(request, stream)
-            return
-        commands: dict[str, tuple[_Command, bool]] = {
+        self._commands: dict[str, tuple[_Command, bool]] = {
             "state": (lambda one, _: self._state(one), True),
             "density": (self._density, True),
             "reset": (self._reset, False),
             "parameters": (self._parameters, False),
         }
-        if name not in commands:
-            unknown = schemas.MessageError(
-                "invalid_value", "key", f"one of q/{', q/'.join((*commands, 'tracks'))}", f"q/{name}"
-            )
-            guarded(request, lambda: request.refuse(self._problem(stream, unknown)))
+        """Commands by name, each with whether it goes before the frames that wait."""
+
+    def answer(self, request: Request) -> None:
+        """Answer what concerns sessions, here or by the stream."""
+        name = request.key.rpartition("/")[2]
+        stream = request.key.removeprefix(f"{self._keys.prefix}/").removesuffix(f"/q/{name}")
+        if "*" in request.key:
+            self._answer_many(request)
             return
-        command, urgent = commands[name]
+        try:
+            self._keys.tracks(stream)
+        except schemas.MessageError as error:
+            self._refuse(request, error)
+            return
+        session = self._streams.fusion.session_of(stream)
+        try:
+            if self._streams.elsewhere(session):
+                request.finish()  # another instance tracks the stream, and answers
+            elif name == "tracks" and session == stream:
+                self._tracks.answer(request, stream)
+            else:
+                self._command(request, name, stream, session)
+        except schemas.MessageError as error:
+            self._refuse(request, error, stream)
+
+    def _refuse(self, request: Request, error: Exception, stream: str = "") -> None:
+        guarded(request, partial(_raise, error), instance=self._streams.instance, stream=stream)
+
+    def _command(self, request: Request, name: str, stream: str, session: str) -> None:
+        """Have a stream answer.
+
+        Raises:
+            MessageError: there is no such query, or no room for the stream.
+        """
+        if session != stream:
+            raise schemas.MessageError("invalid_value", "key", f"{session}, the session that it shares", stream)
+        if name not in self._commands:
+            expected = f"one of q/{', q/'.join((*self._commands, 'tracks'))}"
+            raise schemas.MessageError("invalid_value", "key", expected, f"q/{name}")
+        command, urgent = self._commands[name]
 
         def answer(one: Stream) -> None:
-            guarded(request, lambda: self._run(command, one, request))
+            guarded(request, lambda: self._run(command, one, request), instance=self._streams.instance, stream=stream)
 
         # A stream can be set up ahead of its first frame, by a valid request.
         creates = name == "parameters" and self._sets(request)
         if not self._streams.command(stream, lambda one: one.ask(answer, create=creates), urgent=urgent):
-            full = schemas.MessageError("too_large", "key", "fewer new streams at once", "another one")
-            guarded(request, lambda: request.refuse(self._problem(stream, full)))
+            raise schemas.MessageError("too_large", "key", "fewer new streams at once", "another one")
 
     def _sets(self, request: Request) -> bool:
         """Whether a request for parameters is valid and changes any."""
         try:
-            asked = schemas.decode(
-                request.payload or b"",
-                schemas.SessionParameters,
-                encoding=request.encoding,
-                limits=self._streams.limits,
-            )
+            asked = self._payload(request, schemas.SessionParameters())
         except schemas.MessageError:
             return False
         known = asked.profile is None or self._streams.profiles.named(asked.profile) is not None
@@ -180,10 +193,10 @@ class StreamQueries:
             request.finish()
             return
         if not self._room_for_wildcards.acquire(blocking=False):
-            full = schemas.MessageError(
-                "too_large", "key", f"at most {MOST_WILDCARDS} queries about many streams open at once", "another one"
+            full = RefusedError(
+                "key", f"at most {MOST_WILDCARDS} queries about many streams open at once", "another one"
             )
-            guarded(request, lambda: request.refuse(self._problem("", full, code="refused")))
+            guarded(request, partial(_raise, full), instance=self._streams.instance)
             return
 
         def finish() -> None:
@@ -252,47 +265,29 @@ class StreamQueries:
         )
         request.answer(self._keys.query(stream.name, "density"), message)
 
-    def _reset(self, stream: Stream, request: Request) -> _State | None:
-        asked = self._payload(stream, request, schemas.ResetRequest, schemas.ResetRequest())
-        if asked is None:
-            return None
+    def _reset(self, stream: Stream, request: Request) -> _State:
+        asked = self._payload(request, schemas.ResetRequest())
         session = stream.session
-        if session is not None and asked.close:
+        if session is None:
+            return self._nothing(stream.name, "closed" if asked.close else "new"), None
+        if asked.close:
             stream.close_session("query")
             return session.state(closed=True), None
-        if session is not None:
-            stream.deliver(session.reset())
-            return self._state(stream)
-        return self._nothing(stream.name, "closed" if asked.close else "new"), None
+        stream.deliver(session.reset())
+        return self._state(stream)
 
     def _parameters(self, stream: Stream, request: Request) -> None:
         empty = schemas.SessionParameters()
-        asked = self._payload(stream, request, schemas.SessionParameters, empty)
-        if asked is None:
-            return
-        parameters = None
-        if asked.profile is not None:
-            parameters = self._streams.profiles.named(asked.profile)
-            if parameters is None:
-                expected = f"one of {', '.join(self._streams.profiles.names)}"
-                error = schemas.MessageError("invalid_value", "profile", expected, repr(asked.profile))
-                request.refuse(self._problem(stream.name, error))
-                return
-        if asked != empty and stream.session is None:
-            full = schemas.MessageError(
-                "too_large", "stream", "a stream that is tracked already", "no room for another"
-            )
-            request.refuse(self._problem(stream.name, full, code="refused"))
-            return
-        session = stream.session
-        if session is not None and asked != empty:
-            try:
-                horizons = None if asked.horizons is None else asked.horizons.tolist()
-                stream.deliver(session.configure(parameters, asked.cloud_wait_s, horizons, restart=asked.restart))
-            except RefusedError as error:
-                refusal = schemas.MessageError("invalid_value", error.path, error.expected, error.received)
-                request.refuse(self._problem(stream.name, refusal, code="refused"))
-                return
+        asked = self._payload(request, empty)
+        parameters = None if asked.profile is None else self._streams.profiles.named(asked.profile)
+        if asked.profile is not None and parameters is None:
+            expected = f"one of {', '.join(self._streams.profiles.names)}"
+            raise schemas.MessageError("invalid_value", "profile", expected, repr(asked.profile))
+        if asked != empty:
+            if stream.session is None:
+                raise RefusedError("stream", "a stream that is tracked already", "no room for another")
+            horizons = None if asked.horizons is None else asked.horizons.tolist()
+            stream.deliver(stream.session.configure(parameters, asked.cloud_wait_s, horizons, restart=asked.restart))
         request.answer(self._keys.query(stream.name, "parameters"), self._in_force(stream))
 
     def _in_force(self, stream: Stream) -> schemas.SessionParameters:
@@ -306,24 +301,24 @@ class StreamQueries:
             session=session.session if session else None,
         )
 
-    def _nothing(self, name: str, state: Literal["new", "closed"]) -> schemas.SessionState:
+    def _nothing(self, stream: str, state: Literal["new", "closed"]) -> schemas.SessionState:
         """Return the state of a stream that has no session."""
-        return schemas.SessionState(
-            stream=name, session=NO_SESSION, state=state, profile=self._streams.profiles.of(name).name
-        )
+        profile = self._streams.profiles.of(stream).name
+        return schemas.SessionState(stream=stream, session=NO_SESSION, state=state, profile=profile)
 
-    def _payload(self, stream: Stream, request: Request, expected: type[_T], empty: _T) -> _T | None:
-        """Return what was sent along, `empty` when nothing was, None after a refusal."""
+    def _payload(self, request: Request, empty: _T) -> _T:
+        """Return the payload of a request, `empty` without one.
+
+        Raises:
+            MessageError: it is not valid.
+        """
         if not request.payload:
             return empty
-        try:
-            return schemas.decode(request.payload, expected, encoding=request.encoding, limits=self._streams.limits)
-        except schemas.MessageError as error:
-            request.refuse(self._problem(stream.name, error))
-            return None
+        return schemas.decode(request.payload, type(empty), encoding=request.encoding, limits=self._streams.limits)
 
-    def _problem(self, name: str, error: schemas.MessageError, *, code: str = "") -> schemas.Problem:
-        return problem_with(error, instance=self._streams.instance, stream=name, code=code)
+
+def _raise(error: Exception) -> None:
+    raise error
 
 
 class _Countdown:
@@ -347,12 +342,11 @@ class ServiceQueries:
 
     Args:
         streams: the streams.
-        status: makes the status of the service.
-        metrics: makes its metrics, in Prometheus' text format.
-        samples: makes its metrics as data for the parent of this process.
-        member: the partitions of this process.
+        status: returns the status of the service.
+        metrics: returns its metrics, in Prometheus' text format.
+        samples: returns its metrics as data for the parent of this process.
         hand_over: gives what was received lately of sessions that are tracked elsewhere now.
-        workers: how many processes the service has.
+        workers: number of processes of the service.
     """
 
     def __init__(
@@ -362,18 +356,15 @@ class ServiceQueries:
         status: Callable[[], schemas.ServiceStatus],
         metrics: Callable[[], bytes],
         samples: Callable[[], bytes],
-        member: Member,
         hand_over: Callable[[Iterable[str], Callable[[Packet], None]], None],
         workers: int,
     ) -> None:
-        self._instance = streams.instance
+        self._streams = streams
         self._keys = streams.keys
-        self._limits = streams.limits
-        self._fusion = streams.fusion
+        self._member = streams.member
         self._status = status
         self._metrics = metrics
         self._samples = samples
-        self._member = member
         self._handed_over = hand_over
         self._workers = workers
         self._moves = ThreadPoolExecutor(1, "move")
@@ -382,22 +373,22 @@ class ServiceQueries:
 
     def answer(self, request: Request) -> None:
         """Answer with the status of the service, its metrics, or both when the key has a `*`; or have streams moved."""
-        instance = self._instance
+        instance = self._streams.instance
+        orders = {self._keys.move(instance): self._move, self._keys.drain(instance): self._drain}
         if request.key == self._keys.recent():
             self._handovers.submit(guarded, request, lambda: self._hand_over(request))
-            return
-        if request.key in {self._keys.move(instance), self._keys.drain(instance)}:
-            if self._moving.acquire(blocking=False):
-                moves = self._move if request.key == self._keys.move(instance) else self._drain
-                self._moves.submit(self._move_in_turn, request, moves)
-            else:
-                many = schemas.MessageError("invalid_value", "worker", f"at most {MOVES} moves at a time", "more")
-                guarded(request, lambda: request.refuse(self._problem(many)))
-            return
-        guarded(request, lambda: self._report(request, self._keys.status(instance), self._keys.metrics(instance)))
+        elif request.key not in orders:
+            guarded(request, lambda: self._report(request))
+        elif self._moving.acquire(blocking=False):
+            self._moves.submit(self._order, request, orders[request.key])
+        else:
+            many = schemas.MessageError("invalid_value", "worker", f"at most {MOVES} moves at a time", "more")
+            guarded(request, partial(_raise, many), instance=instance)
 
-    def _report(self, request: Request, status: str, metrics: str) -> None:
-        if request.key == self._keys.samples(self._instance):
+    def _report(self, request: Request) -> None:
+        instance = self._streams.instance
+        status, metrics = self._keys.status(instance), self._keys.metrics(instance)
+        if request.key == self._keys.samples(instance):
             request.answer_text(request.key, self._samples(), JSON)
             return
         if request.matches(status):
@@ -407,56 +398,44 @@ class ServiceQueries:
 
     def _hand_over(self, request: Request) -> None:
         """Answer with what was received lately of sessions, whose names are lines, to who tracks them now."""
-        key = self._keys.recent(self._instance)
+        key = self._keys.recent(self._streams.instance)
 
         def give(packet: Packet) -> None:
             request.answer_text(key, packet.payload or b"", packet.encoding, about=packet.key)
 
         self._handed_over((request.payload or b"").decode("ascii", "replace").splitlines(), give)
 
-    def _move_in_turn(self, request: Request, moves: Callable[[Request], None]) -> None:
+    def _order(self, request: Request, order: Callable[[Request], None]) -> None:
         try:
-            guarded(request, lambda: moves(request))
+            guarded(request, lambda: order(request), instance=self._streams.instance)
         finally:
             self._moving.release()
 
     def _move(self, request: Request) -> None:
         """Have a stream brought here, and say so."""
+        asked = move_asked(request, self._streams.limits, self._workers)
         try:
-            asked = move_asked(request, self._limits, self._workers)
-        except schemas.MessageError as error:
-            request.refuse(self._problem(error))
-            return
-        try:
-            received = "" if self._member.bring(self._fusion.session_of(asked.stream), MOVE_S) else "none in time"
+            brought = self._member.bring(self._streams.fusion.session_of(asked.stream), MOVE_S)
+            received = "" if brought else "none in time"
         except StoreError as error:
             received = str(error)
         if received:
             failed = schemas.MessageError("invalid_value", "worker", "a worker to which the stream comes", received)
-            request.refuse(self._problem(failed, asked.stream))
+            request.refuse(problem_with(failed, instance=self._streams.instance, stream=asked.stream))
         else:
             request.answer(request.key, asked)
 
     def _drain(self, request: Request) -> None:
         """Have all streams taken by others, and say so."""
-        try:
-            asked = drain_asked(request, self._limits)
-        except schemas.MessageError as error:
-            request.refuse(self._problem(error))
-            return
+        asked = drain_asked(request, self._streams.limits)
         received = "none" if asked.drain and not self._member.others else ""
         if not received:
             self._member.drain(drains=asked.drain)
             if asked.drain and not self._member.drained(MOVE_S):
                 received = UNDRAINED
         if received:
-            failed = schemas.MessageError("invalid_value", "drain", "another member that takes the streams", received)
-            request.refuse(self._problem(failed))
-        else:
-            request.answer(request.key, asked)
-
-    def _problem(self, error: schemas.MessageError, stream: str = "") -> schemas.Problem:
-        return problem_with(error, instance=self._instance, stream=stream)
+            raise schemas.MessageError("invalid_value", "drain", "another member that takes the streams", received)
+        request.answer(request.key, asked)
 
 
 def move_asked(request: Request, limits: schemas.Limits, workers: int) -> schemas.MoveRequest:
