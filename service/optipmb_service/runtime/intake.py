@@ -11,7 +11,8 @@ From the partitions that are held and the streams that are known follows a set o
   tokens are dropped unread. It alone watches who tracks which stream.
 
 New subscriptions are declared before old ones are withdrawn. A stream that comes here from another member is held until
-the others have answered what they have received of it lately; then its session goes on with that.
+the others have answered what they have received of it lately; then its session goes on with that. The member that has a
+partition asks once for each session, and the end of a process waits, for a moment, until all was asked for.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from optipmb_service.runtime.directory import StreamDirectory, node_of
 from optipmb_service.session.values import SECOND
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from optipmb_service.cluster.member import Member
     from optipmb_service.runtime.ports import Packet
@@ -155,7 +156,9 @@ class Intake:
         self._came: set[int] = set()
         self._left: dict[int, int] = {}
         self._received: set[int] = set()
-        self._handover = Handover(streams, member, inputs)
+        self._owed: set[str] = set()
+        """Sessions that have left, as long as the member that has them has not asked for what is held of them."""
+        self._given = threading.Condition()
         self._wake = threading.Event()
         self._hurry = threading.Event()
         self._expires_ns = 0
@@ -189,7 +192,9 @@ class Intake:
             elif change is Change.LOST:
                 self._came.discard(partition)
                 self._left[partition] = time.monotonic_ns() + self._linger_ns
-        (self._handover.lost if change is Change.LOST else self._handover.kept)(partition)
+        held = self._streams.held({partition})
+        with self._given:
+            (self._owed.update if change is Change.LOST else self._owed.difference_update)(held)
         self._hurry.set()
         self._wake.set()
 
@@ -201,13 +206,25 @@ class Intake:
 
     def hand_over(self, sessions: Iterable[str], give: Callable[[Packet], None]) -> None:
         """Give what was received lately of sessions that are tracked elsewhere now, the oldest first."""
-        given = self._handover.give(
-            list(sessions), lambda one: DISCOVERY in self._received or one in self._received, give
-        )
+        sessions = list(sessions)
+        if asked := [session for session in sessions if self._may_have(session)]:
+            self._drain(asked)
+            for packet in self._streams.recent(asked):
+                give(packet)
+            with self._given:
+                self._owed.difference_update(asked)
+                self._given.notify_all()
+        # Who asks has subscribed already.
+        still = {partition_of(session) for session in self._owed.copy()}
         with self._lock:
-            for partition in given:
+            for partition in {partition_of(session) for session in sessions} - still:
                 self._left.pop(partition, None)
         self._wake.set()
+
+    def handed_over(self, timeout: float) -> bool:
+        """Wait until who has the partitions that were left has asked, at most so long (s); False when that was it."""
+        with self._given:
+            return self._given.wait_for(lambda: not self._owed, timeout)
 
     def awaited(self, session: str, sensors: Iterable[str]) -> dict[str, bool]:
         """Return the streams of a session whose caches may hold something, each with whether its publisher is there.
@@ -226,10 +243,6 @@ class Intake:
         It is called on a thread that it must not keep.
         """
         self._inputs.ask_cache(stream, lambda found, complete: then([packet for packet, _ in found], complete))
-
-    def handed_over(self, timeout: float) -> bool:
-        """Wait until who has the partitions that were left has asked, at most so long (s); False when that was it."""
-        return self._handover.wait(timeout)
 
     # From the network
 
@@ -342,7 +355,35 @@ class Intake:
             del streams[stream]
         self._known = streams
         if coming:
-            self._handover.take(coming)
+            self._take_up(coming)
+
+    def _take_up(self, sessions: Sequence[str]) -> None:
+        """Go on with sessions that came here, each with what others have received of it lately."""
+        packets: dict[str, list[Packet]] = {session: [] for session in sessions}
+        try:
+            for packet, _ in self._inputs.ask_recent(sessions):
+                _, session = self._streams.parsed(packet.key)
+                if session in packets:
+                    packets[session].append(packet)
+        finally:
+            for session, found in packets.items():
+                self._streams.take_up(session, found)
+
+    def _may_have(self, session: str) -> bool:
+        """Whether something of a session that is tracked elsewhere may have come, or be on its way through here."""
+        if self._member.holds(session):
+            return False
+        received = DISCOVERY in self._received or partition_of(session) in self._received
+        return received or self._streams.keeps(session)
+
+    def _drain(self, sessions: list[str]) -> None:
+        """Wait for what is on its way through this process, for a moment at most."""
+        ends = time.monotonic() + DRAIN_S
+        passed = threading.Event()
+        self._inputs.pass_through(passed.set)
+        passed.wait(DRAIN_S)
+        while any(self._streams.waits(session) for session in sessions) and time.monotonic() < ends:
+            time.sleep(DRAIN_POLL_S)
 
     def _watch_owners(self, *, discovering: bool) -> None:
         if discovering is not self._watching or (discovering and self._streams.doubts_owners):
@@ -400,90 +441,3 @@ class Intake:
             and self._streams.of(session) is None
         }  # fmt: skip
         return sorted(coming | self._streams.held(came) if came else coming)
-
-
-class Handover:
-    """Gives what was received of sessions that are tracked elsewhere now, and asks for that of those that came here.
-
-    The member that has a partition asks all others once for each session. Until all that is owed was asked for, the end
-    of a process waits, for a moment at most.
-
-    Args:
-        streams: hold the messages.
-        member: knows which partitions are held.
-        inputs: the network.
-    """
-
-    def __init__(self, streams: Streams, member: Member, inputs: Inputs) -> None:
-        self._streams = streams
-        self._member = member
-        self._inputs = inputs
-        self._owed: set[str] = set()
-        self._given = threading.Condition()
-
-    def lost(self, partition: int) -> None:
-        """Owe the sessions of a partition that was left."""
-        with self._given:
-            self._owed.update(self._streams.held({partition}))
-
-    def kept(self, partition: int) -> None:
-        """Owe nothing of a partition that is not left, or not yet."""
-        with self._given:
-            self._owed.difference_update(self._streams.held({partition}))
-
-    def give(
-        self, sessions: Collection[str], received: Callable[[int], bool], give: Callable[[Packet], None]
-    ) -> set[int]:
-        """Give what was received lately of sessions, the oldest first.
-
-        Args:
-            sessions: whose messages are asked for.
-            received: whether messages of a partition are received here.
-            give: takes each packet.
-
-        Returns:
-            The partitions of these sessions of which nothing is owed any longer.
-        """
-        asked = [session for session in sessions if self._may_have(session, received)]
-        if asked:
-            self._drain(asked)
-            for packet in self._streams.recent(asked):
-                give(packet)
-            with self._given:
-                self._owed.difference_update(asked)
-                self._given.notify_all()
-        # Who asks has subscribed already.
-        still = {partition_of(session) for session in self._owed.copy()}
-        return {partition_of(session) for session in sessions} - still
-
-    def take(self, sessions: Sequence[str]) -> None:
-        """Go on with sessions that came here, each with what others have received of it lately."""
-        packets: dict[str, list[Packet]] = {session: [] for session in sessions}
-        try:
-            for packet, _ in self._inputs.ask_recent(sessions):
-                _, session = self._streams.parsed(packet.key)
-                if session in packets:
-                    packets[session].append(packet)
-        finally:
-            for session, found in packets.items():
-                self._streams.take_up(session, found)
-
-    def wait(self, timeout: float) -> bool:
-        """Wait until all that is owed was asked for, at most so long (s); False when that was it."""
-        with self._given:
-            return self._given.wait_for(lambda: not self._owed, timeout)
-
-    def _may_have(self, session: str, received: Callable[[int], bool]) -> bool:
-        """Whether something of a session that is tracked elsewhere may have come, or be on its way through here."""
-        if self._member.holds(session):
-            return False
-        return received(partition_of(session)) or self._streams.keeps(session)
-
-    def _drain(self, sessions: list[str]) -> None:
-        """Wait for what is on its way through this process, for a moment at most."""
-        ends = time.monotonic() + DRAIN_S
-        passed = threading.Event()
-        self._inputs.pass_through(passed.set)
-        passed.wait(DRAIN_S)
-        while any(self._streams.waits(session) for session in sessions) and time.monotonic() < ends:
-            time.sleep(DRAIN_POLL_S)
