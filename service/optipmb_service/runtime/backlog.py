@@ -151,10 +151,11 @@ class Backlog:
     def detach(self) -> bool:
         """End with a stream that has nothing left to do; False: messages are held for another member."""
         with self._lock:
-            foreign = self.state == "foreign"
+            if self._held:
+                self.state = "foreign"
             self._schedule = None
-            self.closed = not foreign
-            return not foreign
+            self.closed = self.state != "foreign"
+            return self.closed
 
     def close_empty(self) -> bool:
         """Close a foreign backlog that has neither messages nor a stream; False when it has."""
