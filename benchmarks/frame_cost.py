@@ -96,7 +96,7 @@ class Network:
         """Run the actors until none has anything to do."""
         while self.waiting:
             actor = self.waiting.pop(0)
-            if actor.work():
+            if (actor if callable(actor) else actor.work)():
                 self.waiting.append(actor)
 
     def holds(self, stream: str) -> bool:

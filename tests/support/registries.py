@@ -26,12 +26,12 @@ class Around:
     strained = unlinked = False
 
     def __init__(self) -> None:
-        self._working: list[Any] = []
+        self._working: list[Callable[[], bool]] = []
         self.kept: dict[str, Checkpoint] = {}
 
-    def submit(self, stream: Any) -> None:
-        """Take a stream that has something to do."""
-        self._working.append(stream)
+    def submit(self, work: Callable[[], bool]) -> None:
+        """Take work."""
+        self._working.append(work)
 
     def run(self) -> None:
         """Give turns until no stream has anything to do."""
@@ -42,9 +42,9 @@ class Around:
         """Run what was submitted first; False when there was nothing."""
         if not self._working:
             return False
-        stream = self._working.pop(0)
-        if stream.work():
-            self._working.append(stream)
+        work = self._working.pop(0)
+        if work():
+            self._working.append(work)
         return True
 
     def put(self, checkpoint: Checkpoint, _: int | None, then: Callable[[], None] | None = None) -> None:

@@ -97,7 +97,7 @@ class Stream:
         self._asking: list[Callable[[], None]] = []
         self._armed_ns: int | None = None
         self._fence: int | None = None
-        backlog.attach(partial(streams.scheduler.submit, self))
+        backlog.attach(partial(streams.scheduler.submit, self.work))
         self._counts = StreamCounters(backlog)
 
     # A turn

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -400,7 +400,15 @@ class Streams:
         """Have every session that changed give its state to the checkpoint writer."""
         changed = [stream for stream in self._all() if stream.changed]  # thousands may be silent
         if changed:
-            self.scheduler.submit(_Keeping(changed))
+            self.scheduler.submit(partial(self._keep_some, iter(changed)))
+
+    @staticmethod
+    def _keep_some(changed: Iterator[Stream]) -> bool:
+        """Give some states, on the tracking thread; True: there are more, after the frames that wait."""
+        some = list(islice(changed, KEPT_AT_ONCE))
+        for stream in some:
+            stream.keep()
+        return len(some) == KEPT_AT_ONCE
 
     def keep_now(self) -> None:
         """Do the same in the calling thread, when the tracking thread has ended."""
@@ -583,20 +591,6 @@ class Streams:
             known = self._streams.get
             self._unproven = {one for one in self._unproven if not one.occupied and known(one.name) is one}
         return len(self._unproven) >= most
-
-
-class _Keeping:
-    """Has streams give their states to the checkpoint writer, on the tracking thread, few at a time."""
-
-    def __init__(self, streams: list[Stream]) -> None:
-        self._left = iter(streams)
-
-    def work(self) -> bool:
-        """Go on; True: there are more, after the frames that wait."""
-        some = list(islice(self._left, KEPT_AT_ONCE))
-        for stream in some:
-            stream.keep()
-        return len(some) == KEPT_AT_ONCE
 
 
 class Rivals:

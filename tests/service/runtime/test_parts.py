@@ -55,9 +55,9 @@ def test_workers_take_turns() -> None:
         def work(self) -> bool:
             return gate.wait(60) and False
 
-    scheduler.submit(Gate())
-    scheduler.submit(Work("long", 3))
-    scheduler.submit(Work("short", 2))
+    scheduler.submit(Gate().work)
+    scheduler.submit(Work("long", 3).work)
+    scheduler.submit(Work("short", 2).work)
     gate.set()
     assert done.wait(60)
     assert turns == ["long", "short", "long", "short", "long"]
@@ -78,8 +78,8 @@ def test_an_error_does_not_end_the_tracking_thread() -> None:
             return False
 
     scheduler = Scheduler()
-    scheduler.submit(Broken())
-    scheduler.submit(Sound())
+    scheduler.submit(Broken().work)
+    scheduler.submit(Sound().work)
     assert gate.wait(60)
     assert scheduler.close(5)
 
@@ -94,7 +94,7 @@ def test_a_step_that_does_not_end_does_not_keep_the_scheduler() -> None:
             return gate.wait(60) and False
 
     scheduler = Scheduler()
-    scheduler.submit(Stuck())
+    scheduler.submit(Stuck().work)
     assert entered.wait(60)
     assert not scheduler.close(0.05)
     gate.set()
