@@ -30,7 +30,7 @@ EVICT_EVERY_NS: Final = SECOND
 """A session is asked to close no more often than this."""
 
 REFUSED_NS: Final = SECOND // 10
-"""How long a stream without room is refused without another look."""
+"""Time for which a stream without room is refused without another look."""
 
 MAX_REFUSED: Final = 256
 """Streams for which that is remembered."""

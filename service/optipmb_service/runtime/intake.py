@@ -1,6 +1,6 @@
-"""What a member receives: the streams of its partitions, and of others what somebody has to receive.
+"""Intake: the subscriptions of a member.
 
-From the partitions that are held and the streams that are known follows a set of subscriptions, whatever came before:
+They follow from the partitions that it holds and the streams that are known, whatever came before:
 
 - all detections and all clouds, where this member holds all partitions;
 - else detections and clouds of each stream of its partitions, and of those that it left just now, for who has them
@@ -52,12 +52,12 @@ What those without a cache sent is asked for before the next are taken in.
 """
 
 REST: Final = 2.0
-"""How many times as long as a step took of the processor the thread rests before the next one."""
+"""Rest after a step, in times of the processor time that it took."""
 
 MOST_REST_S: Final = 0.5
 
 DRAIN_S: Final = 0.5
-"""How long a member that is asked for what came lately waits for what is still on its way through this process."""
+"""Longest wait, before messages are given to another member, for those that are on their way through this process."""
 
 DRAIN_POLL_S: Final = 0.005
 
@@ -65,7 +65,7 @@ Kind = Literal["detections", "points", "discovery"]
 
 
 class Input(NamedTuple):
-    """A subscription: what of a stream, or of all of them, and whether what was lost is recovered from a cache."""
+    """A subscription to a stream, or to all of them; `cached`: lost messages are recovered from a cache."""
 
     kind: Kind
     stream: str = ALL
@@ -73,7 +73,7 @@ class Input(NamedTuple):
 
 
 def _inputs(streams: Iterable[str]) -> set[Input]:
-    """Return all subscriptions that there may be of these streams, and those that are of no single one."""
+    """Return all possible subscriptions to these streams, and those to all streams."""
     kinds: tuple[Kind, Kind] = ("detections", "points")
     of_all = {Input("discovery"), Input("detections"), Input("points")}
     return of_all | {Input(kind, stream, cached) for stream in streams for kind in kinds for cached in (False, True)}
@@ -90,7 +90,7 @@ class Inputs(Protocol):
         passed_by: Callable[[str, int], None],
         answered: Callable[[str], None],
     ) -> None:
-        """Say where messages go, who decides which of those discovered do, who counts the rest, who hears of caches."""
+        """Register the receivers of messages, of discovered keys, of those that are dropped, and of complete caches."""
 
     def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
         """Receive a stream, or all of them; what was lost comes from the cache of the publisher where it has one."""
@@ -101,10 +101,10 @@ class Inputs(Protocol):
     def watch_streams(
         self, published: Callable[[str, str, bool], None], discovered: Callable[[str, bool], None]
     ) -> None:
-        """Tell of the tokens of publishers, and of streams that others announce; each True: it is there."""
+        """Report tokens of publishers, and streams that others announce; True: it is there, False: it has gone."""
 
     def watch_owners(self, on_owner: Callable[[str, str, bool], None] | None) -> None:
-        """Tell which instance tracks which stream, or does so no longer (False), from now on; None: nobody any more."""
+        """Report from now on which instance tracks which stream (False: no longer); None: stop."""
 
     def discover(self, streams: set[str]) -> None:
         """Announce these streams, and no others."""
@@ -148,7 +148,7 @@ class Intake:
         self._known: dict[str, bool] = {}
         """The streams whose inputs are in line, each with whether its publisher has a cache."""
         self._aligned: object = None
-        """What they follow from beside the streams: where it changes, all are looked at."""
+        """Inputs of the last step other than streams: when they change, all streams are looked at."""
         self._announced: set[str] = set()
         self._watching = False
         """Whether owners are watched."""
@@ -183,7 +183,7 @@ class Intake:
             self._thread.join(timeout)
 
     def changed(self, partition: int, change: Change) -> None:
-        """Take in what has become of a partition."""
+        """Follow a change of a partition."""
         self._streams.changed(partition, change)
         with self._lock:
             if change is Change.HELD:
@@ -268,7 +268,7 @@ class Intake:
                 self._wake.set()
 
     def _noticed(self, key: str, recoverable: bool) -> bool:  # noqa: FBT001 - as the network calls it
-        """Take in detections of whatever stream; False: the publisher has a token, and its member receives them."""
+        """Note detections of any stream; False: the publisher has a token, and its member receives them."""
         try:
             stream, _ = self._streams.parsed(key)
         except schemas.MessageError:
@@ -298,7 +298,7 @@ class Intake:
             self._hurry.wait(min(MOST_REST_S, REST * (time.thread_time() - began_s)))
 
     def _step(self) -> None:
-        """See what is held and known now, and act on it; the next step does again what failed in this one."""
+        """Bring the subscriptions in line with what is held and known; what fails is done again in the next step."""
         now_ns = time.monotonic_ns()
         with self._lock:
             came, self._came = self._came, set()
@@ -316,7 +316,7 @@ class Intake:
             raise
 
     def _align(self, came: set[int], held: set[int], received: set[int], now_ns: int) -> None:
-        """Bring the subscriptions in line, and take up what came here."""
+        """Declare and withdraw subscriptions, and take up sessions that came here."""
         everything = len(held) == PARTITIONS
         discovering = DISCOVERY in held
         if now_ns >= self._expires_ns:

@@ -33,7 +33,7 @@ MOST_BYTES: Final = 2**22
 """Bytes of an answer, but for its first stamp."""
 
 LATE_NS: Final = 5_000_000_000
-"""How much later in the log the tracks of a frame may be corrected; by stamps. Frames are inserted for a second."""
+"""Longest distance, by stamps, of a correction from the tracks of a frame. Frames are inserted for a second."""
 
 
 class _Published(Protocol):

@@ -44,7 +44,7 @@ MAX_DUMPS: Final = 32
 _T = TypeVar("_T")
 
 FAILED_NS: Final = 60 * 1_000_000_000
-"""How long after the last failure a stream's checkpoint is called failing; it is tried every second while it sends."""
+"""Time after the last failure for which a stream's checkpoint counts as failing."""
 
 DAY_S: Final = 86_400.0
 EXPIRE_EVERY_NS: Final = 3600 * 1_000_000_000
@@ -53,7 +53,7 @@ MAX_FAILED: Final = 1024
 """Streams whose failure is remembered."""
 
 SHOWN: Final = 3
-"""Of these, how many are named at once."""
+"""Failing streams that are named at once."""
 
 SETTLE_S: Final = 0.25
 """Between a checkpoint and its writing, time for the tracks to leave."""
@@ -125,7 +125,7 @@ class CheckpointWriter:
 
     @property
     def failure(self) -> str:
-        """Why the store, or the checkpoint of a stream, fails at present; empty while nothing does."""
+        """Present failure of the store, or of the checkpoint of a stream; empty while there is none."""
         if self._store_failure:
             return self._store_failure
         lately_ns = time.monotonic_ns() - FAILED_NS
@@ -326,7 +326,7 @@ class CheckpointWriter:
         """Encode one after the other, with pauses between them.
 
         Encoding holds the interpreter's lock for a millisecond. Forty in a row are forty milliseconds in which frames
-        only get what the interpreter takes away from this thread; a pause gives the lock to whoever waits for it.
+        only get what the interpreter takes away from this thread; a pause gives the lock to threads that wait for it.
         """
         pause_s = 0.0 if self._ended.is_set() else min(PAUSE_S, self._interval_s / 2 / len(checkpoints))
         encoded = {}

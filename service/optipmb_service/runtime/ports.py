@@ -64,14 +64,14 @@ class Request(Protocol):
 
     @property
     def payload(self) -> bytes | None:
-        """What was sent along."""
+        """The payload of the query."""
 
     @property
     def encoding(self) -> str:
         """The encoding of the payload."""
 
     def matches(self, key: str) -> bool:
-        """Tell whether the key expression that was asked includes a key."""
+        """Return whether the key expression that was asked includes a key."""
 
     def answer(self, key: str, message: schemas.Message) -> None:
         """Reply."""
@@ -83,7 +83,7 @@ class Request(Protocol):
         """Reply with an error."""
 
     def finish(self) -> None:
-        """Tell the asker that nothing follows."""
+        """End the replies."""
 
 
 class TransportError(Exception):

@@ -45,10 +45,10 @@ JSON = "application/json"
 """Zenoh encoding of the metrics as data."""
 
 MOVE_S = 15.0
-"""How long a stream may take to be moved; it takes a second."""
+"""Longest time for moving a stream; it takes a second."""
 
 UNDRAINED = "not all taken in time; it goes on draining until that is undone"
-"""Why a drain was not confirmed."""
+"""Reason of a drain that is not confirmed."""
 
 MOVES = 16
 """Moves that wait for each other."""

@@ -54,7 +54,7 @@ TURN_NS: Final = 5_000_000
 """Time after which they have it in any case."""
 
 REST: Final = 9
-"""How many times as long as a message took beyond its limit a sensor rests: it has a tenth of the time at most."""
+"""Rest of a sensor after a message beyond the limit, in times of what it took: it has a tenth of the time at most."""
 
 CLOUD_REFUSED: Final = {"invalid_value", "refused"}
 """Problems by which a session refuses a cloud: not valid, or of one sensor too many."""
@@ -89,7 +89,7 @@ class Stream:
         """Monotonic time until when messages of a sensor are refused that took too long."""
         self._changed = False
         self._incarnation: Incarnation | None = None
-        """What an earlier session left behind, while one is being opened; else None."""
+        """Incarnation of the earlier session while one is being opened, else None."""
         self._restore_only = False
         self._unread = Incarnation()
         """The highest ids of sessions whose checkpoints are of another version."""
@@ -629,13 +629,13 @@ class _Accounts(NamedTuple):
     """Terms of the totals, replaced in one assignment: readers never see a decrease or a message twice."""
 
     session: Session | None
-    """The one that counts now."""
+    """Session that counts now."""
     base: Counters
-    """What it had counted when it was opened."""
+    """Its counts when it was opened."""
     opened: MessageCounters
     """The traffic at that time."""
     traffic: MessageCounters
-    """What was counted outside it, and by the sessions before it."""
+    """Counts of messages outside it, and of earlier sessions."""
 
 
 class StreamCounters:

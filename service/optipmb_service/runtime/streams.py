@@ -63,7 +63,7 @@ PARTS: Final = 4
 """Parts of a stream's memory: queue, clouds, pending frames, window."""
 
 SWEEP_REST: Final = 200
-"""How many times as long as a look at all sessions took of the processor it rests before the next one."""
+"""Rest after a look at all sessions, in times of the processor time that it took."""
 
 MOST_REST_NS: Final = 5 * SECOND
 
