@@ -340,15 +340,18 @@ class Backlog:
             item = self._frames.popleft() if self._frames else None
             return self._unqueue(item) if isinstance(item, Packet) else item
 
+    def take_answered(self) -> set[str]:
+        """Take the streams whose caches are complete, once all was taken that came of them."""
+        with self._lock:
+            if self.state != "live" or self._missed or self._held:
+                return set()
+            answered, self.answered = self.answered, set()
+            return answered
+
     @property
     def empty(self) -> bool:
         """Whether nothing can be taken, or soon."""
         return not (self._frames or self._clouds or self._urgent or self._held or self._missed)
-
-    @property
-    def caught_up(self) -> bool:
-        """Whether all was taken that was missed or held."""
-        return self.state == "live" and not (self._missed or self._held)
 
     @property
     def clouds_waiting(self) -> bool:

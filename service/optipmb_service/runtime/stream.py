@@ -117,8 +117,7 @@ class Stream:
                 break
         paused = self._paused  # asked after `take`: a call of `wake` before that may mean that the pause has ended
         if not paused:
-            if backlog.answered and backlog.caught_up:
-                answered, backlog.answered = backlog.answered, set()
+            if backlog.answered and (answered := backlog.take_answered()):
                 self._guard(self.on_caches_answered, *answered)
             if self._tracks.waiting:
                 self._guard(self._tracks.flush)
