@@ -140,7 +140,7 @@ repeat:
 
 schemas: $(VENV)/.installed
 	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md schemas/json
-	$(BIN)/python docs/reference.py --check docs/operation.md
+	$(BIN)/python docs/reference.py --check docs/reference.md
 
 wheel: kernels
 	sh tests/wheel.sh $(PYTHON) $(BIN)

@@ -1,6 +1,6 @@
 """Which settings the service has.
 
-Times are in seconds. Every setting is described where it stands; `docs/operation.md` prints the same table, and so does
+Times are in seconds. Every setting is described where it stands; `docs/reference.md` prints the same table, and so does
 ``optipmb-service config``.
 """
 
