@@ -189,7 +189,7 @@ def python(base: Path, wheel: Path, _node: Path) -> None:
     said(f"  import optipmb: {place.import_ms('optipmb'):.0f} ms of processor time")
     (place.work / "mine.py").write_text(blocks(README, "python", "OnlineTracker"))
     printed = timed("the first tracks", lambda: place.run("python", "mine.py"))
-    checked("'Car'" in printed.splitlines()[-1], f"expected a car, received {printed}")
+    checked("'car'" in printed.splitlines()[-1], f"expected a car, received {printed}")
 
 
 def node(base: Path, wheel: Path, node_wheel: Path) -> None:
