@@ -11,7 +11,7 @@ import optipmb_schemas as schemas
 import structlog
 
 from optipmb_service.runtime.ports import Packet, TransportError
-from optipmb_service.runtime.requests import problem_with
+from optipmb_service.runtime.queries import problem_with
 from optipmb_service.zenoh.client import Client
 from optipmb_service.zenoh.inputs import ReturnedPublishers, Topic
 from optipmb_service.zenoh.taps import Taps
