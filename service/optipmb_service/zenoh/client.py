@@ -36,12 +36,7 @@ log = structlog.get_logger("optipmb_service")
 
 
 class Turns:
-    """Bound on how often strangers have keys declared: a burst, then one in each period. May be used by any threads.
-
-    Args:
-        burst: declared at once.
-        period_s: time until there is a further one.
-    """
+    """Bound on how often strangers have keys declared: a burst, then one in each period. May be used by any threads."""
 
     def __init__(self, burst: int, period_s: float) -> None:
         self._burst = burst
@@ -94,9 +89,6 @@ class Outgoing:
 
 class Client(Session):
     """A session on the network; a client waits for a router until it has one.
-
-    Args:
-        settings: endpoints, prefix, and the file with everything else.
 
     Raises:
         TransportError: an endpoint or the configuration cannot be used.

@@ -47,7 +47,6 @@ class Topic:
 
     Args:
         name: of the topic, for the log.
-        session: to subscribe on.
         receive: called for each sample, one after the other; the thread of the network is not to be kept waiting.
         answered: called with the key of a publisher when all has been handed over that its cache held.
     """
@@ -162,7 +161,6 @@ class ReturnedPublishers:
     begin anew, and Zenoh drops its messages, up to the highest number before, without a word.
 
     Args:
-        session: to ask on.
         due: returns the number that is expected next of a publisher, by Zenoh id and number of the entity; 0: it is not
             known.
     """

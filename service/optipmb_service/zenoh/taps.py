@@ -1,7 +1,7 @@
 """Subscriptions of viewers: shared by those of one stream, kept for a while for who comes back, and bounded in rate.
 
-Each subscription takes a number for its key that Zenoh never gives back. A browser that connects again
-and again takes none while its subscriptions are kept, and whoever asks for ever new streams soon has to wait.
+Each subscription takes a number for its key that Zenoh never gives back. A browser that connects again and again takes
+none while its subscriptions are kept, and whoever asks for ever new streams soon has to wait.
 """
 
 from __future__ import annotations
@@ -36,12 +36,7 @@ PERIOD_S: Final = 15.0
 
 
 class Taps:
-    """The subscriptions of the viewers of a process; may be used by any threads.
-
-    Args:
-        session: to subscribe on.
-        prefix: first chunks of all keys.
-    """
+    """The subscriptions of the viewers of a process; may be used by any threads."""
 
     def __init__(self, session: Session, prefix: str) -> None:
         self._session = session
@@ -54,9 +49,7 @@ class Taps:
     def join(self, names: tuple[str, str], receive: Receive) -> Callable[[], None]:
         """Hand over the newest tracks and detections of streams, until the result is called, which may be twice.
 
-        Args:
-            names: key expressions of the streams of the tracks and of the detections.
-            receive: called on threads of their own.
+        The names are key expressions of the streams of the tracks and of the detections.
 
         Raises:
             TransportError: the session is closed, or too many streams were subscribed to.
@@ -104,11 +97,7 @@ class Taps:
 
 
 class _Tap:
-    """The subscriptions to one stream, each with a thread of its own.
-
-    Raises:
-        TransportError: the session is closed.
-    """
+    """The subscriptions to one stream, each with a thread of its own."""
 
     def __init__(self, session: Session, prefix: str, tracks: str, detections: str) -> None:
         self.listeners: dict[object, Receive] = {}

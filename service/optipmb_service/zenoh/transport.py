@@ -68,12 +68,6 @@ class Announcements:
 
     What a router takes to declare a token grows with how many tokens there are, for each that watches them: with a
     token for each stream it was most of what a new stream cost, and with 10,000 streams beyond what one router can do.
-
-    Args:
-        session: to declare on.
-        keys: of the network.
-        instance: who announces.
-        run: tells this process from others of its name.
     """
 
     def __init__(self, session: Session, keys: schemas.Keys, instance: str, run: str) -> None:
@@ -105,9 +99,6 @@ class Transport:
     """A Zenoh session with what the service declares on it.
 
     Its methods raise `TransportError` when the session is closed, or has declared all keys that it can.
-
-    Args:
-        settings: endpoints, prefix, instance.
 
     Raises:
         TransportError: an endpoint is in use or unusable. As a client it does not raise but wait for a router.
@@ -177,10 +168,7 @@ class Transport:
     def subscribe(self, kind: Kind, stream: str, *, cached: bool) -> None:
         """Receive the detections or clouds of a stream, or of all of them where it is empty; `discovery` is of all.
 
-        Args:
-            kind: what of it.
-            stream: its name.
-            cached: whether what was lost is recovered from the publisher's cache.
+        With `cached`, what was lost is recovered from the publisher's cache.
         """
         if kind == "discovery":
             self._topics["detections"].subscribe(kind, self._keys.all("detections"), self._discover)
