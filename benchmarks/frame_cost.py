@@ -25,10 +25,6 @@ from typing import TYPE_CHECKING, Any
 import optipmb_schemas as schemas
 from optipmb_client.load import generated
 from optipmb_client.load.material import FIRST, head, message
-from optipmb_service.app.kernels import warm_up
-from optipmb_service.observability import logs
-from optipmb_service.observability.metrics import Metrics
-from optipmb_service.observability.problem_reporter import ProblemReporter
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.track_publisher import TrackPublisher
@@ -154,8 +150,10 @@ def first_of(*modules: str) -> Any:
 
 def measured(objects: int, points: int) -> dict[str, float]:
     """Return the median microseconds of each part of a frame."""
-    logs.configure("console", "error")
-    warm_up()
+    first_of("telemetry.logs", "observability.logs").configure("console", "error")
+    first_of("app.kernels", "app.worker").warm_up()
+    metrics = first_of("telemetry.metrics", "observability.metrics").Metrics
+    reporter = first_of("telemetry.problem_reporter", "observability.problem_reporter").ProblemReporter
     parts = Parts()
     network: Any = Network()  # in the place of several parts
     decoding = first_of("runtime.stream", "runtime.stream_tracking", "runtime.stream_actor")
@@ -176,9 +174,9 @@ def measured(objects: int, points: int) -> dict[str, float]:
         ("conversion", convert, "tracks_of"),
         ("step", optipmb.Tracker, "step"),
         ("publishing", TrackPublisher, "send"),
-        ("metrics", Metrics, "received"),
-        ("metrics", Metrics, "published"),
-        ("metrics", Metrics, "tracks"),
+        ("metrics", metrics, "received"),
+        ("metrics", metrics, "published"),
+        ("metrics", metrics, "tracks"),
         ("actor", getattr(turn_of, "Stream", None) or turn_of.StreamActor, "work"),
     ):
         if hasattr(owner, name):
@@ -194,11 +192,11 @@ def measured(objects: int, points: int) -> dict[str, float]:
     streams = streams_type(
         first_of("settings.model", "settings").Settings(instance="cost", store="none"),
         Profiles.read("nuscenes", {}),
-        reporter=ProblemReporter(network.publish_problem, lambda *_: None),
+        reporter=reporter(network.publish_problem, lambda *_: None),
         scheduler=network,
         member=network,
         arm=lambda *_: None,
-        metrics=Metrics(),
+        metrics=metrics(),
         **others,
     )
     rows: list[dict[str, float]] = []

@@ -6,12 +6,12 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from optipmb_schemas import Detections, Keys, Points, encode, encoding_of
-from optipmb_service.observability.metrics import Metrics
-from optipmb_service.observability.problem_reporter import ProblemReporter
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.streams import Streams
-from optipmb_service.settings.model import Settings
+from optipmb_service.settings import Settings
+from optipmb_service.telemetry.metrics import Metrics
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
 from sessions import chained
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from optipmb_service.session.values import SECOND, Incarnation
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 MAX_OWNERS: Final = 16_384
 """Nodes and sites whose rates are remembered."""

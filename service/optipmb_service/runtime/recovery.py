@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
     import optipmb_schemas as schemas
 
-    from optipmb_service.cluster.log_reader import LogReader
-    from optipmb_service.cluster.message_log import LogMessage
+    from optipmb_service.cluster.message_log import LogMessage, LogReader
     from optipmb_service.runtime.profiles import Fusion
     from optipmb_service.runtime.streams import Streams
     from optipmb_service.session.checkpoint import Checkpoint

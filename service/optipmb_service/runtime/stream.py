@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import optipmb_schemas as schemas
 import structlog
 
-from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.persistence import save_dump
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.recovery import CacheRecovery, LogCheck
@@ -36,6 +35,7 @@ from optipmb_service.session.values import (
     Tracked,
     total,
 )
+from optipmb_service.telemetry.stream_meter import StreamMeter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

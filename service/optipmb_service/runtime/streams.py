@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator
 
     from optipmb_service.cluster.member import Member
-    from optipmb_service.observability.metrics import Metrics
-    from optipmb_service.observability.problem_reporter import ProblemReporter
     from optipmb_service.runtime.intake import Intake
     from optipmb_service.runtime.persistence import CheckpointWriter
     from optipmb_service.runtime.ports import Packet, Publisher
@@ -36,7 +34,9 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.recovery import Log
     from optipmb_service.runtime.scheduler import Scheduler
     from optipmb_service.session.values import Incarnation
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.metrics import Metrics
+    from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 MAX_UNPROVEN: Final = 256
 """Streams at once that have not sent a valid message yet."""

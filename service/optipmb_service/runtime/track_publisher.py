@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.cluster.member import Member
-    from optipmb_service.observability.metrics import Metrics
-    from optipmb_service.observability.stream_meter import StreamMeter
     from optipmb_service.runtime.ports import Publisher
     from optipmb_service.session.values import Tracked
+    from optipmb_service.telemetry.metrics import Metrics
+    from optipmb_service.telemetry.stream_meter import StreamMeter
 
 log = structlog.get_logger("optipmb_service")
 
