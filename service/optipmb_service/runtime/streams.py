@@ -237,7 +237,7 @@ class Streams:
 
     def _command(self, session: str, command: Callable[[Stream], None], *, urgent: bool, limited: bool = True) -> bool:
         while (stream := self._streams.get(session) or self._stream(session, limited=limited)) is not None:
-            if stream.backlog.command(lambda one=stream: command(one), urgent=urgent):  # type: ignore[misc]  # bound now
+            if stream.backlog.command(partial(command, stream), urgent=urgent):
                 return True
             self._forget_closed(session)
         return False
