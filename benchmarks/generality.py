@@ -27,7 +27,7 @@ from optipmb_client import offline
 from optipmb_client.datasets import open_dataset
 from optipmb_client.evaluation import default_rules
 from optipmb_client.evaluation.calibration import calibration
-from optipmb_client.evaluation.figures import CENTRE_DISTANCE
+from optipmb_client.evaluation.cases import CENTRE_DISTANCE
 from optipmb_client.geometry import Pose, to_sensor, to_world
 from optipmb_client.results import ResultTable
 from optipmb_client.results.full import COLUMNS, FullTable

@@ -9,11 +9,10 @@ import pytest
 from optipmb_client import offline
 from optipmb_client.datasets import Dataset, open_dataset
 from optipmb_client.datasets.scene.lidar import Scan, scan
-from optipmb_client.evaluation.ab3dmot import ab3dmot_rules, evaluate_ab3dmot
-from optipmb_client.evaluation.cases import prepare
-from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
-from optipmb_client.evaluation.nuscenes import evaluate_nuscenes, evaluate_scenes
-from optipmb_client.evaluation.nuscenes_scene import NuScenesConfig, prepare_scene
+from optipmb_client.evaluation.ab3dmot import evaluate_ab3dmot
+from optipmb_client.evaluation.cases import ab3dmot_rules, prepare
+from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
+from optipmb_client.evaluation.nuscenes import NuScenesConfig, evaluate_nuscenes, evaluate_scenes, prepare_scene
 from optipmb_client.results.kitti import read_kitti_results
 from optipmb_client.tracking import track
 from optipmb_client.tuning.degrade import Degradation, degrade

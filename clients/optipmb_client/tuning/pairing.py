@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optipmb_client.evaluation import Rules
-from optipmb_client.evaluation.assignment import assign_frames, most_pairs
-from optipmb_client.evaluation.cases import prepare
+from optipmb_client.evaluation.cases import assign_frames, most_pairs, prepare
 from optipmb_client.geometry import Bools, Floats, Ints, to_sensor, wrap_angle
 from optipmb_client.results import ResultTable
 from optipmb_client.tuning.material import Clip

@@ -13,12 +13,15 @@ import numpy as np
 from optipmb_client.datasets import DataSequence
 from optipmb_client.datasets.nuscenes import NuScenesSequence
 from optipmb_client.evaluation import Case, Rules, default_rules
-from optipmb_client.evaluation.ab3dmot import ab3dmot_rules
-from optipmb_client.evaluation.cases import prepare
-from optipmb_client.evaluation.figures import CENTRE_DISTANCE
-from optipmb_client.evaluation.nuscenes_figures import evaluate_class
-from optipmb_client.evaluation.nuscenes_matching import Pairing, pair
-from optipmb_client.evaluation.nuscenes_scene import NuScenesConfig, NuScenesScene, prepare_scene
+from optipmb_client.evaluation.cases import CENTRE_DISTANCE, ab3dmot_rules, prepare
+from optipmb_client.evaluation.nuscenes import (
+    NuScenesConfig,
+    NuScenesScene,
+    Pairing,
+    evaluate_class,
+    pair,
+    prepare_scene,
+)
 from optipmb_client.geometry import Bools, to_sensor
 from optipmb_client.results import ResultTable
 from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
