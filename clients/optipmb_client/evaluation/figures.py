@@ -84,8 +84,8 @@ def cell(name: str, value: float | None, *, metres: bool = False) -> str:
     return f"{100.0 * value:.2f}" if kind == "share" or (kind == "match" and not metres) else f"{value:.3f}"
 
 
-def number(value: float | None) -> str:
+def number(value: float) -> str:
     """Return a figure as `optipmb tune`, `sweep` and `ablate` print it."""
-    if value is None:
+    if not math.isfinite(value):
         return "-"
     return str(int(value)) if value == int(value) else f"{value:.4f}"
