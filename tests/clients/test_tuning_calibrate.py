@@ -59,7 +59,7 @@ def test_covariances_come_true_where_they_were_not_measured(lasting: float) -> N
 
 def test_existence_comes_true_on_other_scenes() -> None:
     """Of the tracks that are said to exist with some probability, about this share does, in scenes not measured on."""
-    sequences = open_dataset("scene", frames=60, clouds=False).sequences([f"{i:04d}" for i in range(4)])
+    sequences = open_dataset("scene", frames=100, clouds=False).sequences([f"{i:04d}" for i in range(4)])
     clips = [of_class(load(one, PAPER, RULES), "Car", RULES) for one in sequences]
     found = calibrate(clips[:2], SCORER, CARS)
     assert found is not None
