@@ -5,7 +5,7 @@ across the heading of the label, `height` is that of the centre upwards. Heading
 backward when its heading is off by more than half of pi. Tracks count from an existence probability of a half on; only
 boxes with a detection of their own in the frame are compared, so that both columns are of the same objects at the same
 times. Labels and tracks belong together as in `optipmb_client.evaluation.calibration`. Where the dataset was opened
-without the detections that the tracks were made of, the headings alone are judged, and `without` says why.
+without the detections that the tracks were made of, only headings are compared, and `without` has the reason.
 """
 
 import itertools
