@@ -34,10 +34,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from optipmb_client.datasets.nuscenes import CLASS_RANGE, NuScenesDataset, NuScenesSequence, tracking_labels
-from optipmb_client.evaluation.cases import by_frame, same_frame
+from optipmb_client.evaluation.cases import by_frame, most_pairs, same_frame, uncontested
 from optipmb_client.evaluation.figures import defined, overall
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Bools, Floats, Ints, rotation_of
@@ -332,20 +331,10 @@ def _continued(pairs: list[_Pair], last: dict[int, int]) -> list[_Pair]:
 
 def _assigned(pairs: list[_Pair]) -> list[_Pair]:
     """Return the most pairs without common members and, of those, the ones with the least total distance."""
-    objects = {row: i for i, row in enumerate(dict.fromkeys(one[1] for one in pairs))}
-    tracks = {row: i for i, row in enumerate(dict.fromkeys(one[2] for one in pairs))}
-    if len(objects) == len(pairs) == len(tracks):
+    rows, columns, metres = (np.array([one[place] for one in pairs]) for place in (1, 2, 3))
+    if uncontested(rows.astype(np.int64), columns.astype(np.int64)).all():
         return pairs
-    # Leaving a pair out must never pay: one forbidden pair costs more than any set of allowed ones.
-    forbidden = 1.0 + 2.0 * sum(one[3] for one in pairs)
-    cost = np.full((len(objects), len(tracks)), forbidden)
-    at = {}
-    for one in pairs:
-        place = objects[one[1]], tracks[one[2]]
-        cost[place] = one[3]
-        at[place] = one
-    found = zip(*(side.tolist() for side in linear_sum_assignment(cost)), strict=True)
-    return [at[place] for place in found if place in at]
+    return [pairs[i] for i in most_pairs(rows, columns, metres)]
 
 
 def _present(frame: Ints, frames: int) -> Bools:
@@ -541,24 +530,9 @@ def _true_scores(pairings: Sequence[Pairing]) -> Floats:
 def _worst(pairings: Sequence[Pairing], config: NuScenesConfig) -> NuScenesFigures:
     """Return the figures of a class of which nothing is found."""
     gt = float(sum(len(pairing.truth_id) for pairing in pairings))
-    return NuScenesFigures(
-        threshold=math.nan,
-        recall=0.0,
-        motar=0.0,
-        gt=gt,
-        mota=0.0,
-        motp=config.worst_motp,
-        mt=0.0,
-        ml=float(sum(pairing.objects for pairing in pairings)),
-        faf=500.0,
-        tp=0.0,
-        fp=math.nan,
-        fn=gt,
-        ids=math.nan,
-        frag=math.nan,
-        tid=20.0,
-        lgd=20.0,
-    )
+    found = {"recall": 0.0, "motar": 0.0, "gt": gt, "mota": 0.0, "motp": config.worst_motp, "tp": 0.0, "fn": gt}
+    lost = float(sum(pairing.objects for pairing in pairings))
+    return replace(UNDEFINED, **found, mt=0.0, ml=lost, faf=500.0, tid=20.0, lgd=20.0)
 
 
 def _average(values: list[float], worst: float) -> float:

@@ -22,7 +22,7 @@ from optipmb_client.tuning.pairing import (
     Pairs,
     Residuals,
     Trajectory,
-    detected_frames,
+    detected,
     pair_detections,
     residuals,
     trajectories,
@@ -233,12 +233,7 @@ def _birth(errors: Residuals, pairs: Sequence[Pairs], paths: Sequence[dict[int, 
     """Return P^0 from the first detection of each object, and from what objects do."""
     first = errors.first
     velocity = errors.velocity[first]
-    starts: list[Floats] = []
-    for found, objects in zip(pairs, paths, strict=True):
-        for identity, path in objects.items():
-            frames = detected_frames(found, identity)
-            if len(frames):
-                starts.append(path.velocity[np.searchsorted(path.frame, frames[0])])
+    starts = [path.velocity[at[0]] for _, path, _, at in detected(pairs, paths)]
     speeds = np.linalg.norm(np.array(starts).reshape(-1, 2), axis=1)
     speeds = speeds[np.isfinite(speeds)]
     return {
@@ -263,12 +258,8 @@ def _lasting(errors: Residuals, period: float) -> float:
 
 def _longest_gap(pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]], period: float) -> float:
     """Return the nominal periods within which nearly all breaks between detections of an object end."""
-    gaps: list[float] = []
-    for found, objects in zip(pairs, paths, strict=True):
-        for identity, path in objects.items():
-            frames = detected_frames(found, identity)
-            time = path.time[np.searchsorted(path.frame, frames)]
-            gaps += [float(one) / period - 1.0 for one in np.diff(time) if one > 1.5 * period]
+    between = [one for _, path, _, at in detected(pairs, paths) for one in np.diff(path.time[at]).tolist()]
+    gaps = [one / period - 1.0 for one in between if one > 1.5 * period]
     return float(np.quantile(gaps, _GAP_QUANTILE)) if gaps else math.nan
 
 

@@ -4,7 +4,7 @@ Conventions: world frame, metres, seconds. In each frame as many pairs as possib
 those ways the one of least total distance is taken.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -162,23 +162,24 @@ class Residuals:
 def residuals(pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]) -> Residuals:
     """Return detection minus label of all pairs."""
     parts = [(np.empty(0), np.empty((0, 2)), np.empty(0), np.empty((0, 2)))]
-    for found, objects in zip(pairs, paths, strict=True):
-        for identity, path in objects.items():
-            rows = np.flatnonzero(found.object == identity)
-            if not len(rows):
-                continue
-            at = np.searchsorted(path.frame, found.frame[rows])
-            parts.append(
-                (
-                    np.diff(path.time[at], prepend=np.nan),
-                    found.position[rows] - path.position[at],
-                    wrap_angle(found.yaw[rows] - path.yaw[at]),
-                    found.velocity[rows] - path.velocity[at],
-                )
-            )
+    parts += [
+        (
+            np.diff(path.time[at], prepend=np.nan),
+            found.position[rows] - path.position[at],
+            wrap_angle(found.yaw[rows] - path.yaw[at]),
+            found.velocity[rows] - path.velocity[at],
+        )
+        for found, path, rows, at in detected(pairs, paths)
+    ]
     return Residuals(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def detected_frames(pairs: Pairs, identity: int) -> Ints:
-    """Return the frames in which an object is detected, ascending."""
-    return np.asarray(pairs.frame[pairs.object == identity], dtype=np.int64)
+def detected(
+    pairs: Sequence[Pairs], paths: Sequence[dict[int, Trajectory]]
+) -> Iterator[tuple[Pairs, Trajectory, Ints, Ints]]:
+    """Yield each detected object: its recording, its path, and the rows of its detections in both."""
+    for found, objects in zip(pairs, paths, strict=True):
+        for identity, path in objects.items():
+            rows = np.flatnonzero(found.object == identity)
+            if len(rows):
+                yield found, path, rows, np.searchsorted(path.frame, found.frame[rows])
