@@ -83,8 +83,9 @@ def by_class(rows: "Many[Row]") -> "list[tuple[str, list[Figures]]]":
 
 def cells_of(figures: "Figures", names: "Many[str]") -> list[str]:
     """Return figures as the cells of a table."""
-    values = figures.to_json()
-    return [_cell(values[name]) for name in names]
+    from optipmb_client.evaluation.figures import number  # noqa: PLC0415  as above
+
+    return [number(figures[name]) for name in names]
 
 
 def print_rows(
@@ -102,9 +103,3 @@ def print_rows(
     for row in cells:
         table.add_row(*row)
     print_table(table)
-
-
-def _cell(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return str(int(value)) if value == int(value) else f"{value:.4f}"

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from optipmb_client.evaluation import ClassResult, Rules
-    from optipmb_client.evaluation.figures import ClassFigures
+    from optipmb_client.evaluation.evaluate import ClassFigures
 
 
 def evaluate(  # noqa: PLR0913  these are the command's options
@@ -131,8 +131,13 @@ def _judge(
         nuscenes_table,
     )
     from optipmb_client.evaluation import evaluate_files  # noqa: PLC0415  as above
-    from optipmb_client.evaluation.figures import Settings, class_average  # noqa: PLC0415  as above
-    from optipmb_client.evaluation.jobs import Evaluation, FiguresTask, figures_of  # noqa: PLC0415  as above
+    from optipmb_client.evaluation.evaluate import (  # noqa: PLC0415  as above
+        Evaluation,
+        FiguresTask,
+        Settings,
+        class_average,
+        figures_of,
+    )
     from optipmb_client.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
 
     head: list[RenderableType] = []

@@ -47,7 +47,6 @@ def sweep(
     """
     from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
     from optipmb_client.offline import profile_compared  # noqa: PLC0415  as above
-    from optipmb_client.tuning.picture import write_sweep  # noqa: PLC0415  as above
 
     wanted = [_values(text) for text in parameter or FIGURE_5]
     asked = data.asked()
@@ -62,7 +61,7 @@ def sweep(
         found = [next(rows) for _ in values]
         own = {label: tuning.value_of(parameters, label, path) for label in source.classes}
         tried = [tuning.value_of(row.variant.parameters, source.classes[0], path) for row in found]
-        figures = {label: [one.to_json() for one in each] for label, each in by_class(found)}
+        figures = {label: [tuning.plain_figures(one) for one in each] for label, each in by_class(found)}
         swept.append({"parameter": path, "profile": own, "values": tried, "figures": figures})
         for label, each in [] if as_json else by_class(found):
             now = f" (profile: {own[label]})" if label in own else ""
@@ -77,7 +76,7 @@ def sweep(
     }
     if out is not None:
         picture = find_spec("matplotlib") is not None
-        write_sweep(out, result, picture=picture)
+        tuning.write_sweep(out, result, picture=picture)
         if not picture:
             warn(str(to_install("matplotlib", "sweep.png")))
     if as_json:

@@ -1,5 +1,6 @@
 """`optipmb tune`: from detections and labels to a parameter profile."""
 
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -165,21 +166,20 @@ def _report(refined: "Refined") -> Group:
     for fold in refined.folds:
         figures.add_row(f"without {' '.join(fold.sequences)}: before", *cells_of(fold.before[0], SHOWN))
         figures.add_row(f"without {' '.join(fold.sequences)}: after", *cells_of(fold.after[0], SHOWN))
-    evidence = Table(box=None, pad_edge=False)
+    changes = Table(box=None, pad_edge=False)
     for column in ("changed", "from", "to", "gain", "+-", "gains"):
-        evidence.add_column(column, justify="left" if column == "changed" else "right")
-    for one in refined.evidence:
+        changes.add_column(column, justify="left" if column == "changed" else "right")
+    for one in refined.changes:
         gains = f"{one.positive} of {one.groups}"
-        evidence.add_row(one.path, str(one.start), str(one.value), f"{one.gain:.5f}", f"{one.error:.5f}", gains)
+        changes.add_row(one.path, str(one.start), str(one.value), f"{one.gain:.5f}", f"{one.error:.5f}", gains)
     ranking = Table(box=None, pad_edge=False)
     for column in ("tracks ranked by", refined.plan.metric, "gain", "+-", "sAMOTA", "AMOTA", "MOTA"):
         ranking.add_column(column, justify="left" if column == "tracks ranked by" else "right")
     for score in refined.ranking:
-        values = score.figures.to_json()
-        shown = (score.value, score.gain, score.error, *(values[name] for name in ("sAMOTA", "AMOTA", "MOTA")))
-        ranking.add_row(score.score, *(f"{value:.4f}" if value is not None else "-" for value in shown))
+        shown = (score.value, score.gain, score.error, *(score.figures[name] for name in ("sAMOTA", "AMOTA", "MOTA")))
+        ranking.add_row(score.score, *(f"{value:.4f}" if isfinite(value) else "-" for value in shown))
     return Group(
-        figures, Text(), evidence, Text(_objective(refined)), Text(), ranking, Text(_calibration(refined)), Text()
+        figures, Text(), changes, Text(_objective(refined)), Text(), ranking, Text(_calibration(refined)), Text()
     )
 
 
