@@ -20,17 +20,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["animate_tracks"]
 
-FRAMES: Final = 70
-"""Of a longer sequence every second frame is drawn, or every third …"""
+FRAMES: Final = 70  # of a longer sequence every second frame is drawn, or every third …
 TRAIL_S: Final = 3.0
-REACH_M: Final = 45.0
-"""On each side of the sensor, where the picture follows it."""
-WIDEST_M: Final = 140.0
-"""What is wider than this does not fit one view: the picture follows the sensor."""
-INSIDE: Final = (0.03, 0.97)
-"""The view is as wide as these quantiles of the places of tracks, and"""
+REACH_M: Final = 45.0  # on each side of the sensor, where the picture follows it
+WIDEST_M: Final = 140.0  # what is wider than this does not fit one view: the picture follows the sensor
+INSIDE: Final = (0.03, 0.97)  # the view is as wide as these quantiles of the places of tracks, and
 MARGIN_M: Final = 4.0
 NARROWEST_M: Final = 30.0
 SCALE_M: Final = 10.0

@@ -6,8 +6,6 @@
 import re
 from collections.abc import Iterable, Sequence
 
-__all__ = ["filled", "spread"]
-
 
 def filled(arguments: Sequence[str], option: str, values: re.Pattern[str], default: str) -> list[str]:
     """Rewrite `--x` as `--x=DEFAULT` where none of the values that the option takes follows, and leave all else."""

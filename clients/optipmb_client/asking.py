@@ -10,8 +10,6 @@ from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Arrival, Inbox
 from optipmb_client.zenoh import Connection
 
-__all__ = ["DensityAsker"]
-
 PERIOD_S: Final = 0.5
 TIMEOUT_S: Final = 1.0
 

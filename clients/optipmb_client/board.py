@@ -16,8 +16,6 @@ from rich.text import Text
 from optipmb_client.columns import without
 from optipmb_client.status import duration, profile_of
 
-__all__ = ["Board"]
-
 HISTORY = 40  # samples of the curve of frames per second
 GONE_S = 60.0  # how long an instance that vanished stays on the board
 RECENT_S = 30.0  # how long a problem is new
@@ -25,11 +23,11 @@ LATE_MS = 50.0  # latency that is worth a colour
 VERY_LATE_MS = 200.0
 SHOWN_PROBLEMS = 6
 FRAME_LINES = 6  # lines of the board that are neither services, streams nor problems
+# Columns that a narrow terminal does not show, the first ones first
 SPARE = {
     "instances": ("frames/s lately", "stands by", "up", "p50 ms", "waiting"),
     "streams": ("profile", "p50 ms", "lost", "instance", "tracks", "last frame", "waiting"),
 }
-"""Columns that a narrow terminal does not show, the first ones first."""
 
 BARS = " ▁▂▃▄▅▆▇█"
 GOOD, POOR, BAD, QUIET = "green", "yellow", "bold red", "dim"

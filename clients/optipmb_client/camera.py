@@ -15,11 +15,9 @@ from optipmb_client.geometry import Bools, Floats, box_corners, wrap_angle
 SENSOR_FROM_CAMERA: Floats = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=np.float64)
 """The relabelling of axes; orthogonal, so its transpose goes back."""
 
-KITTI_IMAGE = (1242.0, 375.0)
-"""Width and height of most images of the KITTI tracking benchmark, in pixels."""
+KITTI_IMAGE = (1242.0, 375.0)  # width and height of most images of the KITTI tracking benchmark, in pixels
 
-_NEAR = 0.1
-"""Depth in metres in front of which nothing is projected."""
+_NEAR = 0.1  # depth in metres in front of which nothing is projected
 
 _EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]])
 
@@ -31,7 +29,6 @@ def sensor_from_kitti(bottom: Floats, hwl: Floats, rotation_y: Floats) -> tuple[
         bottom: (N, 3) centre of the bottom, camera frame.
         hwl: (N, 3) height, width, length.
         rotation_y: (N,).
-
     """
     center = bottom @ SENSOR_FROM_CAMERA.T
     center[:, 2] += 0.5 * hwl[:, 0]
@@ -78,7 +75,6 @@ class Camera:
         Returns:
             (N, 4) x1 y1 x2 y2 in pixels, and (N,) whether the image shows it. What it does not show (behind the camera,
             beside its view) gets 0 0 0 0: a box without height, which the KITTI evaluation leaves out of account.
-
         """
         corners = box_corners(center, size, yaw) @ SENSOR_FROM_CAMERA  # (N, 8, 3), camera frame
         start, stop = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]

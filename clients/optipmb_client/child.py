@@ -21,8 +21,6 @@ from optipmb_client.errors import ConnectionFailed, ServiceUnavailable
 from optipmb_client.sessions import find_services
 from optipmb_client.zenoh import Connection
 
-__all__ = ["ServiceProcess"]
-
 # Runs in the child before the service: asks the kernel for SIGTERM at the death of the parent, which survives the exec.
 # Written out because the hook that Python offers for this runs between fork and exec, which is unsafe with threads.
 _BOOTSTRAP = """

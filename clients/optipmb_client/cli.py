@@ -20,13 +20,12 @@ from optipmb_client.datasets import DatasetError
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.extras import to_install
 
-__all__ = ["app", "main", "run"]
-
 FAILED = 1
 WRONG = 2
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
 
+# Functions of the commands, in modules of the commands' names, in the order of the help
 COMMANDS: Final = {
     "demo": "demo",
     "check": "check",
@@ -49,7 +48,6 @@ COMMANDS: Final = {
     "drain": "drain",
     "warm-up": "warm_up",
 }
-"""Functions of the commands, in modules of the commands' names, in the order of the help."""
 
 # What the option parser raises for a wrong option: the base of its public subclass, as it has no public name itself.
 _OptionError: Any = typer.BadParameter.__base__

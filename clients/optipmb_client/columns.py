@@ -6,8 +6,6 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
-__all__ = ["parts", "without"]
-
 
 def parts(table: Table, width: int) -> Iterator[Table]:
     """Yield a table in parts that fit a width; its leading columns that are aligned left stand in each of them."""

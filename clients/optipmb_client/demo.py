@@ -13,8 +13,6 @@ from optipmb_client.recording import Preloaded
 from optipmb_client.replay import Pace, ReplayedSequence, replay
 from optipmb_client.zenoh import Connection
 
-__all__ = ["Demonstration", "demonstrate"]
-
 START_S = 300.0  # the first start after an installation compiles
 PATIENCE_S = 20.0
 SEED = 4  # of the scene

@@ -14,16 +14,13 @@ import numpy as np
 from optipmb_client.camera import sensor_from_kitti
 from optipmb_client.files import DatasetError, numbers, read_rows, read_text
 
-__all__ = ["BOX_LISTS", "LISTS", "frame_files", "is_kitti_object", "read_frames", "read_json", "split_boxes"]
-
 _Record: TypeAlias = dict[str, Any]
 BOX_LISTS: Final = ("bboxes_3d", "boxes_3d", "boxes_lidar", "pred_boxes", "gt_boxes", "boxes", "bbox_3d", "box3d")
 """Names of lists of x, y, z, length, width, height, yaw and, in some, a velocity."""
 LISTS: Final = (*BOX_LISTS, "detections", "objects", "predictions", "annotations")
 """Names of lists of all boxes of a frame."""
 _KITTI: Final = "h w l x y z rotation_y score"
-_FIRST: Final = 8
-"""Field of a line of KITTI's object benchmark where the 3D box begins."""
+_FIRST: Final = 8  # field of a line of KITTI's object benchmark where the 3D box begins
 _STAMPS: Final = 1_000_000_000
 """From this number on, the number in the name of a file is a stamp, and not that of a frame."""
 

@@ -12,8 +12,6 @@ from optipmb_client.evaluation.tracks import read_tracks
 from optipmb_client.pictures import Panel, draw_tracks
 from optipmb_client.results import ResultTable
 
-__all__ = ["draw_results"]
-
 
 def draw_results(
     picture: Path,

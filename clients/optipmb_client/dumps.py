@@ -9,22 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
-from optipmb_schemas import (
-    Detections,
-    Dump,
-    DumpedFrame,
-    MessageError,
-    Points,
-    Pose,
-    Tracks,
-    decode_dump,
-)
+from optipmb_schemas import Detections, Dump, DumpedFrame, MessageError, Points, Pose, Tracks, decode_dump
 
 import optipmb
 from optipmb_client.errors import UsageError
 from optipmb_client.offline import track_fields
-
-__all__ = ["Replayed", "read", "replay"]
 
 
 class _Steps(Protocol):

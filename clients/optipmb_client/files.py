@@ -48,7 +48,6 @@ def read_points(path: Path, what: str, columns: int) -> NDArray[np.float32]:
 
     Raises:
         DatasetError: the file cannot be read, or its size is that of no number of points.
-
     """
     data = read_bytes(path, what)
     if len(data) % (4 * columns):
@@ -67,7 +66,6 @@ def numbers(path: Path, rows: Iterable[tuple[int, list[str]]], columns: int, wha
 
     Raises:
         DatasetError: a line has another number of fields, or a field is not a finite number; names the line.
-
     """
     values = np.empty((0, columns))
     taken = list(rows)

@@ -44,8 +44,6 @@ from optipmb_schemas import Detections, Message, Points, Problem, Tracks
 from optipmb_client.colours import rgb_of
 from optipmb_client.geometry import rotation_of, to_world
 
-__all__ = ["FoxgloveMessages", "Shown"]
-
 FRAME: Final = "world"
 ARROW_S: Final = 1.0  # an arrow is as long as the way of one second
 SLOW: Final = 0.3  # m/s below which there is no arrow

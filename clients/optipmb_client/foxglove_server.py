@@ -11,8 +11,6 @@ from optipmb_client.foxglove_messages import FoxgloveMessages
 
 _TOPICS: dict[type[Message], str] = {Tracks: "tracks", Detections: "detections", Points: "points", Problem: "problems"}
 
-__all__ = ["FoxgloveServer"]
-
 
 class FoxgloveServer:
     """A server that shows messages of any streams; a viewer that is too slow loses the oldest.

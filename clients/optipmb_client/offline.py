@@ -59,15 +59,11 @@ __all__ = [
     "warm_up",
 ]
 
-AUTO: Final = "auto"
-"""Name of the profile that is made for the data: rate and classes as they come."""
+AUTO: Final = "auto"  # name of the profile that is made for the data: rate and classes as they come
 USUAL_PERIOD: Final = 0.1
-FAR: Final = 1.6
-"""A rate so many times that of the profile, or a part of it, is far from it."""
-LOOKED_AT: Final = 20
-"""Sequences, and"""
-LOOKED_INTO: Final = 300
-"""frames of each that tell rate and scores."""
+FAR: Final = 1.6  # a rate so many times that of the profile, or a part of it, is far from it
+LOOKED_AT: Final = 20  # sequences, and
+LOOKED_INTO: Final = 300  # frames of each that tell rate and scores
 GLANCE: Final = 20
 """Frames of each that tell whether the rate is about that of a profile: clouds, if there are any, take long to read."""
 
@@ -81,8 +77,7 @@ class Tracked:
     detections: int
     left_out: dict[str, int]
     """Number of detections of each class that the profile lacks, or that are below its score filter."""
-    estimated: int
-    """Frames in which the motion of the sensor was estimated."""
+    estimated: int  # frames in which the motion of the sensor was estimated
     steps_ns: tuple[int, ...]
     seconds: float
 
@@ -221,8 +216,7 @@ def tracker_frame(parameters: Parameters, sequence: str, given: DetectionFrame) 
     return frame
 
 
-_warm = functools.cache(warm_up)
-"""Once in each process."""
+_warm = functools.cache(warm_up)  # once in each process
 
 
 def track_whole(

@@ -25,16 +25,14 @@ if TYPE_CHECKING:
 _INK = "#222222"
 _TRUTH = "#B5B5B5"
 _MARGIN = 6.0
-_BREAK = 5
-"""A path is not drawn across more missing frames than this."""
+_BREAK = 5  # a path is not drawn across more missing frames than this
 
 
 class Panel(NamedTuple):
     """Tracks of one tracker, in the world frame."""
 
     tracks: ResultTable
-    results: Sequence[ClearResult] = ()
-    """CLEAR figures of the classes; their misses and identity switches are marked."""
+    results: Sequence[ClearResult] = ()  # CLEAR figures of the classes; their misses and identity switches are marked
     title: str = ""
 
 
@@ -49,7 +47,6 @@ def draw_tracks(path: Path, sequence: DataSequence, panels: Sequence[Panel], tru
 
     Raises:
         ClientError: matplotlib is not installed.
-
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - matplotlib is an extra

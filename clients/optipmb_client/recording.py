@@ -17,8 +17,6 @@ from optipmb_client.results.full import full_path, write_full
 from optipmb_client.results.table import join, track_columns
 from optipmb_client.table_files import Columns, is_table, write_table
 
-__all__ = ["Latency", "Preloaded", "Results", "horizons_for", "latency", "selected_frames"]
-
 
 @dataclass(frozen=True)
 class Latency:

@@ -28,8 +28,6 @@ from optipmb_client.recording import Latency, Results, horizons_for, latency, se
 from optipmb_client.sessions import close_session, set_parameters
 from optipmb_client.subscriber import Subscriber
 
-__all__ = ["Pace", "ReplayedSequence", "replay"]
-
 CLOUD_WAIT_S = 10.0  # a cloud may be late on a busy machine; tracking without it would change the result
 CACHED_CLOUDS = 16  # for a service that is killed and restarted meanwhile; it keeps no more of a stream by default
 CLOUDS_AHEAD = 4  # frames under way then: a successor goes back to a checkpoint, and needs the clouds since then, too

@@ -8,20 +8,15 @@ from rich.console import Group, JustifyMethod, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-__all__ = ["duration", "members_of", "profile_of", "render"]
-
 COLUMNS = ("stream", "profile", "state", "frames/s", "p50 ms", "p99 ms", "frames", "tracks", "queue")
 COUNTED = ("refused", "shed", "late", "gaps", "duplicates", "last frame")
-TEXTS = 3
-"""Columns of texts; the others are of numbers."""
+TEXTS = 3  # columns of texts; the others are of numbers
 
 SHOWN_PROBLEMS = 5
 
-WORKER = re.compile(r"-w\d+$")
-"""What follows the instance in the name of one of its workers."""
+WORKER = re.compile(r"-w\d+$")  # what follows the instance in the name of one of its workers
 
-NAME = 32
-"""Characters of a member's name in a line."""
+NAME = 32  # characters of a member's name in a line
 
 
 def render(services: Sequence[ServiceStatus]) -> RenderableType:

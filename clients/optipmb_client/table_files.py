@@ -23,7 +23,6 @@ from optipmb_client.files import DatasetError, write_whole
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = ["SUFFIXES", "Columns", "is_table", "line_of", "read_table", "tables_in", "to_arrow", "write_table"]
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """By name, all of one length: float64 (NaN where no value is), int64 (none missing), datetime64[ns] or str."""

@@ -17,10 +17,7 @@ from optipmb_client.recording import Latency, Results, horizons_for, latency
 from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES
 from optipmb_client.table_files import Columns
 
-__all__ = ["RecordingsFailed", "TrackedSequence", "track"]
-
-SHOWN: Final = 20
-"""Recordings that failed, named in the error."""
+SHOWN: Final = 20  # recordings that failed, named in the error
 
 
 @dataclass(frozen=True)
@@ -34,13 +31,10 @@ class TrackedSequence:
     detections: int
     left_out: dict[str, int]
     """Number of detections of each class that the profile lacks, or that are below its score filter."""
-    estimated: int
-    """Frames in which the motion of the sensor was estimated."""
-    cut: tuple[int, int]
-    """Number of boxes beyond those that a benchmark accepts in a sample, and of the samples."""
+    estimated: int  # frames in which the motion of the sensor was estimated
+    cut: tuple[int, int]  # number of boxes beyond those that a benchmark accepts in a sample, and of the samples
     tracks: int
-    confirmed: int
-    """Tracks that were confirmed in some frame."""
+    confirmed: int  # tracks that were confirmed in some frame
     seconds: float
     step: Latency | None
 
@@ -102,12 +96,7 @@ def _track_one(shared: Tracking, name: str) -> tuple[TrackedSequence, Path | Col
     opened = shared.opened
     sequence = opened.sequence(name)
     found = track_whole(
-        shared.parameters,
-        sequence,
-        shared.classes,
-        shared.modules,
-        smooth=shared.smooth,
-        on_frame=opened.on_frame,
+        shared.parameters, sequence, shared.classes, shared.modules, smooth=shared.smooth, on_frame=opened.on_frame
     )
     written = Results(opened.dataset, shared.out, full=shared.full).write(sequence, found.tracks)
     limited = opened.dataset.name == "nuscenes" and isinstance(written, Path)

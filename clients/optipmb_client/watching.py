@@ -18,25 +18,18 @@ from optipmb_schemas import Density, Detections, Message, Points, Tracks
 from optipmb_client.colours import rgb_of
 from optipmb_client.geometry import Floats, rotation_of
 
-__all__ = ["View"]
-
 TRAIL_S: Final = 5.0
 SIGMAS: Final = 2.0
-HIGH: Final = 90.0
-"""Metres above the ground from where the view from above is taken."""
+HIGH: Final = 90.0  # metres above the ground from where the view from above is taken
 
-SURE: Final = 0.5
-"""Tracks with a lower score are drawn thin and without a label."""
+SURE: Final = 0.5  # tracks with a lower score are drawn thin and without a label
 
-UNIX_NS: Final = 10**17
-"""Stamps above it are times since 1970; below, seconds since some start."""
+UNIX_NS: Final = 10**17  # stamps above it are times since 1970; below, seconds since some start
 
-LINE: Final = -1.5
-"""Thickness of lines in points on the screen, whatever the distance: so Rerun takes negative radii."""
+LINE: Final = -1.5  # thickness of lines in points on the screen, whatever the distance: so Rerun takes negative radii
 
 TICK_M: Final = 20.0
-AXES_M: Final = (42.0, 34.0)
-"""How far the axes are from the middle, to the left and below."""
+AXES_M: Final = (42.0, 34.0)  # how far the axes are from the middle, to the left and below
 
 GREY: Final = (130, 130, 130)
 INK: Final = (30, 30, 30)

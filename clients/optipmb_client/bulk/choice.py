@@ -3,8 +3,6 @@
 from optipmb_client.bulk.executors import Executor, Here, Processes
 from optipmb_client.extras import needed
 
-__all__ = ["executor_for"]
-
 
 def executor_for(jobs: int, ray: str | None = None) -> Executor:
     """Return the executor for so many tasks at once.

@@ -22,16 +22,10 @@ from optipmb_client.bulk.executors import ATTEMPTS, Executor
 from optipmb_client.bulk.task import Done, Failed, Function, WorkerDiedError, attempt
 from optipmb_client.errors import ClientError
 
-__all__ = ["LOCAL", "RayCluster"]
-
-LOCAL: Final = "local"
-"""The address of a cluster that is started here and ends with the command."""
-STORE_BYTES: Final = 256 * 2**20
-"""Shared memory of a local cluster; what does not fit is written to disk."""
-WAITING: Final = 2
-"""Tasks under way for each processor: one runs, the next is there when it ends."""
-PATIENCE_S: Final = 10.0
-"""For the connection to a head."""
+LOCAL: Final = "local"  # the address of a cluster that is started here and ends with the command
+STORE_BYTES: Final = 256 * 2**20  # shared memory of a local cluster; what does not fit is written to disk
+WAITING: Final = 2  # tasks under way for each processor: one runs, the next is there when it ends
+PATIENCE_S: Final = 10.0  # for the connection to a head
 
 
 class RayCluster(Executor):

@@ -18,21 +18,15 @@ from typing import Any, Final, Self
 
 from optipmb_client.bulk.task import Done, Failed, Function, WorkerDiedError, attempt
 
-__all__ = ["ATTEMPTS", "Executor", "Here", "Processes"]
-
-ATTEMPTS: Final = 3
-"""How often a task is started whose process dies."""
+ATTEMPTS: Final = 3  # how often a task is started whose process dies
 
 
 class Executor(ABC):
     """Runs tasks. Use it as a context manager: at its end nothing of it is left, whatever was under way."""
 
-    width: int
-    """Tasks that are to be under way at once."""
-    attempts: int
-    """How often the loop starts a task whose process dies."""
-    here = False
-    """Whether tasks run in this process, and share its objects."""
+    width: int  # tasks that are to be under way at once
+    attempts: int  # how often the loop starts a task whose process dies
+    here = False  # whether tasks run in this process, and share its objects
 
     @abstractmethod
     def start(self, function: Function, shared: Any) -> None:

@@ -9,8 +9,6 @@ from typing import Any, TypeVar
 from optipmb_client.bulk.executors import Executor
 from optipmb_client.bulk.task import Done, Failed, WorkerDiedError
 
-__all__ = ["Outcome", "in_order", "run", "values"]
-
 T = TypeVar("T")
 
 

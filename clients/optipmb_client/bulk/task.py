@@ -10,12 +10,9 @@ from optipmb_schemas import MessageError
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.files import DatasetError
 
-__all__ = ["Done", "Failed", "Function", "WorkerDiedError", "attempt"]
-
 T = TypeVar("T")
 
-Function: TypeAlias = Callable[[Any, Any], Any]
-"""A function of a module: (what all tasks share, the task) -> a value."""
+Function: TypeAlias = Callable[[Any, Any], Any]  # a function of a module: (what all tasks share, the task) -> a value
 _INPUT: Final = (UsageError, DatasetError, MessageError, OSError)
 
 

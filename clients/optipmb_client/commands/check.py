@@ -10,13 +10,7 @@ import typer
 from rich.table import Table
 
 from optipmb_client.class_names import class_like
-from optipmb_client.commands.options import (
-    AsJson,
-    DataOptions,
-    open_sequences,
-    print_json,
-    print_table,
-)
+from optipmb_client.commands.options import AsJson, DataOptions, open_sequences, print_json, print_table
 from optipmb_client.datasets.motion import headings_along
 
 KINDS = ("car", "truck", "bus", "trailer", "pedestrian", "bicycle", "motorcycle")
@@ -29,11 +23,7 @@ if TYPE_CHECKING:
     from optipmb_client.geometry import Floats
 
 
-def check(
-    data: DataOptions,
-    *,
-    as_json: AsJson = False,
-) -> None:
+def check(data: DataOptions, *, as_json: AsJson = False) -> None:
     """Show how your data are read, without tracking: optipmb check detections.csv.
 
     Units, rate, classes, headings against the motion of the boxes, suspicious rows, and the options that read them

@@ -54,8 +54,7 @@ def evaluate(  # noqa: PLR0913  these are the command's options
     cutoff: Annotated[float, typer.Option(min=0.01, help="Cut-off distance of GOSPA and OSPA, in metres.")] = 2.0,
     order: Annotated[float, typer.Option(min=1.0, help="Order of GOSPA and OSPA.")] = 2.0,
     jobs: Annotated[
-        int | None,
-        typer.Option(min=1, help="Classes at once; default: one for each processor.", show_default=False),
+        int | None, typer.Option(min=1, help="Classes at once; default: one for each processor.", show_default=False)
     ] = None,
     ray: Ray = None,
     as_json: AsJson = False,
@@ -104,8 +103,7 @@ class _How:
     distance: float | None
     cutoff: float
     order: float
-    warn: Callable[[str], None]
-    """Prints each assumption once."""
+    warn: Callable[[str], None]  # prints each assumption once
 
 
 @dataclass(frozen=True)
@@ -125,11 +123,7 @@ def _judge(
     how: _How,
     executor: Executor,
 ) -> _Judgement:
-    from optipmb_client.commands.tables import (  # noqa: PLC0415  loads the solvers of scipy
-        clear_table,
-        figure_tables,
-        nuscenes_table,
-    )
+    from optipmb_client.commands.tables import clear_table, figure_tables, nuscenes_table  # noqa: PLC0415  loads the solvers of scipy
     from optipmb_client.evaluation import evaluate_files  # noqa: PLC0415  as above
     from optipmb_client.evaluation.figures import Settings, class_average  # noqa: PLC0415  as above
     from optipmb_client.evaluation.jobs import Evaluation, FiguresTask, figures_of  # noqa: PLC0415  as above

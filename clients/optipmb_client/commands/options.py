@@ -23,31 +23,7 @@ from optipmb_client.datasets import DATASETS, DataSequence, Dataset, DatasetArgu
 from optipmb_client.errors import ClientError, UsageError
 from optipmb_client.table_files import SUFFIXES
 
-__all__ = [
-    "MANY",
-    "RAY_ADDRESS",
-    "AsJson",
-    "Classes",
-    "DataOptions",
-    "DatasetOptions",
-    "Full",
-    "LabelledOptions",
-    "Out",
-    "Profile",
-    "Ray",
-    "Tracks",
-    "executor_of",
-    "grouped",
-    "mcap_needed",
-    "open_sequences",
-    "print_json",
-    "print_table",
-    "say",
-    "warn",
-]
-
-WORTH_PROCESSES: Final = 3000
-"""Frames from which further processes are faster than this one alone."""
+WORTH_PROCESSES: Final = 3000  # frames from which further processes are faster than this one alone
 
 WIDE = 200
 MANY = ("--sequences", "--classes", "--class", "--streams")  # options that take several values after one flag
@@ -84,8 +60,7 @@ Profile = Annotated[
         "--profile", help="Parameter profile, or auto for a detector that nobody tuned; default: the dataset's own."
     ),
 ]
-RAY_ADDRESS: Final = re.compile(r"auto|local|(ray://)?[^\s/]+:\d+")
-"""What may follow --ray."""
+RAY_ADDRESS: Final = re.compile(r"auto|local|(ray://)?[^\s/]+:\d+")  # what may follow --ray
 Ray = Annotated[
     str | None,
     typer.Option(
@@ -105,8 +80,7 @@ class DatasetOptions:
 
     data: Path | None = field(default=None, init=False)
     dataset: Annotated[
-        str | None,
-        typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False),
+        str | None, typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False)
     ] = None
     root: Annotated[Path | None, typer.Option("--root", help="File or folder of the dataset; scenes need none.")] = None
     detections: Annotated[

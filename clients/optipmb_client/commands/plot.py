@@ -6,13 +6,7 @@ from typing import Annotated
 import typer
 
 from optipmb_client.commands.evaluate import labels_of
-from optipmb_client.commands.options import (
-    AsJson,
-    LabelledOptions,
-    open_sequences,
-    print_json,
-    say,
-)
+from optipmb_client.commands.options import AsJson, LabelledOptions, open_sequences, print_json, say
 from optipmb_client.errors import UsageError
 
 

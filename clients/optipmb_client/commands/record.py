@@ -46,11 +46,7 @@ def record(
     about = {"made_by": f"optipmb {version('optipmb')}", "prefix": service.prefix, "streams": " ".join(patterns)}
     if out.exists():
         raise UsageError(f"--out: expected a new file, there is {out} already")
-    with (
-        service.connection(timeout) as connection,
-        _ended_by(stop),
-        StatusLine() as progress,
-    ):
+    with service.connection(timeout) as connection, _ended_by(stop), StatusLine() as progress:
         result = record_streams(
             connection,
             patterns,

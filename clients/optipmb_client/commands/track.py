@@ -56,8 +56,7 @@ def track(  # noqa: PLR0913  these are the command's options
         typer.Option(metavar="[SCORE]", help="Write a submission; of KITTI confirmed tracks from this mean score on."),
     ] = None,
     jobs: Annotated[
-        int | None,
-        typer.Option(min=1, help="Recordings at once; default: one for each processor.", show_default=False),
+        int | None, typer.Option(min=1, help="Recordings at once; default: one for each processor.", show_default=False)
     ] = None,
     ray: Ray = None,
     dump: Annotated[

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from optipmb_client.tuning import Curves, Estimate, Refined
 
 SHOWN = ("sAMOTA", "AMOTA", "MOTA", "MOTP", "HOTA", "IDS", "FP", "FN", "GT")
-LEAST_SHOWN = 100
-"""Boxes of tracks from which a tenth of the probabilities is shown."""
+LEAST_SHOWN = 100  # boxes of tracks from which a tenth of the probabilities is shown
 METRICS = ("combination", "samota", "amota", "mota", "hota", "both")
 
 

@@ -9,18 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from optipmb_schemas import (
-    Density,
-    Detections,
-    Keys,
-    Message,
-    MessageError,
-    Points,
-    Problem,
-    Topic,
-    Tracks,
-    decode,
-)
+from optipmb_schemas import Density, Detections, Keys, Message, MessageError, Points, Problem, Topic, Tracks, decode
 
 from optipmb_client.asking import DensityAsker
 from optipmb_client.commands.options import mcap_needed, say
@@ -165,12 +154,7 @@ def _open(recording: "RecordingStream", save: Path | None) -> None:
 
 
 def _live(
-    service: ServiceOptions,
-    timeout: float,
-    patterns: list[str],
-    *,
-    points: bool,
-    poisson: bool,
+    service: ServiceOptions, timeout: float, patterns: list[str], *, points: bool, poisson: bool
 ) -> Iterator[Message | None]:
     """Yield what comes; None now and then while nothing does."""
     keys = Keys(service.prefix)

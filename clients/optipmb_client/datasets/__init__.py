@@ -5,14 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
-from optipmb_client.datasets.interface import (
-    Cloud,
-    DataSequence,
-    Dataset,
-    DetectionFrame,
-    Regions,
-    Truth,
-)
+from optipmb_client.datasets.interface import Cloud, DataSequence, Dataset, DetectionFrame, Regions, Truth
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Pose
 from optipmb_client.table_files import tables_in
@@ -32,8 +25,7 @@ __all__ = [
     "open_dataset",
 ]
 
-_ROS2_MCAP = b"\x04\x00\x00\x00ros2"
-"""Profile in the header of an MCAP file of ROS 2."""
+_ROS2_MCAP = b"\x04\x00\x00\x00ros2"  # profile in the header of an MCAP file of ROS 2
 _HEAD = 64
 
 DATASETS = ("kitti", "nuscenes", "scene", "mcap", "rosbag", "table")
@@ -70,7 +62,6 @@ def open_dataset(
 
     Raises:
         DatasetError: the name, the root, the detector or an option is not known.
-
     """
     if name == "scene":
         if root is not None or detections is not None:

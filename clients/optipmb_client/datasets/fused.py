@@ -19,8 +19,6 @@ from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Ints, Pose
 from optipmb_client.results import ResultWriter
 
-__all__ = ["FusedDataset", "FusedSequence"]
-
 
 class OfSensor(DataSequence, Protocol):
     """A sequence that says of which sensor it is."""

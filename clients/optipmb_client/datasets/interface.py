@@ -50,20 +50,13 @@ class DetectionFrame:
 
     index: int
     stamp_ns: int
-    pose: Pose
-    """World from sensor; the identity where the detector gives boxes in the world frame."""
-    labels: tuple[str, ...]
-    """Class names, the same for all frames of a sequence."""
-    label: Ints
-    """(M,) index into `labels`."""
-    center: Floats
-    """(M, 3)"""
-    size: Floats
-    """(M, 3)"""
-    yaw: Floats
-    """(M,)"""
-    score: Floats
-    """(M,) in (0, 1]"""
+    pose: Pose  # world from sensor; the identity where the detector gives boxes in the world frame
+    labels: tuple[str, ...]  # class names, the same for all frames of a sequence
+    label: Ints  # (M,) index into `labels`
+    center: Floats  # (M, 3)
+    size: Floats  # (M, 3)
+    yaw: Floats  # (M,)
+    score: Floats  # (M,) in (0, 1]
     velocity: Floats | None = None
     """(M, 2) over ground along the axes of the sensor; None where the detector gives none."""
     cloud: Cloud | None = None
@@ -89,36 +82,24 @@ DETECTION_COLUMNS = ("label", "center", "size", "yaw", "score", "velocity", "pos
 class Regions:
     """Parts of the image in which nothing is annotated (KITTI's DontCare)."""
 
-    frame: Ints
-    """(D,)"""
-    box2d: Floats
-    """(D, 4) x1 y1 x2 y2 in pixels."""
+    frame: Ints  # (D,)
+    box2d: Floats  # (D, 4) x1 y1 x2 y2 in pixels
 
 
 @dataclass(frozen=True)
 class Truth(BoxTable):
     """The annotated objects of one sequence, ordered by frame; boxes in the world frame."""
 
-    velocity: Floats
-    """(R, 2) world frame; NaN where unknown."""
-    occlusion: Ints
-    """(R,) KITTI's levels: 0 visible, 1 partly, 2 largely occluded, 3 unknown."""
-    truncation: Ints
-    """(R,) KITTI's levels: 0 none, 1 partly, 2 largely outside the image."""
-    covered: Floats
-    """(R,) fraction of the visible surface hidden by others, in [0, 1]; NaN where unknown."""
-    points: Ints
-    """(R,) LiDAR returns on the object; -1 where unknown."""
-    box2d: Floats
-    """(R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image."""
-    ignored: Bools
-    """(R,) neither to be found nor wrong to find: hardly visible, or cut by the border of the image."""
-    regions: Regions
-    """Where detections count as neither right nor wrong."""
-    labelled: Bools | None = None
-    """(F,) frames that are compared; None: all."""
-    notes: tuple[str, ...] = ()
-    """Assumptions about it, a line each."""
+    velocity: Floats  # (R, 2) world frame; NaN where unknown
+    occlusion: Ints  # (R,) KITTI's levels: 0 visible, 1 partly, 2 largely occluded, 3 unknown
+    truncation: Ints  # (R,) KITTI's levels: 0 none, 1 partly, 2 largely outside the image
+    covered: Floats  # (R,) fraction of the visible surface hidden by others, in [0, 1]; NaN where unknown
+    points: Ints  # (R,) LiDAR returns on the object; -1 where unknown
+    box2d: Floats  # (R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image
+    ignored: Bools  # (R,) neither to be found nor wrong to find: hardly visible, or cut by the border of the image
+    regions: Regions  # where detections count as neither right nor wrong
+    labelled: Bools | None = None  # (F,) frames that are compared; None: all
+    notes: tuple[str, ...] = ()  # assumptions about it, a line each
 
 
 class DataSequence(Protocol):

@@ -20,14 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from optipmb_client.camera import SENSOR_FROM_CAMERA, Camera, sensor_from_kitti
-from optipmb_client.datasets.interface import (
-    Cloud,
-    DataSequence,
-    DetectionFrame,
-    Points,
-    Regions,
-    Truth,
-)
+from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFrame, Points, Regions, Truth
 from optipmb_client.datasets.kitti_files import (
     Calibration,
     read_calibration,
@@ -43,11 +36,11 @@ from optipmb_client.results.kitti import SUBMISSION_SCORES, KittiResultWriter
 
 PERIOD_NS = 100_000_000
 
+# AB3DMOT's splits of the training sequences
 SPLITS = {
     "train": ("0000", "0002", "0003", "0004", "0005", "0007", "0009", "0011", "0017", "0020"),
     "val": ("0001", "0006", "0008", "0010", "0012", "0013", "0014", "0015", "0016", "0018", "0019"),
 }
-"""AB3DMOT's splits of the training sequences."""
 
 _TYPE_CODES = {"Pedestrian": 1, "Car": 2, "Cyclist": 3}
 _CLASSES = tuple(sorted(_TYPE_CODES))
@@ -67,10 +60,8 @@ class Layout:
     base: Path
     detector: Path | None
     """The folder with one folder per class; None where no detector is named and there is not just one."""
-    clouds: bool
-    """Clouds are wanted."""
-    still: bool = False
-    """The sensor is taken to stand still; no poses are read."""
+    clouds: bool  # clouds are wanted
+    still: bool = False  # the sensor is taken to stand still; no poses are read
 
     @cached_property
     def probability(self) -> bool:
@@ -243,7 +234,6 @@ def read_scan(path: Path) -> Points:
 
     Raises:
         DatasetError: the file cannot be read, or is no list of four 32-bit numbers per point.
-
     """
     return read_points(path, "a velodyne scan", _SCAN_COLUMNS)
 
@@ -288,7 +278,6 @@ class KittiDataset:
 
         Raises:
             DatasetError: a named sequence is not there, or none is.
-
         """
         present = self._present()
         wanted: list[str] = []

@@ -12,8 +12,7 @@ import numpy as np
 from optipmb_client.files import DatasetError, numbers, read_rows
 from optipmb_client.geometry import Floats, Ints
 
-EARTH_RADIUS_M = 6_378_137.0
-"""Of the mercator projection that KITTI's development kit uses."""
+EARTH_RADIUS_M = 6_378_137.0  # of the mercator projection that KITTI's development kit uses
 
 _POSE_FIELDS = 12
 _ROTATION_ERROR = 1e-3  # far more than the rounding of the text, far less than a matrix that is no rotation
@@ -38,12 +37,9 @@ class Calibration:
     """The matrices of one calibration file."""
 
     path: Path
-    projection: Floats
-    """P2: (3, 4) image of camera 2 <- rectified camera 0."""
-    rectified_from_velodyne: Floats
-    """(4, 4)"""
-    velodyne_from_imu: Floats | None
-    """(4, 4); None where the file has none."""
+    projection: Floats  # P2: (3, 4) image of camera 2 <- rectified camera 0
+    rectified_from_velodyne: Floats  # (4, 4)
+    velodyne_from_imu: Floats | None  # (4, 4); None where the file has none
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -54,7 +50,6 @@ def read_calibration(path: Path) -> Calibration:
 
     Raises:
         DatasetError: the file cannot be read, or lacks P2, R0_rect or Tr_velo_to_cam, or a matrix is not one.
-
     """
     found: dict[str, Floats] = {}
     for line, fields in read_rows(path, "a calibration file"):
@@ -68,10 +63,7 @@ def read_calibration(path: Path) -> Calibration:
     rectified[:3, :3] = found["R0_rect"]
     imu = found.get("Tr_imu_to_velo")
     return Calibration(
-        path,
-        found["P2"],
-        rectified @ homogeneous(found["Tr_velo_to_cam"]),
-        None if imu is None else homogeneous(imu),
+        path, found["P2"], rectified @ homogeneous(found["Tr_velo_to_cam"]), None if imu is None else homogeneous(imu)
     )
 
 
@@ -88,7 +80,6 @@ def read_poses(path: Path) -> Floats:
 
     Raises:
         DatasetError: a line has not 12 numbers, or its rotation is none.
-
     """
     rows = read_rows(path, "a pose file")
     matrices = numbers(path, rows, _POSE_FIELDS, "a 3x4 pose, row by row").reshape(-1, 3, 4)
@@ -108,7 +99,6 @@ def read_oxts(path: Path, calibration: Calibration) -> Floats:
 
     Raises:
         DatasetError: a line has not 30 numbers, or the calibration lacks the place of the IMU.
-
     """
     if calibration.velodyne_from_imu is None:
         raise DatasetError(calibration.path, "a line Tr_imu_to_velo, to use oxts", "a file without it")
@@ -149,12 +139,9 @@ class LabelFile:
     truncation: Ints
     occlusion: Ints
     alpha: Floats
-    box2d: Floats
-    """(R, 4)"""
-    hwl: Floats
-    """(R, 3)"""
-    bottom: Floats
-    """(R, 3)"""
+    box2d: Floats  # (R, 4)
+    hwl: Floats  # (R, 3)
+    bottom: Floats  # (R, 3)
     rotation_y: Floats
 
 
@@ -163,7 +150,6 @@ def read_labels(path: Path, frames: int) -> LabelFile:
 
     Raises:
         DatasetError: a line has not 17 fields, a field is no number, or a frame lies outside the sequence.
-
     """
     rows = read_rows(path, "a label file")
     for line, fields in rows:
@@ -193,14 +179,10 @@ class DetectionFile:
 
     frame: Ints
     type: Ints
-    box2d: Floats
-    """(R, 4)"""
-    score: Floats
-    """(R,) as the detector gave it: a logit or a probability."""
-    hwl: Floats
-    """(R, 3)"""
-    bottom: Floats
-    """(R, 3)"""
+    box2d: Floats  # (R, 4)
+    score: Floats  # (R,) as the detector gave it: a logit or a probability
+    hwl: Floats  # (R, 3)
+    bottom: Floats  # (R, 3)
     rotation_y: Floats
     alpha: Floats
 
@@ -217,7 +199,6 @@ def read_detections(path: Path, frames: int, type_code: int | None) -> Detection
         DatasetError: a line has not 15 numbers, a frame lies outside the sequence, a size is not positive, or the type
         is
             another one.
-
     """
     rows = read_rows(path, "a detection file", ",")
     values = numbers(path, rows, _DETECTION_FIELDS, _DETECTION)

@@ -31,6 +31,7 @@ from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES, Submission,
 
 VERSIONS = ("v1.0-trainval", "v1.0-mini", "v1.0-test")
 
+# Objects at least so far from the car, in metres, do not count in the benchmark
 CLASS_RANGE = {
     "bicycle": 40.0,
     "bus": 50.0,
@@ -40,8 +41,8 @@ CLASS_RANGE = {
     "trailer": 50.0,
     "truck": 50.0,
 }
-"""Objects at least so far from the car, in metres, do not count in the benchmark."""
 
+# The class of a category in the tracking benchmark; it has no others
 TRACKING_CLASS = {
     "vehicle.bicycle": "bicycle",
     "vehicle.bus.bendy": "bus",
@@ -55,12 +56,10 @@ TRACKING_CLASS = {
     "vehicle.trailer": "trailer",
     "vehicle.truck": "truck",
 }
-"""The class of a category in the tracking benchmark; it has no others."""
 
 _WORLD = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 _SCAN_COLUMNS = 5
-_OCCLUSION = np.array([3, 2, 1, 1, 0])
-"""KITTI's level for each level of visibility."""
+_OCCLUSION = np.array([3, 2, 1, 1, 0])  # KITTI's level for each level of visibility
 _LEAST_SCORE = 1e-12
 
 
@@ -91,7 +90,6 @@ class NuScenesDetections:
 
         Raises:
             DatasetError: the file does not have the sample, or a score is not in [0, 1].
-
         """
         boxes = self.submission.boxes(token)
         if len(boxes) and not (boxes.score.min() >= 0.0 and boxes.score.max() <= 1.0):
@@ -243,7 +241,6 @@ def read_sweep(path: Path) -> Points:
 
     Raises:
         DatasetError: the file cannot be read, or is no list of five 32-bit numbers per point (x y z intensity ring).
-
     """
     return read_points(path, "a LiDAR scan", _SCAN_COLUMNS)
 
@@ -291,7 +288,6 @@ class NuScenesDataset:
 
         Raises:
             DatasetError: a named scene is not there, or none is.
-
         """
         scenes = self.tables.scenes
         splits = own_splits(self.tables.folder) if set(names) - {"all", *scenes, *SPLITS} else {}

@@ -31,8 +31,7 @@ _RANGES = {
     "mini_train": "61 553 655 757 796 1077 1094 1100",
     "mini_val": "103 916",
 }
-SPLITS = tuple(_RANGES)
-"""Names of the official splits."""
+SPLITS = tuple(_RANGES)  # names of the official splits
 
 
 def scenes_of_split(split: str) -> tuple[str, ...]:
@@ -46,7 +45,6 @@ def own_splits(folder: Path) -> dict[str, tuple[str, ...]]:
 
     Raises:
         DatasetError: the file is not a map from names to lists of names.
-
     """
     path = folder / "splits.json"
     if not path.exists():

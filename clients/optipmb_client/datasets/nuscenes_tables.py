@@ -33,7 +33,6 @@ def read_table(folder: Path, table: str, *names: str) -> Iterator[tuple[Any, ...
 
     Raises:
         DatasetError: the file cannot be read or is not a list of records with these fields.
-
     """
     path = folder / f"{table}.json"
     what = f"the table {table}, a JSON list of records with {', '.join(names)}"
@@ -81,8 +80,7 @@ class SceneSamples:
 
     name: str
     tokens: tuple[str, ...]
-    stamp_us: Ints
-    """(F,)"""
+    stamp_us: Ints  # (F,)
 
     def __len__(self) -> int:
         return len(self.tokens)
@@ -92,36 +90,25 @@ class SceneSamples:
 class Keyframe:
     """Where car and LiDAR were at a keyframe."""
 
-    ego: Pose
-    """World from car, at the time of the scan."""
-    lidar: Pose
-    """World from LiDAR."""
-    filename: str
-    """Of the scan, below the folder of the tables' folder."""
+    ego: Pose  # world from car, at the time of the scan
+    lidar: Pose  # world from LiDAR
+    filename: str  # of the scan, below the folder of the tables' folder
 
 
 @dataclass(frozen=True)
 class Annotations:
     """Annotated boxes of one scene, of all categories, ordered by frame and within a frame as in the table."""
 
-    frame: Ints
-    """(R,)"""
-    instance: Ints
-    """(R,) index of the object in the table of instances."""
-    category: tuple[str, ...]
-    """R names, such as vehicle.car."""
-    center: Floats
-    """(R, 3)"""
-    size: Floats
-    """(R, 3) length, width, height"""
-    rotation: Floats
-    """(R, 4) quaternion w x y z"""
+    frame: Ints  # (R,)
+    instance: Ints  # (R,) index of the object in the table of instances
+    category: tuple[str, ...]  # R names, such as vehicle.car
+    center: Floats  # (R, 3)
+    size: Floats  # (R, 3) length, width, height
+    rotation: Floats  # (R, 4) quaternion w x y z
     velocity: Floats
     """(R, 2) from the annotations of the same object before and after; NaN where there are none near in time."""
-    lidar_points: Ints
-    """(R,)"""
-    radar_points: Ints
-    """(R,)"""
+    lidar_points: Ints  # (R,)
+    radar_points: Ints  # (R,)
     visibility: Ints
     """(R,) 1: up to 40 %, 2: up to 60 %, 3: up to 80 %, 4: more of it is seen by the cameras; 0: unknown."""
 
@@ -208,14 +195,10 @@ class NuScenesTables:
 
 @dataclass(frozen=True)
 class _AnnotationTable:
-    scene: Ints
-    """(R,) ascending"""
-    integers: Ints
-    """(R, 6) frame, instance, category, visibility, LiDAR points, radar points"""
-    boxes: Floats
-    """(R, 10)"""
-    velocity: Floats
-    """(R, 2)"""
+    scene: Ints  # (R,) ascending
+    integers: Ints  # (R, 6) frame, instance, category, visibility, LiDAR points, radar points
+    boxes: Floats  # (R, 10)
+    velocity: Floats  # (R, 2)
     categories: tuple[str, ...]
 
 
@@ -269,7 +252,6 @@ def box_velocity(instance: Ints, stamp_us: Ints, position: Floats, longest_s: fl
         stamp_us: (R,) microseconds.
         position: (R, 2) metres.
         longest_s: seconds.
-
     """
     order = np.lexsort((stamp_us, instance))
     same = instance[order][1:] == instance[order][:-1]

@@ -4,10 +4,7 @@ from collections.abc import Callable
 
 from optipmb_client.load.run import Run
 
-__all__ = ["find_limit"]
-
-CLOSE = 1.05
-"""The search ends when the rates that hold and that do not differ by less than this factor."""
+CLOSE = 1.05  # the search ends when the rates that hold and that do not differ by less than this factor
 
 LEAST_HZ = 0.1
 MOST_HZ = 10_000.0

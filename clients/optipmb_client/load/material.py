@@ -17,16 +17,11 @@ from optipmb_schemas import Detections, Points, Pose, encode
 from optipmb_client.datasets import DataSequence, DetectionFrame
 from optipmb_client.datasets.interface import DETECTION_COLUMNS
 
-__all__ = ["FIRST", "STREAM_BYTES", "Frames", "generated", "head", "recorded"]
+FIRST = 2**32  # number of the first frame: from here on msgpack writes nine bytes
 
-FIRST = 2**32
-"""Number of the first frame: from here on msgpack writes nine bytes."""
+STREAM_BYTES = 24  # length of the names of streams
 
-STREAM_BYTES = 24
-"""Length of the names of streams."""
-
-CLOUDS = 20
-"""Different clouds that are generated; more would only take memory."""
+CLOUDS = 20  # different clouds that are generated; more would only take memory
 
 SPACING_M = 12.0
 RADIUS_M = 4.0
@@ -41,10 +36,8 @@ class Frames:
 
     detections: tuple[bytes, ...]
     clouds: tuple[bytes | None, ...]
-    objects: float
-    """Mean number of objects in a frame."""
-    points: float
-    """Mean number of points in a frame."""
+    objects: float  # mean number of objects in a frame
+    points: float  # mean number of points in a frame
 
     def __len__(self) -> int:
         return len(self.detections)

@@ -10,8 +10,6 @@ from optipmb_client.colours import COLOURS
 from optipmb_client.errors import ClientError
 from optipmb_client.load.run import STAGES, Run
 
-__all__ = ["draw_runs", "table_of"]
-
 _STYLES = ("-", "--", "-.", ":")
 _MARKS = ("o", "s", "^", "D")
 

@@ -25,16 +25,12 @@ from optipmb_client.sessions import close_session, set_parameters
 from optipmb_client.zenoh import Connection
 from optipmb_client.zenoh.sender import Sender
 
-__all__ = ["STAGES", "Load", "Run", "run_load"]
-
 STAGES = ("queue", "decode", "step", "deliver")
 """Parts of a latency: waiting (for a thread, for the cloud), decoding, tracking, and the rest: encoding and network."""
 
-SETTLED = 10
-"""Frames of a stream whose latency does not count: its session begins with them."""
+SETTLED = 10  # frames of a stream whose latency does not count: its session begins with them
 
-STRAGGLERS_S = 5.0
-"""After the last frame, how long nothing may come before what has not come counts as lost."""
+STRAGGLERS_S = 5.0  # after the last frame, how long nothing may come before what has not come counts as lost
 CACHE = 50
 EPOCH_NS = 1_600_000_000_000_000_000
 
@@ -75,17 +71,14 @@ class Run:
     sent: int
     received: int
     repeated: int
-    cloudless: int
-    """Frames whose cloud was sent and that were tracked without it."""
+    cloudless: int  # frames whose cloud was sent and that were tracked without it
     p50_ms: float
     p99_ms: float
     max_ms: float
     stages_p50_ms: dict[str, float]
     stages_p99_ms: dict[str, float]
-    late_p99_ms: float
-    """How late the generator itself was."""
-    generator_cpu: float
-    """Share of one processor that the generator took."""
+    late_p99_ms: float  # how late the generator itself was
+    generator_cpu: float  # share of one processor that the generator took
 
     @property
     def lost(self) -> int:

@@ -14,13 +14,9 @@ from optipmb_schemas import Detections, Message, MessageError, SessionParameters
 from optipmb_client.mcap_files.reading import Recorded
 from optipmb_client.mcap_files.writing import KINDS
 
-__all__ = ["FrameId", "Step", "StreamPlan", "content", "plan", "renamed", "steps"]
+FrameId: TypeAlias = tuple[bytes, int]  # epoch and sequence number
 
-FrameId: TypeAlias = tuple[bytes, int]
-"""Epoch and sequence number."""
-
-MARGIN_S: Final = 1e-3
-"""Of ages, which are of floating point."""
+MARGIN_S: Final = 1e-3  # of ages, which are of floating point
 
 _T = TypeVar("_T", bound=Message)
 

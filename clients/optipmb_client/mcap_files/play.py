@@ -23,8 +23,6 @@ from optipmb_client.subscriber import Subscriber
 from optipmb_client.zenoh import Connection
 from optipmb_client.zenoh.sender import Sender
 
-__all__ = ["PlayedStream", "choose", "play"]
-
 NO_PROFILE: Final = "--profile: expected a profile, for the recording does not say which was in force on {}"
 
 
@@ -172,11 +170,7 @@ class _Player:
         self._problems: collections.deque[Problem] = collections.deque(maxlen=KEPT_PROBLEMS)
         self._problem_count = 0
         self._inbox = Subscriber(
-            self._stream,
-            connection=connection,
-            on_problem=self._note,
-            queue=4 * len(one.frames) + 64,
-            prefix=prefix,
+            self._stream, connection=connection, on_problem=self._note, queue=4 * len(one.frames) + 64, prefix=prefix
         )
 
     def __enter__(self) -> Self:

@@ -14,8 +14,6 @@ from optipmb_schemas.fields import check_stream
 from optipmb_client.files import DatasetError
 from optipmb_client.mcap_files.writing import ENCODING, KINDS
 
-__all__ = ["Recorded", "RecordingFile"]
-
 _WHAT = "a recording (MCAP file)"
 _LARGEST = 2**30
 """Bytes of the largest record that is read: chunks have a few megabytes, a damaged length may say anything."""

@@ -20,8 +20,6 @@ from optipmb_client.mcap_files.writing import RecordingWriter
 from optipmb_client.sessions import set_parameters
 from optipmb_client.zenoh import Connection
 
-__all__ = ["Recording", "record"]
-
 SMALL: tuple[Topic, ...] = ("detections", "tracks", "problems")
 SMALL_QUEUE = 16_384
 CLOUD_QUEUE = 64  # a cloud has a few megabytes

@@ -18,8 +18,7 @@ from optipmb_schemas.export import schema_of
 
 from optipmb_client.foxglove_messages import FoxgloveMessages, Shown
 
-__all__ = ["ENCODING", "KINDS", "RecordingWriter"]
-
+# Message types by the last part of their keys
 KINDS: Final[dict[str, type[Message]]] = {
     "detections": Detections,
     "points": Points,
@@ -27,10 +26,8 @@ KINDS: Final[dict[str, type[Message]]] = {
     "problems": Problem,
     "parameters": SessionParameters,
 }
-"""Message types by the last part of their keys."""
 
-ENCODING: Final = "encoding"
-"""Name in the metadata of a channel under which the Zenoh encoding of its messages stands."""
+ENCODING: Final = "encoding"  # name in the metadata of a channel under which the Zenoh encoding of its messages stands
 
 CHUNK: Final = 4 * 2**20
 SEQUENCES: Final = 2**32

@@ -2,8 +2,4 @@
 
 from optipmb_client.results.rows import ResultTable, ResultWriter, empty_table
 
-__all__ = [
-    "ResultTable",
-    "ResultWriter",
-    "empty_table",
-]
+__all__ = ["ResultTable", "ResultWriter", "empty_table"]

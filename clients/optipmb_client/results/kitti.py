@@ -25,8 +25,7 @@ from optipmb_client.files import DatasetError, numbers, read_rows, write_whole
 from optipmb_client.geometry import PoseLike, rotation_of, to_sensor
 from optipmb_client.results.rows import ResultTable, ResultWriter
 
-LEAST_SHOWN = 0.5
-"""Part of a projected box that must lie in the image for its line to have an image box."""
+LEAST_SHOWN = 0.5  # part of a projected box that must lie in the image for its line to have an image box
 
 SUBMISSION_SCORES = {"Car": 0.55, "Cyclist": 0.6, "Pedestrian": 0.55}
 """Least mean score of a track in a submission, for the highest HOTA of image boxes (`docs/tuning.md`)."""
@@ -98,7 +97,6 @@ def read_kitti_results(path: Path, labels: Sequence[str] = ()) -> ResultTable:
     Raises:
         DatasetError: the file is missing, a line has another number of fields or a field that is no number, a frame is
             negative, or one id stands twice in a frame.
-
     """
     what = "frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z ry score"
     rows = read_rows(path, "a KITTI result file")

@@ -24,8 +24,7 @@ from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES, NUSCENES_ME
 from optipmb_client.results.rows import ResultTable, ResultWriter, stacked
 
 NUSCENES_FILE = "tracking_results.json"
-NUSCENES_MAX_BOXES = 500
-"""Boxes in one sample that the benchmark accepts."""
+NUSCENES_MAX_BOXES = 500  # boxes in one sample that the benchmark accepts
 
 _DECIMALS = 6
 _DIGITS = 18
@@ -42,7 +41,6 @@ def join_scenes(out: Path, scenes: Sequence[str], meta: Mapping[str, Any]) -> No
 
     Raises:
         DatasetError: the file of a scene cannot be read.
-
     """
     head = _head(meta)
     texts = (read_text(scene_file(out, name), "the results of a scene") for name in scenes)
@@ -77,7 +75,6 @@ class NuScenesResultWriter(ResultWriter):
 
         Raises:
             DatasetError: a track is of a class that the benchmark does not have.
-
         """
         unknown = [name for name in np.asarray(tracks.labels)[tracks.label].tolist() if name not in NUSCENES_CLASSES]
         if unknown:
@@ -125,7 +122,6 @@ def read_nuscenes_results(path: Path) -> Submission:
 
     Raises:
         DatasetError: it cannot be read, is not in the layout, or holds more boxes in a sample than the benchmark takes.
-
     """
     file = path / NUSCENES_FILE if path.is_dir() else path
     results = read_submission(file, "tracking")
@@ -143,7 +139,6 @@ def result_table(results: Submission, scene: str, samples: Sequence[str]) -> Res
 
     Raises:
         DatasetError: a sample is missing, or an id stands twice in a sample.
-
     """
     frames = [results.boxes(token) for token in samples]
     names = [name for boxes in frames for name in boxes.id]

@@ -42,20 +42,13 @@ _PLANE = 2
 class Boxes:
     """The boxes of one sample."""
 
-    label: Ints
-    """(M,) index into `NUSCENES_CLASSES`."""
-    center: Floats
-    """(M, 3)"""
-    size: Floats
-    """(M, 3) length, width, height."""
-    yaw: Floats
-    """(M,)"""
-    velocity: Floats
-    """(M, 2); a row is NaN where the velocity is unknown."""
-    score: Floats
-    """(M,)"""
-    id: tuple[str, ...]
-    """M texts; empty texts for detections."""
+    label: Ints  # (M,) index into `NUSCENES_CLASSES`
+    center: Floats  # (M, 3)
+    size: Floats  # (M, 3) length, width, height
+    yaw: Floats  # (M,)
+    velocity: Floats  # (M, 2); a row is NaN where the velocity is unknown
+    score: Floats  # (M,)
+    id: tuple[str, ...]  # M texts; empty texts for detections
 
     def __len__(self) -> int:
         return len(self.label)
@@ -67,10 +60,8 @@ class Submission:
 
     path: Path
     meta: Mapping[str, Any]
-    rows: Mapping[str, list[tuple[str, _Row]]]
-    """By sample token: id and numbers of each box."""
-    classes: Mapping[str, int]
-    """Number of boxes of each class name of the file, also of classes that are left out."""
+    rows: Mapping[str, list[tuple[str, _Row]]]  # by sample token: id and numbers of each box
+    classes: Mapping[str, int]  # number of boxes of each class name of the file, also of classes that are left out
 
     def __contains__(self, token: str) -> bool:
         return token in self.rows
@@ -88,7 +79,6 @@ class Submission:
 
         Raises:
             DatasetError: the file does not have the sample, or a box has a number that cannot be one.
-
         """
         if token not in self.rows:
             raise DatasetError(self.path, "every sample, if need be with an empty list", f"no sample {token}")
@@ -123,7 +113,6 @@ def read_submission(path: Path, kind: Kind) -> Submission:
 
     Raises:
         DatasetError: it cannot be read or is not in the layout.
-
     """
     what = f"a nuScenes {kind} file"
 

@@ -15,8 +15,6 @@ from optipmb_schemas import Tracks
 
 from optipmb_client.geometry import Bools, Floats, Ints, PoseLike, stack_poses, to_sensor, to_world
 
-__all__ = ["BoxTable", "ResultTable", "ResultWriter", "column_shape", "empty_table", "stacked"]
-
 
 class ResultWriter(ABC):
     """Takes the tracks of one sequence frame by frame; the file appears complete at `close`, or not at all.
@@ -56,18 +54,12 @@ class BoxTable:
     """Boxes of one sequence, ordered by frame, in one frame of reference that the maker names."""
 
     labels: tuple[str, ...]
-    frame: Ints
-    """(R,)"""
-    id: Ints
-    """(R,)"""
-    label: Ints
-    """(R,) index into `labels`."""
-    center: Floats
-    """(R, 3)"""
-    size: Floats
-    """(R, 3) length, width, height."""
-    yaw: Floats
-    """(R,)"""
+    frame: Ints  # (R,)
+    id: Ints  # (R,)
+    label: Ints  # (R,) index into `labels`
+    center: Floats  # (R, 3)
+    size: Floats  # (R, 3) length, width, height
+    yaw: Floats  # (R,)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -107,12 +99,9 @@ _NOT_OF_ROWS: Final = {"labels", "notes", "regions", "labelled"}
 class ResultTable(BoxTable):
     """All boxes of all tracks of one sequence."""
 
-    score: Floats
-    """(R,)"""
-    box2d: Floats
-    """(R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image."""
-    notes: tuple[str, ...] = ()
-    """Assumptions about them, a line each."""
+    score: Floats  # (R,)
+    box2d: Floats  # (R, 4) x1 y1 x2 y2 in pixels; NaN where there is no image
+    notes: tuple[str, ...] = ()  # assumptions about them, a line each
 
 
 def empty_table(labels: tuple[str, ...] = ()) -> ResultTable:

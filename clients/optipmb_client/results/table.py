@@ -20,8 +20,6 @@ from optipmb_client.geometry import Ints, PoseLike
 from optipmb_client.results.rows import ResultWriter, stacked
 from optipmb_client.table_files import Columns, write_table
 
-__all__ = ["COVARIANCE", "TableResultWriter", "join", "track_columns"]
-
 _STATE: Final = ("x", "y", "v", "phi", "omega", "a")
 COVARIANCE: Final = {f"cov_{_STATE[i]}_{_STATE[j]}": (i, j) for i in range(6) for j in range(i, 6)}
 """Column -> place in the covariance (6, 6)."""

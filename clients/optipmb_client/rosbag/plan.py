@@ -16,8 +16,6 @@ from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Pose
 from optipmb_client.rosbag.reading import Bag, Raw
 
-__all__ = ["Choice", "Plan", "PlannedFrame", "plan", "read_transforms"]
-
 _TF: Final = "tf2_msgs/msg/TFMessage"
 _ODOMETRY: Final = "nav_msgs/msg/Odometry"
 _SOME: Final = 5
@@ -27,12 +25,9 @@ _SOME: Final = 5
 class Choice:
     """What a user chooses where a bag leaves it open; empty: by the rules above."""
 
-    points: str = ""
-    """Topic of the clouds."""
-    odometry: str = ""
-    """Topic of the odometry."""
-    fixed_frame: str = ""
-    """Frame of the tracks; default: the one that all others hang from."""
+    points: str = ""  # topic of the clouds
+    odometry: str = ""  # topic of the odometry
+    fixed_frame: str = ""  # frame of the tracks; default: the one that all others hang from
 
 
 class PlannedFrame(NamedTuple):

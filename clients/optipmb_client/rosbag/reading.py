@@ -15,10 +15,8 @@ from optipmb_client.files import DatasetError
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-__all__ = ["Bag", "Raw", "Stamped"]
 
-_CDR: Final = 4
-"""Bytes ahead of the fields; the second tells the order of the bytes of numbers."""
+_CDR: Final = 4  # bytes ahead of the fields; the second tells the order of the bytes of numbers
 
 
 class Raw(NamedTuple):

@@ -24,8 +24,6 @@ from optipmb_client.rosbag.reading import Bag, Raw
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["BagResultWriter"]
-
 
 class BagResultWriter(ResultWriter):
     """Writes the tracks of one sequence of a bag; use it as a context manager.

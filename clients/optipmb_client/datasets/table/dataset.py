@@ -26,13 +26,12 @@ from optipmb_client.table_files import SUFFIXES, tables_in
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["OPTIONS", "TableDataset", "TableSequence"]
 
+# Options beside `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
 OPTIONS: Final = (
     *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
     *("poses", "truth", "tracks", "decimal", "encoding", "date"),
 )
-"""Options beside `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them."""
 GAP: Final = 1.5
 _HERE: Final = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 

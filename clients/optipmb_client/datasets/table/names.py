@@ -11,8 +11,6 @@ from typing import Final
 
 from optipmb_client.detector_files import BOX_LISTS
 
-__all__ = ["ALIASES", "Column", "find_columns"]
-
 
 @dataclass(frozen=True)
 class Column:
@@ -95,8 +93,7 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Names of each column, the most telling first."""
 
-_LISTED: Final = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")
-"""Meanings of the numbers of a list of `BOX_LISTS`."""
+_LISTED: Final = ("x", "y", "z", "l", "w", "h", "yaw", "vx", "vy")  # meanings of the numbers of a list of `BOX_LISTS`
 _UNITS: Final[Mapping[str, str]] = {
     "deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad",
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us",

@@ -32,21 +32,14 @@ from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Bools, Floats, Ints
 from optipmb_client.table_files import Columns, read_table
 
-__all__ = ["NO_CLASS", "NO_ID", "Boxes", "read_boxes", "read_tables"]
-
-NO_CLASS: Final = "object"
-"""Class of all boxes of a table without classes."""
-NO_ID: Final = -1
-"""Id of a box that has none."""
+NO_CLASS: Final = "object"  # class of all boxes of a table without classes
+NO_ID: Final = -1  # id of a box that has none
 _UNIT: Final = 1e-3
 _MOST_SHOWN: Final = 6
-_CROWDED: Final = 0.5
-"""Share of boxes that share their place with another one from which their stamps cannot be right."""
-_LONGEST: Final = 30.0
-"""Boxes that are longer, in metres, are suspicious."""
+_CROWDED: Final = 0.5  # share of boxes that share their place with another one from which their stamps cannot be right
+_LONGEST: Final = 30.0  # boxes that are longer, in metres, are suspicious
 LEAST_VARIANCE: Final = 1e-8
-LARGEST_VARIANCE: Final = 1e8
-"""Variances of a position along any axis, m^2, as `Detections` have them."""
+LARGEST_VARIANCE: Final = 1e8  # variances of a position along any axis, m^2, as `Detections` have them
 _POSE: Final = ("pose_x", "pose_y", "pose_z")
 _TURNS: Final = ("w", "x", "y", "z")
 
@@ -55,40 +48,26 @@ _TURNS: Final = ("w", "x", "y", "z")
 class Boxes:
     """The rows of one table; those of a row that stands for an empty frame are left out of all but the frames."""
 
-    frame_stamp: Ints
-    """(R,) ns, of every row, also those without a box."""
-    frame_key: NDArray[np.str_]
-    """(R,) recording and sensor of every row."""
+    frame_stamp: Ints  # (R,) ns, of every row, also those without a box
+    frame_key: NDArray[np.str_]  # (R,) recording and sensor of every row
     frame_pose: Floats | None
     """(R, 7) translation and quaternion, world from sensor; None where boxes are in the world frame."""
-    frame_time: NDArray[Any]
-    """(R,) time as the table has it."""
-    frame_number: NDArray[Any] | None
-    """(R,) number of the frame as the table has it; None where it has none."""
-    row: Ints
-    """(B,) row of each box, counted from 0."""
-    center: Floats
-    """(B, 3)"""
-    size: Floats
-    """(B, 3); NaN in a table of objects that has neither l nor w."""
-    yaw: Floats
-    """(B,); NaN in a table of objects that has none."""
-    velocity: Floats | None
-    """(B, 2); rows of NaN where unknown."""
+    frame_time: NDArray[Any]  # (R,) time as the table has it
+    frame_number: NDArray[Any] | None  # (R,) number of the frame as the table has it; None where it has none
+    row: Ints  # (B,) row of each box, counted from 0
+    center: Floats  # (B, 3)
+    size: Floats  # (B, 3); NaN in a table of objects that has neither l nor w
+    yaw: Floats  # (B,); NaN in a table of objects that has none
+    velocity: Floats | None  # (B, 2); rows of NaN where unknown
     position_covariance: Floats | None
     """(B, 3, 3) of the errors of the centres along the axes of the boxes, m^2; of NaN where unknown, None without."""
-    score: Floats
-    """(B,) in (0, 1]"""
-    name: NDArray[np.str_]
-    """(B,) class"""
-    id: Ints | None
-    """(B,) object, `NO_ID` where the cell has none; None where the table has no such column."""
+    score: Floats  # (B,) in (0, 1]
+    name: NDArray[np.str_]  # (B,) class
+    id: Ints | None  # (B,) object, `NO_ID` where the cell has none; None where the table has no such column
     time_column: str
     key_columns: tuple[str, ...]
-    sensor_column: str
-    """That of `key_columns` which names the sensor; empty: none does."""
-    keys: Mapping[str, tuple[str, ...]]
-    """Key -> values of the columns that it stands for."""
+    sensor_column: str  # that of `key_columns` which names the sensor; empty: none does
+    keys: Mapping[str, tuple[str, ...]]  # key -> values of the columns that it stands for
 
     def rows(self, first: int, last: int) -> "Boxes":
         """Return the table of the rows from `first` up to `last`, which are counted from 0 again."""

@@ -20,8 +20,6 @@ from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Bools, Floats, Ints, Pose, stack_poses, to_world
 from optipmb_client.table_files import line_of, read_table
 
-__all__ = ["ObjectTable", "TableOptions", "match_stamps", "read_objects", "truth_at"]
-
 SPARSE: Final = 1.5
 _WRITTEN: Final = frozenset({"existence", "age", "time_since_detection", "detection_row"})
 """Columns by which a table of tracks that OptiPMB wrote is known."""
@@ -36,10 +34,8 @@ class TableOptions:
     """Options by which all tables of a dataset are read: detections, truth and tracks."""
 
     options: Mapping[str, str] = field(default_factory=dict)
-    recordings: set[str] = field(default_factory=set)
-    """Names and keys of all recordings."""
-    named: dict[str, DatasetError | None] = field(default_factory=dict)
-    """As `Reading.named`, of all tables."""
+    recordings: set[str] = field(default_factory=set)  # names and keys of all recordings
+    named: dict[str, DatasetError | None] = field(default_factory=dict)  # as `Reading.named`, of all tables
 
     def check(self) -> None:
         """Raise for an option that names a column or class of no table."""

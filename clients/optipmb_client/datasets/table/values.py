@@ -18,58 +18,28 @@ from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Ints, wrap_angle
 from optipmb_client.table_files import line_of
 
-__all__ = [
-    "COUNTED_HZ",
-    "HEADINGS",
-    "SECONDS",
-    "Finding",
-    "Reading",
-    "frame_starts",
-    "group_stamps",
-    "median_step",
-    "read_angle",
-    "read_axes",
-    "read_digits",
-    "read_heading",
-    "read_scores",
-    "read_sizes",
-    "read_stamps",
-    "read_turn",
-    "read_velocity",
-]
-
 SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-DATED: Final = (1e8, 4.2e9)
-"""Seconds since 1970 that are taken for a date: 1973 to 2103."""
-PERIODS: Final = (0.005, 10.0)
-"""Shortest and longest time between frames that is plausible, s."""
-COUNTED_HZ: Final = 10.0
-"""Rate of frames that are counted and not stamped, where nobody says another."""
-APART: Final = 3.0
-"""Ratio of the shortest step between frames to the longest step inside of one."""
-UPRIGHT: Final = 0.3
-"""Largest x and y of the quaternion of a box that stands upright."""
+DATED: Final = (1e8, 4.2e9)  # seconds since 1970 that are taken for a date: 1973 to 2103
+PERIODS: Final = (0.005, 10.0)  # shortest and longest time between frames that is plausible, s
+COUNTED_HZ: Final = 10.0  # rate of frames that are counted and not stamped, where nobody says another
+APART: Final = 3.0  # ratio of the shortest step between frames to the longest step inside of one
+UPRIGHT: Final = 0.3  # largest x and y of the quaternion of a box that stands upright
 FULL_TURN: Final = 6.4
 PERCENT: Final = 100.0
 SPREAD: Final = 8.0
-LOGIT: Final = 30.0
-"""Beyond it a sigmoid is 0 or 1 in six decimals; scores beyond it are no logits."""
-ROUNDING: Final = 1e-3
-"""Scores up to so much above 1 are 1."""
-FEW: Final = 0.05
-"""Share of scores outside 0 to 1 up to which they are mistakes and not of another kind."""
-ENOUGH_MOVES: Final = 5
-"""Moves from which headings are compared with motion."""
-AGREED: Final = 0.5
-"""Share of moves along headings of another convention from which it is likely."""
+LOGIT: Final = 30.0  # beyond it a sigmoid is 0 or 1 in six decimals; scores beyond it are no logits
+ROUNDING: Final = 1e-3  # scores up to so much above 1 are 1
+FEW: Final = 0.05  # share of scores outside 0 to 1 up to which they are mistakes and not of another kind
+ENOUGH_MOVES: Final = 5  # moves from which headings are compared with motion
+AGREED: Final = 0.5  # share of moves along headings of another convention from which it is likely
 DOUBTFUL: Final = 0.7
 CERTAIN: Final = 0.8
 """Headings are in degrees where fewer moves than the first share are along them in radians, more than the second go
 forward along them in degrees."""
 SINGLE: Final = 0.1
-FAR: Final = 1e5
-"""Coordinates in metres beyond which single precision loses centimetres."""
+FAR: Final = 1e5  # coordinates in metres beyond which single precision loses centimetres
 
+# Axis from which a heading is measured, counter-clockwise if not said otherwise -> (sign, offset) of the yaw
 HEADINGS: Final[Mapping[str, tuple[float, float]]] = {
     "x": (1.0, 0.0),
     "y": (1.0, 0.5 * np.pi),
@@ -80,7 +50,6 @@ HEADINGS: Final[Mapping[str, tuple[float, float]]] = {
     "-x-clockwise": (-1.0, np.pi),
     "-y-clockwise": (-1.0, -0.5 * np.pi),
 }
-"""Axis from which a heading is measured, counter-clockwise if not said otherwise -> (sign, offset) of the yaw."""
 
 
 @dataclass(frozen=True)
@@ -390,8 +359,7 @@ def read_velocity(
     return axes
 
 
-SLOW: Final = 0.5
-"""Differences of velocities up to it say nothing, m/s."""
+SLOW: Final = 0.5  # differences of velocities up to it say nothing, m/s
 
 
 def read_sizes(reading: Reading, sizes: Floats, names: np.ndarray, *, stated: bool) -> Floats:
