@@ -28,7 +28,7 @@ from optipmb_client.evaluation.nuscenes_scene import (
     prepare_scene,
 )
 from optipmb_client.results import ResultTable
-from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
+from optipmb_client.results.nuscenes import NUSCENES_CLASSES
 from real_data import nuscenes_root
 
 CAR, PEDESTRIAN = NUSCENES_CLASSES.index("car"), NUSCENES_CLASSES.index("pedestrian")

@@ -7,57 +7,57 @@ chosen by options: `points`, `odometry`, `fixed_frame`, and `class.NAME=OTHER` f
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from optipmb_schemas import Tracks
 from optipmb_schemas.installation import install_command
 
 from optipmb_client.camera import synthetic_camera
-from optipmb_client.datasets.interface import DETECTION_COLUMNS, Cloud, DataSequence, DetectionFrame, Points, Truth
+from optipmb_client.datasets.interface import (
+    DETECTION_COLUMNS,
+    Cloud,
+    DataSequence,
+    Dataset,
+    DetectionFrame,
+    Points,
+    relabelled,
+)
 from optipmb_client.errors import ClientError
 from optipmb_client.files import DatasetError
-from optipmb_client.geometry import Pose
-from optipmb_client.results import ResultWriter
-from optipmb_client.results.kitti import KittiResultWriter
+from optipmb_client.results.kitti import write_kitti_results
+
+if TYPE_CHECKING:
+    from optipmb_client.geometry import Pose
 
 try:
     from optipmb_schemas import MessageError
     from optipmb_schemas.ros2.arrays import Boxes, boxes_of, points_of
 
-    from optipmb_client.rosbag.plan import Choice, Plan, detection_topics, plan, read_transforms
-    from optipmb_client.rosbag.reading import Bag, Raw
-    from optipmb_client.rosbag.writing import BagResultWriter
+    from optipmb_client.datasets.bag import Bag, Choice, Plan, Raw, detection_topics, plan, read_transforms
+    from optipmb_client.results.bag import write_bag
 except ImportError as error:
     raise ClientError(f"bags need rosbags, which is not installed: {install_command('ros2')}") from error
 
 _CLASS = "class."
 
 
-class RosbagSequence:
+class RosbagSequence(DataSequence):
     """One topic of detections."""
+
+    poses: "list[Pose]"
 
     def __init__(self, bag: Bag, plan_: Plan, classes: Mapping[str, str], *, covariance: bool) -> None:
         self.name = plan_.topic.strip("/").replace("/", ".")
         self.plan = plan_
         self.bag = bag
+        self.has_clouds: bool = bool(plan_.clouds)
+        self.notes = plan_.notes
+        self.poses = [frame.pose for frame in plan_.frames]
         self._classes = classes
         self._covariance = covariance
 
     def __len__(self) -> int:
         return len(self.plan.frames)
-
-    @property
-    def has_clouds(self) -> bool:
-        """Whether any frame has a cloud."""
-        return bool(self.plan.clouds)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was left out, and why."""
-        return tuple(self.plan.notes)
-
-    @property
-    def poses(self) -> Sequence[Pose]:
-        """World from sensor of each frame."""
-        return [frame.pose for frame in self.plan.frames]
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
@@ -86,26 +86,20 @@ class RosbagSequence:
                 if index == len(due) or due[index][0] != due[index - 1][0]:
                     clouds.pop(due[index - 1][0], None)
 
-    def truth(self) -> Truth | None:
-        """Return None: nobody annotated it."""
-        return None
-
     def _complete(self, stamp_ns: int, clouds: Mapping[int, Raw]) -> bool:
         return stamp_ns not in self.plan.clouds or stamp_ns in clouds
 
     def _frame(self, index: int, boxes: Boxes, cloud: Raw | None) -> DetectionFrame:
         planned = self.plan.frames[index]
-        row_of = [self.labels.index(name) for name in boxes.labels]
-        label = boxes.label.copy()
-        for row, there in enumerate(row_of):
-            label[boxes.label == row] = there
         pose = self.plan.clouds.get(planned.stamp_ns)
+        columns = {name: getattr(boxes, name) for name in DETECTION_COLUMNS}
+        columns["label"] = relabelled(boxes.label, boxes.labels, self.labels)
         return DetectionFrame(
             index=index,
             stamp_ns=planned.stamp_ns,
             pose=planned.pose,
             labels=self.labels,
-            **{name: getattr(boxes, name) for name in DETECTION_COLUMNS} | {"label": label},
+            **columns,
             cloud=None if cloud is None or pose is None else Cloud(partial(self._points, cloud), *pose),
         )
 
@@ -122,16 +116,16 @@ class RosbagSequence:
             raise self.bag.wrong(raw, error) from error
 
 
-class RosbagDataset:
+class RosbagDataset(Dataset):
     """The topics of detections of one bag.
 
     Args:
-        path: the folder or file.
+        path: The folder or file.
         options: `points`, `odometry`, `fixed_frame`, `class.NAME`, `keep_input`, and `covariance`: whether the
             covariances of positions in the detections are taken for their accuracy.
 
     Raises:
-        DatasetError: it cannot be read, has no detections, or an option is not known.
+        DatasetError: It cannot be read, has no detections, or an option is not known.
     """
 
     name = "rosbag"
@@ -148,12 +142,9 @@ class RosbagDataset:
                 allowed = f"one of {', '.join(sorted(known))}, keep_input, covariance, class.NAME"
                 raise DatasetError(f"option {name}", allowed, "an unknown option")
         self._bag = Bag(path)
+        self._sequences: dict[str, RosbagSequence] = {}
         self._choice = Choice(**texts)
         self._topics = {topic.strip("/").replace("/", "."): topic for topic in detection_topics(self._bag)}
-
-    @cached_property
-    def _sequences(self) -> dict[str, RosbagSequence]:
-        return {}
 
     def sequences(self, names: Sequence[str]) -> Sequence[RosbagSequence]:
         """Return the topics of these names, with dots or slashes, or `all`."""
@@ -171,9 +162,9 @@ class RosbagDataset:
                 self._sequences[name] = RosbagSequence(self._bag, made, self._classes, covariance=self._covariance)
         return [self._sequences[name] for name in wanted]
 
-    def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
-        """Return a writer of the bag `out` if that is an .mcap file, else of `out/NAME.txt` in the format of KITTI."""
+    def write(self, out: Path, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path:
+        """Write the bag `out` if that is an .mcap file, else `out/NAME.txt` in the format of KITTI."""
         if out.suffix == ".mcap":
-            (chosen,) = self.sequences([sequence.name])
-            return BagResultWriter(out, chosen.bag, chosen.plan, keep_input=self._keep_input)
-        return KittiResultWriter(out / f"{sequence.name}.txt", synthetic_camera())
+            (one,) = self.sequences([sequence.name])
+            return write_bag(out, one.bag, one.plan, tracks, keep_input=self._keep_input)
+        return write_kitti_results(out / f"{sequence.name}.txt", synthetic_camera(), sequence.poses, tracks)

@@ -16,7 +16,7 @@ import numpy as np
 from optipmb_client.datasets.nuscenes import CLASS_RANGE, NuScenesSequence, tracking_labels
 from optipmb_client.geometry import Bools, Floats, Ints, rotation_of
 from optipmb_client.results import ResultTable
-from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
+from optipmb_client.results.nuscenes import NUSCENES_CLASSES
 
 RACK = "static_object.bicycle_rack"
 _RACKED = ("bicycle", "motorcycle")

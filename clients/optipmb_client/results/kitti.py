@@ -23,7 +23,7 @@ from optipmb_client.camera import Camera, alpha_of, kitti_from_sensor, sensor_fr
 from optipmb_client.class_names import class_like
 from optipmb_client.files import DatasetError, numbers, read_rows, write_whole
 from optipmb_client.geometry import PoseLike, rotation_of, to_sensor
-from optipmb_client.results.rows import ResultTable, ResultWriter
+from optipmb_client.results.rows import ResultTable
 
 LEAST_SHOWN = 0.5  # part of a projected box that must lie in the image for its line to have an image box
 
@@ -34,57 +34,54 @@ _FIELDS = 18
 _TYPE = 2
 
 
-class KittiResultWriter(ResultWriter):
-    """Writes the tracks of one sequence; use it as a context manager, or call `close` at the end.
+def write_kitti_results(
+    path: Path,
+    camera: Camera,
+    poses: Sequence[PoseLike],
+    tracks: Mapping[int, Tracks],
+    least: Mapping[str, float] | None = None,
+) -> Path:
+    """Write the tracks (world frame) of a sequence, by frame index; without any the file is empty.
 
     Args:
-        path: the file.
-        camera: the camera of the image boxes.
-        least: for a submission, the least mean score of a track by class; other classes are refused. None: all tracks.
+        path: The file; returned.
+        camera: Camera of the image boxes.
+        poses: World from sensor, one per frame.
+        tracks: The tracks of each frame.
+        least: For a submission, the least mean score of a track by class; other classes are refused. None: all tracks.
     """
-
-    def __init__(self, path: Path, camera: Camera, least: Mapping[str, float] | None = None) -> None:
-        super().__init__(path)
-        self._camera = camera
-        self._least = least
-        self._lines: list[tuple[int, str, float, bool, str]] = []  # id, class, score, whether the image shows it, text
-        self._confirmed: set[int] = set()
-
-    def add(self, index: int, pose: PoseLike, tracks: Tracks) -> None:
-        """Write the tracks (world frame) of frame `index`, whose sensor stood at `pose`."""
-        center, yaw = to_sensor(
-            rotation_of(np.asarray(pose.quaternion)), np.asarray(pose.translation), tracks.center, tracks.yaw
-        )
-        image, seen = self._camera.boxes(center, tracks.size, yaw, least_shown=LEAST_SHOWN)
-        bottom, hwl, rotation_y = kitti_from_sensor(center, tracks.size, yaw)
-        alpha = alpha_of(bottom, rotation_y)
-        values = np.column_stack([alpha, image, hwl, bottom, rotation_y, tracks.score])
-        # Adding zero turns a rounded -0 into 0, so that equal numbers are written alike.
-        values = np.round(values, 6) + 0.0
-        known = tuple(self._least or ())
-        names = [class_like(name, known) or "" if known else name for name in tracks.labels]
-        if other := [tracks.labels[label] for label in tracks.label.tolist() if not names[label]]:
+    known = tuple(least or ())
+    lines: list[tuple[int, str, float, bool, str]] = []  # id, class, score, whether the image shows it, text
+    confirmed: set[int] = set()
+    for index in sorted(tracks):
+        one, pose = tracks[index], poses[index]
+        rotation, translation = rotation_of(np.asarray(pose.quaternion)), np.asarray(pose.translation)
+        center, yaw = to_sensor(rotation, translation, one.center, one.yaw)
+        image, seen = camera.boxes(center, one.size, yaw, least_shown=LEAST_SHOWN)
+        bottom, hwl, rotation_y = kitti_from_sensor(center, one.size, yaw)
+        values = np.column_stack([alpha_of(bottom, rotation_y), image, hwl, bottom, rotation_y, one.score])
+        values = np.round(values, 6) + 0.0  # turns a rounded -0 into 0, so that equal numbers are written alike
+        names = [class_like(name, known) or "" if known else name for name in one.labels]
+        if other := [one.labels[label] for label in one.label.tolist() if not names[label]]:
             raise DatasetError("--submission", f"--classes of {', '.join(known)}", f"tracks of {other[0]!r}")
-        for identity, label, row, shown in zip(tracks.id.tolist(), tracks.label.tolist(), values, seen, strict=True):
+        for identity, label, row, shown in zip(one.id.tolist(), one.label.tolist(), values, seen, strict=True):
             text = " ".join(f"{value:.6f}" for value in row)
             line = f"{index} {identity} {names[label]} -1 -1 {text}\n"
-            self._lines.append((identity, names[label], float(row[-1]), bool(shown), line))
-        if known and tracks.confirmed is not None:
-            self._confirmed.update(tracks.id[np.asarray(tracks.confirmed, dtype=np.bool_)].tolist())
-
-    def close(self) -> None:
-        """Put the file in its place; a sequence without tracks leaves an empty file."""
-        scores: dict[int, list[float]] = {}
-        for identity, _, score, shown, _ in self._lines:
-            if shown and identity in self._confirmed:
-                scores.setdefault(identity, []).append(score)
-        mean = {identity: fmean(values) for identity, values in scores.items()}
-        lines = (
-            line
-            for identity, name, _, shown, line in self._lines
-            if self._least is None or (shown and mean.get(identity, -1.0) >= self._least[name])
-        )
-        write_whole(self.path, lines)
+            lines.append((identity, names[label], float(row[-1]), bool(shown), line))
+        if known and one.confirmed is not None:
+            confirmed.update(one.id[np.asarray(one.confirmed, dtype=np.bool_)].tolist())
+    scores: dict[int, list[float]] = {}
+    for identity, _, score, shown, _ in lines:
+        if shown and identity in confirmed:
+            scores.setdefault(identity, []).append(score)
+    mean = {identity: fmean(values) for identity, values in scores.items()}
+    kept = (
+        line
+        for identity, name, _, shown, line in lines
+        if least is None or (shown and mean.get(identity, -1.0) >= least[name])
+    )
+    write_whole(path, kept)
+    return path
 
 
 def read_kitti_results(path: Path, labels: Sequence[str] = ()) -> ResultTable:

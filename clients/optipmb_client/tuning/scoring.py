@@ -21,7 +21,7 @@ from optipmb_client.evaluation.nuscenes_matching import Pairing, pair
 from optipmb_client.evaluation.nuscenes_scene import NuScenesConfig, NuScenesScene, prepare_scene
 from optipmb_client.geometry import Bools, to_sensor
 from optipmb_client.results import ResultTable
-from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
+from optipmb_client.results.nuscenes import NUSCENES_CLASSES
 from optipmb_client.tuning.figures import Figures, ab3dmot_figures, distance_figures
 from optipmb_client.tuning.material import Clip
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from optipmb_client.detector_files import BOX_LISTS
+from optipmb_client.table_files import BOX_LISTS
 
 
 @dataclass(frozen=True)

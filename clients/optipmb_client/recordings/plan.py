@@ -11,8 +11,7 @@ from typing import Final, TypeAlias, TypeVar
 
 from optipmb_schemas import Detections, Message, MessageError, SessionParameters, Tracks, decode, encode, encoding_of
 
-from optipmb_client.mcap_files.reading import Recorded
-from optipmb_client.mcap_files.writing import KINDS
+from optipmb_client.recordings.files import KINDS, Recorded
 
 FrameId: TypeAlias = tuple[bytes, int]  # epoch and sequence number
 

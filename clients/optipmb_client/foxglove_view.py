@@ -1,4 +1,4 @@
-"""Our messages as those that Foxglove draws by itself: for recordings, and live.
+"""Messages as those that Foxglove draws by itself: for recordings, and live over a WebSocket.
 
 World frame, metres. Below the key of a message stand
 
@@ -8,16 +8,17 @@ World frame, metres. Below the key of a message stand
 - of problems: `/log` (`foxglove.Log`).
 
 A track is the entity of its id; it stays until an update deletes it. Each update holds every track of its frame, so a
-viewer may start at any of them. Messages are made and encoded by Foxglove's own SDK, so they are what Foxglove reads.
+viewer may start at any of them.
 """
 
 import json
 import math
 from collections.abc import Iterable, Iterator
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
+import foxglove
 import numpy as np
-from foxglove import Schema
+from foxglove import Channel, Context, Schema
 from foxglove.messages import (
     ArrowPrimitive,
     Color,
@@ -42,6 +43,7 @@ from foxglove.messages import (
 from optipmb_schemas import Detections, Message, Points, Problem, Tracks
 
 from optipmb_client.colours import rgb_of
+from optipmb_client.errors import UsageError
 from optipmb_client.geometry import rotation_of, to_world
 
 FRAME: Final = "world"
@@ -75,13 +77,13 @@ class Shown(NamedTuple):
 
 
 class FoxgloveMessages:
-    """Makes them; remembers which tracks of each stream are shown, to take away those that end."""
+    """Converts messages; remembers which tracks of each stream are shown, to delete those that end."""
 
     def __init__(self) -> None:
         self._shown: dict[str, set[int]] = {}
 
     def of(self, message: Message) -> Iterator[Shown]:
-        """Yield what shows a message; nothing for other types."""
+        """Yield the messages that show one; none for other types."""
         if isinstance(message, Tracks):
             shown = set(message.id.tolist())
             gone = sorted(self._shown.get(message.stream, set()) - shown)
@@ -222,3 +224,51 @@ def _pose(position: list[float], yaw: float) -> Pose:
 def _vector(values: list[float]) -> Vector3:
     x, y, z = values
     return Vector3(x=x, y=y, z=z)
+
+
+_TOPICS: dict[type[Message], str] = {Tracks: "tracks", Detections: "detections", Points: "points", Problem: "problems"}
+
+
+class FoxgloveServer:
+    """A server that shows messages of any streams; a viewer that is too slow loses the oldest.
+
+    Args:
+        host: address to listen on.
+        port: 0: any that is free.
+
+    Raises:
+        UsageError: the address cannot be listened on.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._context = Context()
+        self._made = FoxgloveMessages()
+        self._channels: dict[str, Channel] = {}
+        try:
+            self._server = foxglove.start_server(name="optipmb", host=host, port=port, context=self._context)
+        except RuntimeError as error:
+            raise UsageError(f"--foxglove-port {port}: cannot listen on {host}: {error}") from error
+        self.address = f"ws://{host}:{self._server.port}"
+
+    def show(self, message: Message) -> None:
+        """Show a message at its stamp; of another type than streams have, nothing."""
+        stream, stamp_ns = getattr(message, "stream", ""), getattr(message, "stamp_ns", None)
+        for one in self._made.of(message):
+            topic = f"/{stream}/{_TOPICS[type(message)]}{one.end}"
+            if topic not in self._channels:
+                self._channels[topic] = Channel(
+                    topic, schema=one.schema, message_encoding=one.encoding, context=self._context
+                )
+            self._channels[topic].log(one.payload, log_time=stamp_ns)
+
+    def close(self) -> None:
+        """Stop serving."""
+        for channel in self._channels.values():
+            channel.close()
+        self._server.stop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

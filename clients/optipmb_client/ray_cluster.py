@@ -1,7 +1,7 @@
 """Tasks on a Ray cluster: the one module that imports Ray.
 
-Ray places tasks, and repeats those whose worker or node is gone. Results come back as bytes, so that their arrays are
-nobody's shared memory. All nodes must have this package in this version, and see data and results under the same paths.
+Ray places tasks, and repeats those whose worker or node is gone. Values come back as bytes, so that their arrays are
+not in shared memory. All nodes must have this package in this version, and see data and results under the same paths.
 """
 
 import os
@@ -13,30 +13,29 @@ import threading
 from concurrent.futures import Future
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import ray
 from ray.exceptions import RayError, RayTaskError
 
-from optipmb_client.bulk.executors import ATTEMPTS, Executor
-from optipmb_client.bulk.task import Done, Failed, Function, WorkerDiedError, attempt
+from optipmb_client.bulk import ATTEMPTS, Executor, Failed, Function, WorkerDiedError, attempt
 from optipmb_client.errors import ClientError
 
-LOCAL: Final = "local"  # the address of a cluster that is started here and ends with the command
-STORE_BYTES: Final = 256 * 2**20  # shared memory of a local cluster; what does not fit is written to disk
-WAITING: Final = 2  # tasks under way for each processor: one runs, the next is there when it ends
-PATIENCE_S: Final = 10.0  # for the connection to a head
+LOCAL = "local"  # the address of a cluster that is started here and ends with the command
+STORE_BYTES = 256 * 2**20  # shared memory of a local cluster; what does not fit is written to disk
+WAITING = 2  # tasks submitted for each processor: one runs, the next is there when it ends
+PATIENCE_S = 10.0  # for the connection to a head
 
 
 class RayCluster(Executor):
     """A Ray cluster.
 
     Args:
-        address: of its head, `auto` for the one of this machine, or `local` for one that is started here.
-        jobs: tasks at once; 0: as many as the cluster has processors.
+        address: Of its head, `auto` for the one of this machine, or `local` for one that is started here.
+        jobs: Tasks at once; 0: as many as the cluster has processors.
 
     Raises:
-        ClientError: no cluster answers there.
+        ClientError: No cluster answers there.
     """
 
     attempts = 1  # Ray repeats them
@@ -73,7 +72,7 @@ class RayCluster(Executor):
         return self._jobs or max(1, WAITING * int(ray.cluster_resources().get("CPU", 1)))
 
     def start(self, function: Function, shared: Any) -> None:
-        """Bring what is called to the cluster, once for all tasks."""
+        """Bring the call to the cluster, once for all tasks."""
         self._call = ray.put(pickle.dumps((function, shared), pickle.HIGHEST_PROTOCOL))
         self._task = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_run)
 
@@ -82,15 +81,14 @@ class RayCluster(Executor):
         future: Future[Any] = self._task.remote([self._call], str(Path.cwd()), version("optipmb"), task).future()
         return future
 
-    def take(self, future: Future[Any]) -> Done[Any] | Failed:
-        """Unpack what the task gave."""
+    def take(self, future: Future[Any]) -> Any:
+        """Unpack the value."""
         try:
-            result: Done[Any] | Failed = pickle.loads(future.result())  # noqa: S301  our own task wrote it
+            return pickle.loads(future.result())  # noqa: S301  our own task wrote it
         except RayTaskError as error:  # before or after the task: this package is not there, or is another
             return Failed(f"on a node of Ray: {str(error).strip().splitlines()[-1]}")
         except RayError as error:
             raise WorkerDiedError(f"Ray has given up after {ATTEMPTS} attempts ({type(error).__name__})") from error
-        return result
 
     def __exit__(self, *_: object) -> None:
         ray.shutdown()
@@ -118,7 +116,7 @@ _held: tuple[str, tuple[Function, Any]] | None = None
 
 
 def _run(call: list[Any], folder: str, wanted: str, task: Any) -> bytes:
-    """Run a task in a worker of Ray, which keeps what is called for the next one."""
+    """Run a task in a worker of Ray, which keeps the call for the next one."""
     global _held  # noqa: PLW0603  a worker has no other place to keep anything
     if version("optipmb") != wanted:
         raise RuntimeError(f"optipmb {version('optipmb')} is installed there, here it is {wanted}")

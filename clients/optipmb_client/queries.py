@@ -1,4 +1,4 @@
-"""Asking for the densities of streams now and then, beside a subscription to their tracks."""
+"""Repeated queries for the densities of streams, beside a subscription to their tracks."""
 
 import threading
 import time
@@ -14,8 +14,8 @@ PERIOD_S: Final = 0.5
 TIMEOUT_S: Final = 1.0
 
 
-class DensityAsker:
-    """Asks, on a thread of its own, for the density of every stream that has had tracks since it was asked last.
+class DensityQueries:
+    """Queries, on a thread of its own, the density of every stream that has had tracks since the last query.
 
     Answers go into an inbox, among the messages that were subscribed to; errors are left out. A stream is asked twice a
     second at most, and not at all while it is silent. So a service that is slow to answer delays neither tracks nor
