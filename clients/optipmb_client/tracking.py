@@ -13,7 +13,6 @@ from optipmb_client.datasets import DataSequence, Dataset, DatasetArguments
 from optipmb_client.errors import ClientError
 from optipmb_client.files import remove_unfinished
 from optipmb_client.offline import track_whole
-from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES
 from optipmb_client.results.output import Latency, Results, horizons_for, latency
 from optipmb_client.table_files import Columns
 
@@ -89,9 +88,12 @@ def _track_one(shared: _Shared, name: str) -> tuple[TrackedSequence, Path | Colu
     (sequence,) = [opened.sequences[name]] if opened.sequences else opened.dataset.sequences([name])
     found = track_whole(how.parameters, sequence, how.classes, how.modules, smooth=how.smooth, on_frame=opened.on_frame)
     written = Results(opened.dataset, shared.out, full=how.full).write(sequence, found.tracks)
-    limited = opened.dataset.name == "nuscenes" and isinstance(written, Path)
-    counts = [len(one.id) for one in found.tracks.values()] if limited else []
-    beyond = [count - NUSCENES_MAX_BOXES for count in counts if count > NUSCENES_MAX_BOXES]
+    beyond = []
+    if opened.dataset.name == "nuscenes" and isinstance(written, Path):
+        from optipmb_client.results.nuscenes import NUSCENES_MAX_BOXES  # noqa: PLC0415  of one format
+
+        counts = [len(one.id) for one in found.tracks.values()]
+        beyond = [count - NUSCENES_MAX_BOXES for count in counts if count > NUSCENES_MAX_BOXES]
     return TrackedSequence(
         name,
         written if isinstance(written, Path) else shared.out,

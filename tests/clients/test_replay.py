@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,10 +31,17 @@ def link(endpoint: str) -> Iterator[Connection]:
         yield connection
 
 
-def run(link: Connection, dataset: Dataset, out: Path, *names: str, **options: object) -> list[ReplayedSequence]:
+def run(
+    link: Connection,
+    dataset: Dataset,
+    out: Path,
+    *names: str,
+    on_frame: Callable[[], None] = lambda: None,
+    **options: object,
+) -> list[ReplayedSequence]:
     """Replay sequences of the scene."""
     how = replace(Replaying("kitti", QUICK), **options)  # type: ignore[arg-type]  # given by the tests
-    return replay(link, dataset, dataset.sequences(names or ["0000"]), out, how)
+    return replay(link, dataset, dataset.sequences(names or ["0000"]), out, how, on_frame)
 
 
 def test_every_frame_comes_back(endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path) -> None:
