@@ -99,7 +99,7 @@ def tracks(
             from_ns = max(0, state.stamp_ns - round(last * SECOND))
         found = list(kept_tracks(connection, stream, from_ns, to_ns, prefix=service.prefix))
     if out is not None:
-        from optipmb_client.results.table import track_columns  # noqa: PLC0415  only with --out
+        from optipmb_client.results.output import track_columns  # noqa: PLC0415  only with --out
 
         write_table(out, track_columns(stream, dict(enumerate(found))))
     stamps = [found[0].stamp_ns, found[-1].stamp_ns] if found else []

@@ -1,7 +1,11 @@
 """Data sets: detections, poses, clouds and truth, read or generated, behind one interface."""
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
+
+from optipmb_schemas.installation import install_command
 
 from optipmb_client.datasets.interface import (
     Cloud,
@@ -14,6 +18,7 @@ from optipmb_client.datasets.interface import (
     Truth,
     selected_frames,
 )
+from optipmb_client.errors import ClientError
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Pose
 from optipmb_client.table_files import tables_in
@@ -103,7 +108,8 @@ def _nuscenes(root: Path, detections: str | Path | None, options: _Options) -> D
 
 
 def _mcap(root: Path, _: str | Path | None, options: _Options) -> Dataset:
-    from optipmb_client.datasets.mcap import RecordedDataset  # noqa: PLC0415  of one format
+    with _needed("recordings need mcap", "record"):
+        from optipmb_client.datasets.mcap import RecordedDataset  # noqa: PLC0415  of one format
 
     _check(options)
     return RecordedDataset(root)
@@ -116,7 +122,8 @@ def _table(root: Path, _: str | Path | None, options: _Options) -> Dataset:
 
 
 def _rosbag(root: Path, _: str | Path | None, options: _Options) -> Dataset:
-    from optipmb_client.datasets.rosbag import RosbagDataset  # noqa: PLC0415  of one format
+    with _needed("bags need rosbags", "ros2"):
+        from optipmb_client.datasets.rosbag import RosbagDataset  # noqa: PLC0415  of one format
 
     return RosbagDataset(root, options)
 
@@ -133,6 +140,14 @@ def _scene(_root: Path, _: str | Path | None, options: _Options) -> Dataset:
 
 
 _OPEN = {"kitti": _kitti, "nuscenes": _nuscenes, "scene": _scene, "mcap": _mcap, "rosbag": _rosbag, "table": _table}
+
+
+@contextlib.contextmanager
+def _needed(what: str, extra: str) -> Iterator[None]:
+    try:
+        yield
+    except ImportError as error:
+        raise ClientError(f"{what}, which is not installed: {install_command(extra)}") from error
 
 
 def _check(options: _Options, *known: str) -> None:

@@ -14,20 +14,14 @@ from functools import cached_property
 from pathlib import Path
 
 from optipmb_schemas import Detections, Points, Tracks, decode
-from optipmb_schemas.installation import install_command
 
 from optipmb_client.camera import synthetic_camera
 from optipmb_client.datasets.interface import IDENTITY, Cloud, DataSequence, Dataset, DetectionFrame, relabelled
-from optipmb_client.errors import ClientError
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Floats, Pose, rotation_of, to_sensor
+from optipmb_client.recordings.files import Recorded, RecordingFile
+from optipmb_client.recordings.plan import StreamPlan, plan, steps
 from optipmb_client.results.kitti import write_kitti_results
-
-try:
-    from optipmb_client.recordings.files import Recorded, RecordingFile
-    from optipmb_client.recordings.plan import StreamPlan, plan, steps
-except ImportError as error:
-    raise ClientError(f"recordings need mcap, which is not installed: {install_command('record')}") from error
 
 
 class RecordedSequence(DataSequence):

@@ -23,7 +23,7 @@ from optipmb_client.datasets.table.rows import NO_ID, Boxes, read_tables
 from optipmb_client.datasets.table.values import Finding, Reading
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Bools, Floats, Ints, Pose, stack_poses, to_world
-from optipmb_client.results.table import track_columns
+from optipmb_client.results.output import track_columns
 from optipmb_client.table_files import SUFFIXES, line_of, read_table, tables_in, write_table
 
 # Options beside `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
