@@ -2,7 +2,7 @@
 
 There is one loop (`run`) over one list of tasks, and three executors. A task is idempotent: it may run again after its
 process was killed, and gives the same bytes. What a task raises becomes a value (`Failed`), so one bad recording stops
-no other, and every exception reaches the caller's process whatever it is made of.
+no other, and every exception reaches the caller's process.
 """
 
 import concurrent.futures
@@ -79,7 +79,7 @@ def attempt(function: Function, shared: Any, task: Any) -> Any:
 
 
 class Executor(ABC):
-    """Runs tasks. Use it as a context manager: at its end nothing of it is left, whatever is running."""
+    """Runs tasks. Use it as a context manager: at its end nothing of it is left, running tasks included."""
 
     width: int  # tasks to run at once
     attempts: int = ATTEMPTS  # starts of a task whose process dies
@@ -87,7 +87,7 @@ class Executor(ABC):
 
     @abstractmethod
     def start(self, function: Function, shared: Any) -> None:
-        """Prepare to call `function(shared, task)`; a second call changes what is called."""
+        """Prepare to call `function(shared, task)`; a second call replaces the first."""
 
     @abstractmethod
     def submit(self, task: Any) -> Future[Any]:
@@ -196,7 +196,7 @@ def _begin(end: Connection, folder: str) -> None:
     """Prepare a process: it ends when the other end of the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its processes
     threading.Thread(target=_end_with, args=(end, Path(folder)), daemon=True).start()
-    tempfile.tempdir = folder  # what a killed process leaves goes with it
+    tempfile.tempdir = folder  # temporary files of a killed process are removed with it
 
 
 def _end_with(end: Connection, folder: Path) -> None:

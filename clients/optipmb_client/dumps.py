@@ -71,7 +71,7 @@ def replay(dump: Dump, tracker: Callable[[optipmb.Parameters], _Steps] = optipmb
             density = optipmb.Density.empty(parameters.labels, density.next_id)
         try:
             density = _step(steps, parameters, density, frame)
-        except Exception as error:  # noqa: BLE001  it is what was asked for
+        except Exception as error:  # noqa: BLE001  the result
             mark = frame.detections
             text = f"{type(error).__name__}: {error}"
             trace = "".join(traceback.format_exception(error))

@@ -1,4 +1,4 @@
-"""Messages as those that Foxglove draws by itself: for recordings, and live over a WebSocket.
+"""Messages in the types that Foxglove draws by itself: for recordings, and live over a WebSocket.
 
 World frame, metres. Below the key of a message stand
 
@@ -167,7 +167,7 @@ def _figures(tracks: Tracks) -> bytes:
 
 
 def _boxes(detections: Detections) -> SceneUpdate:
-    """Return one entity with all boxes: each update replaces that of before."""
+    """Return one entity with all boxes: each update replaces the previous one."""
     center, yaw = detections.center, detections.yaw
     if detections.frame == "sensor" and (pose := detections.pose) is not None:
         center, yaw = to_world(rotation_of(pose.quaternion), pose.translation, center, yaw)

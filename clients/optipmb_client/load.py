@@ -2,11 +2,11 @@
 
 Frames are encoded once, so that a message costs one copy while the load runs. Stream, epoch, number and stamp stand at
 the start of every message and take the same number of bytes in all of them (stream names are of one length, numbers
-begin at 2^32). So a message is a head of its own and a body, which all streams share. The frames repeat; those that are
-generated join without a jump.
+begin at 2^32). So a message is a head of its own and a body, which all streams share. The frames repeat; generated
+ones join without a jump.
 
 Time counts from just before the detections of a frame are handed to the network to the arrival of its tracks in this
-process. Frames of different streams are spread evenly over the period, as those of independent sensors are. The load
+process. Frames of different streams are spread evenly over the period, as from independent sensors. The load
 also measures itself: frames that it sends late, and the processor time that it takes, are part of the result.
 """
 
@@ -379,7 +379,7 @@ def find_limit(measure: Callable[[float], Run], rate: float, latency_ms: float) 
     Args:
         measure: Run a load at a rate per stream.
         rate: Start of the search, which doubles it until it does not hold, then halves the interval.
-        latency_ms: What 99 of 100 frames must not exceed, with nothing lost.
+        latency_ms: Limit for 99 of 100 frames, with nothing lost.
     """
     runs: list[Run] = []
 

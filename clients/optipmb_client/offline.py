@@ -58,7 +58,7 @@ __all__ = [
 
 AUTO: Final = "auto"  # name of the profile that is made for the data: rate and classes as they come
 USUAL_PERIOD: Final = 0.1
-FAR: Final = 1.6  # a rate so many times that of the profile, or a part of it, is far from it
+FAR: Final = 1.6  # ratio of rates from which a profile does not fit
 LOOKED_AT: Final = 20  # sequences that tell rate and scores
 LOOKED_INTO: Final = 300  # frames of each of them
 GLANCE: Final = 20  # frames that tell whether the rate is about that of a profile: clouds, if any, take long to read
@@ -148,7 +148,7 @@ def _nothing(profile: str, parameters: Parameters, labels: tuple[str, ...]) -> s
 
 
 def doubts(parameters: Parameters, sequences: Sequence[DataSequence]) -> Iterator[str]:
-    """Yield what does not fit between a profile and the sequences, a line each."""
+    """Yield doubts whether a profile fits the sequences, a line each."""
     known = parameters.labels
     labels = _labels(sequences)
     found = dict(zip(labels, class_indices(labels, known).tolist(), strict=True))
@@ -172,7 +172,7 @@ def _labels(sequences: Sequence[DataSequence]) -> tuple[str, ...]:
 
 
 def _period(sequences: Sequence[DataSequence], frames: int) -> float | None:
-    """Return the median time in seconds between neighbouring frames, so many, at the start of the first sequences."""
+    """Return the median time in seconds between the first `frames` frames of the first sequences."""
     steps = [
         (after.stamp_ns - before.stamp_ns) / 1e9
         for one in itertools.chain.from_iterable(one.sensors or (one,) for one in sequences[:LOOKED_AT])

@@ -1,7 +1,7 @@
 """Pictures of a sequence from above, as PNG files, and moving pictures, as GIF files.
 
 Conventions: world frame, metres, x to the right and y up; one second of a moving picture is one second of the sequence.
-Colours belong to track ids, which are written beside the tracks too. matplotlib, which brings Pillow, is an extra of
+Colours belong to track ids, which are written at the tracks too. matplotlib, which brings Pillow, is an extra of
 the installation and is imported when the first picture is drawn.
 """
 
@@ -33,7 +33,7 @@ _BREAK = 5  # a path is not drawn across more missing frames than this
 FRAMES = 70  # of a longer sequence every second frame is drawn, or every third …
 TRAIL_S = 3.0
 REACH_M = 45.0  # on each side of the sensor, where the picture follows it
-WIDEST_M = 140.0  # what is wider than this does not fit one view: the picture follows the sensor
+WIDEST_M = 140.0  # a wider scene does not fit one view: the picture follows the sensor
 INSIDE = (0.03, 0.97)  # quantiles of the places of tracks between which the view lies, with a margin
 MARGIN_M = 4.0
 NARROWEST_M = 30.0
@@ -62,11 +62,11 @@ def matplotlib_needed() -> Iterator[None]:
 
 
 def draw_tracks(path: Path, sequence: DataSequence, panels: Sequence[Panel], truth: Truth | None = None) -> None:
-    """Draw the tracks of a sequence from above, those of several trackers side by side on the same axes.
+    """Draw the tracks of a sequence from above, several trackers side by side on the same axes.
 
     Args:
         path: The PNG file.
-        sequence: What was tracked; its poses give the sensor's path.
+        sequence: The tracked sequence; its poses give the sensor's path.
         panels: One for each tracker.
         truth: Annotations in the world frame, drawn thin below the tracks.
 
@@ -108,7 +108,7 @@ def draw_tracks(path: Path, sequence: DataSequence, panels: Sequence[Panel], tru
 
 
 def _extent(places: Sequence[Floats]) -> tuple[Floats, Floats]:
-    """Return the corners (2,) of what is to be seen, at least a few metres apart."""
+    """Return the corners (2,) of the view, at least a few metres apart."""
     points = np.vstack([place[:, :2] for place in places] + [np.zeros((1, 2))] * (not sum(len(p) for p in places)))
     low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
     # A long street is to be wider than a line: the short side is at least a quarter of the long one.
@@ -203,7 +203,7 @@ def animate_tracks(path: Path, sequence: DataSequence, tracks: ResultTable, trut
 
     Args:
         path: The GIF file.
-        sequence: What was tracked; its poses give the sensor's places, its detections are drawn as crosses.
+        sequence: The tracked sequence; its poses give the sensor's places, its detections are drawn as crosses.
         tracks: The tracks in the world frame.
         truth: Annotations in the world frame, drawn grey below the tracks; hardly visible ones are left out.
 
@@ -218,13 +218,13 @@ def animate_tracks(path: Path, sequence: DataSequence, tracks: ResultTable, trut
         raise ClientError(f"sequence {sequence.name}: expected frames to draw, received none")
     view = _View(sequence, tracks, None if truth is None else truth.take(~truth.ignored), given)
     pictures = [Image.fromarray(view.drawn(frame)) for frame in given]
-    # One palette for all frames: what does not move has the same bytes in each, and is stored once.
+    # One palette for all frames: still parts have the same bytes in each, and are stored once.
     sample = Image.new("RGB", (pictures[0].width, 3 * pictures[0].height))
     for place, chosen in enumerate((pictures[0], pictures[len(pictures) // 2], pictures[-1])):
         sample.paste(chosen, (0, place * chosen.height))
     found = sample.quantize(COLOURS, dither=Image.Dither.NONE).getpalette() or []
     shades = np.array(found, dtype=np.int64).reshape(-1, 3)
-    shades[shades.min(axis=1) >= WHITE] = 255  # the ground; an entry beside white would take its place
+    shades[shades.min(axis=1) >= WHITE] = 255  # the ground; an entry near white would replace it
     palette = Image.new("P", (1, 1))
     palette.putpalette(shades.ravel().tolist())
     first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
@@ -356,7 +356,7 @@ def draw_results(
 
     Args:
         picture: The PNG file, or the GIF file of a moving picture of the first tracker.
-        sequence: What was tracked.
+        sequence: The tracked sequence.
         folders: Where its result files are, or tables of tracks: one for each tracker.
         results: Figures of the classes of each tracker; their misses and identity changes are marked.
         score: Least mean score of the tracks that are shown; default: the best threshold of each class, by `results`.

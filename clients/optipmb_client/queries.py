@@ -1,4 +1,4 @@
-"""Repeated queries for the densities of streams, beside a subscription to their tracks."""
+"""Repeated queries for the densities of streams, during a subscription to their tracks."""
 
 import threading
 import time

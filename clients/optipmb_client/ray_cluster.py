@@ -22,7 +22,7 @@ from optipmb_client.bulk import ATTEMPTS, Executor, Failed, Function, WorkerDied
 from optipmb_client.errors import ClientError
 
 LOCAL = "local"  # the address of a cluster that is started here and ends with the command
-STORE_BYTES = 256 * 2**20  # shared memory of a local cluster; what does not fit is written to disk
+STORE_BYTES = 256 * 2**20  # shared memory of a local cluster; the rest is written to disk
 WAITING = 2  # tasks submitted for each processor: one runs, the next is there when it ends
 PATIENCE_S = 10.0  # for the connection to a head
 
@@ -67,8 +67,8 @@ class RayCluster(Executor):
             signal.signal(signal.SIGTERM, handler)  # Ray has put its own in the place of the command's
 
     @property
-    def width(self) -> int:  # type: ignore[override]  # nobody sets it
-        """Tasks under way at once; a cluster may grow and shrink."""
+    def width(self) -> int:  # type: ignore[override]  # read-only
+        """Tasks at once; a cluster may grow and shrink."""
         return self._jobs or max(1, WAITING * int(ray.cluster_resources().get("CPU", 1)))
 
     def start(self, function: Function, shared: Any) -> None:

@@ -4,8 +4,8 @@ Each sequence becomes a stream `replay/<dataset>-<6 hex>/<sequence>` of its own,
 earlier run is in the way. One thread per sequence does everything in turn: publish a frame, receive the tracks that
 have come, wait for the time (at a recorded rate) or for room in the window (at full speed) of the next one.
 
-A frame counts as missing when its tracks have not come although those of a later frame have, or although nothing has
-come for a long time.
+A frame counts as missing when its tracks have not come although a later frame has some, or nothing has come for a long
+time.
 """
 
 import collections
@@ -139,7 +139,7 @@ class Exchange:
 
     @property
     def alive(self) -> bool:
-        """Whether to go on: nobody has asked to stop, and tracks have come back lately or none are in flight."""
+        """Whether to go on: `stop` is not set, and tracks have come back lately or none are in flight."""
         return not self.stop.is_set() and (not self.in_flight or self._silent_s < self._pace.patience_s)
 
     @property

@@ -47,7 +47,7 @@ class ServiceProcess:
     Args:
         options: Further options of `optipmb-service`.
         environment: Environment variables on top of this program's, which lose their `OPTIPMB_` settings.
-        log: File for what the service prints; default: a temporary one.
+        log: File for the output of the service; default: a temporary one.
         grace_s: How long the service may take to end before it is killed.
     """
 
@@ -82,7 +82,7 @@ class ServiceProcess:
                     stdout=log,
                     stderr=subprocess.STDOUT,
                     start_new_session=True,
-                    cwd=folder,  # whatever the service keeps goes with it
+                    cwd=folder,  # files of the service are removed with it
                     env={"XDG_STATE_HOME": folder} | self._environment,
                 )
             started.callback(self.stop)
@@ -103,7 +103,7 @@ class ServiceProcess:
         """Wait until the service says that it is alive; the first start after an installation compiles for a while.
 
         Raises:
-            ServiceUnavailable: It ended, or has not come up in time; says what it printed last.
+            ServiceUnavailable: It ended, or has not come up in time; with its last output.
         """
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
@@ -140,10 +140,7 @@ class ServiceProcess:
 
 
 def _free_port() -> int:
-    """Return a port that nobody has: the child binds it seconds later, and the system must not give it away till then.
-
-    It gives away those of its ephemeral range, for outgoing connections, so this is one below.
-    """
+    """Return a free port below the ephemeral range, which the system would give away before the child binds it."""
     while True:
         port = _FIRST_PORT + secrets.randbelow(_EPHEMERAL_PORT - _FIRST_PORT)
         with socket.socket() as probe, contextlib.suppress(OSError):

@@ -53,7 +53,7 @@ LISTS: Final = (
     "annotations",
 )  # names of lists of all boxes of a frame
 _FIRST: Final = 8  # field of a line of KITTI's object benchmark where the 3D box begins
-_STAMPS: Final = 1_000_000_000  # from here on, the number in the name of a file is a stamp, and not that of a frame
+_STAMPS: Final = 1_000_000_000  # from here on, the number in the name of a file is a stamp, not a frame
 _COMMA: Final = r"^\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*$"
 
 
@@ -99,7 +99,7 @@ def read_table(path: Path, options: Mapping[str, str] | None = None) -> Columns:
         options: of the user: `decimal` and `encoding` of text tables, `date`.
 
     Raises:
-        DatasetError: There is no such file, or it is not of the format that its name says; says which.
+        DatasetError: There is no such file, or it is not of the format that its name says.
         ClientError: pyarrow is not installed.
     """
     pa = _pyarrow()
@@ -445,7 +445,7 @@ def read_json(path: Path) -> list[_Record]:
 
 
 def _centre(path: Path, frame: _Record) -> None:
-    """Move the boxes of a frame of MMDetection3D up to their centres; it gives those of their bottoms."""
+    """Move the boxes of a frame of MMDetection3D, given by their bottoms, up to their centres."""
     kind = frame.pop("box_type_3d")
     if kind != "LiDAR" or any(len(box) not in {7, 9} for box in frame["bboxes_3d"]):
         raise DatasetError(path, "boxes of 7 or 9 numbers, of box_type_3d LiDAR", f"others, of {kind}")

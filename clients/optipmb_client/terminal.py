@@ -94,7 +94,7 @@ def _streams(sessions: Sequence[SessionSummary]) -> Table:
 
 
 def profile_of(session: SessionSummary) -> str:
-    """Return the profile of a session, and that of the settings where it is another one."""
+    """Return the profile of a session, and the one of the settings if it differs."""
     return session.profile if session.configured is None else f"{session.profile} (settings: {session.configured})"
 
 
@@ -157,7 +157,7 @@ class StatusView:
             del self._seen[instance]
 
     def render(self, height: int, width: int) -> RenderableType:
-        """Return the view, at most so many lines and characters; streams that are well are left out first."""
+        """Return the view in at most `height` lines of `width` characters; healthy streams are left out first."""
         alive = [seen for seen in self._seen.values() if seen.at_s == self._now_s]
         shown: list[RenderableType] = [self._title(alive)]
         if not self._seen:

@@ -26,7 +26,7 @@ SURE: Final = 0.5  # tracks with a lower score are drawn thin and without a labe
 
 UNIX_NS: Final = 10**17  # stamps above it are times since 1970; below, seconds since some start
 
-LINE: Final = -1.5  # thickness of lines in points on the screen, whatever the distance: so Rerun takes negative radii
+LINE: Final = -1.5  # thickness of lines in points on the screen at any distance: so Rerun takes negative radii
 
 TICK_M: Final = 20.0
 AXES_M: Final = (42.0, 34.0)  # how far the axes are from the middle, to the left and below
@@ -80,7 +80,7 @@ class View:
         recording.log("legend", rr.TextDocument(LEGEND, media_type="text/markdown"), static=True)
 
     def show(self, message: Message) -> None:
-        """Show a message; what is neither detections, points, tracks nor a density with a stamp is left out."""
+        """Show detections, points, tracks or a density with a stamp; other messages are ignored."""
         if not isinstance(message, Density | Detections | Points | Tracks) or message.stamp_ns is None:
             return
         if message.stamp_ns >= UNIX_NS:
@@ -210,7 +210,7 @@ class View:
 
 
 def _blueprint(stream: str, middle: Floats, *, moving: bool) -> rrb.Blueprint:
-    """Return the layout: from above, beside it 3D, counts and legend. Views follow a sensor that tells its pose."""
+    """Return the layout: from above, and 3D, counts and legend. Views follow a sensor with a pose."""
     x, y = middle.tolist()
     contents = [f"+ /{stream}/**", f"- /{stream}/count/**", "+ /axes"]
     follow = f"/{stream}/sensor" if moving else None
@@ -244,7 +244,7 @@ def _blueprint(stream: str, middle: Floats, *, moving: bool) -> rrb.Blueprint:
 
 
 def _to_world(message: Detections | Points, points: Floats) -> tuple[Floats, float]:
-    """Return points (N, 3) in the world frame, and what is to be added to a yaw seen from above."""
+    """Return points (N, 3) in the world frame, and the turn of the sensor seen from above."""
     if message.frame == "world" or message.pose is None:
         return points, 0.0
     rotation = rotation_of(message.pose.quaternion)

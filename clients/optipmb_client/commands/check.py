@@ -1,4 +1,4 @@
-"""`optipmb check`: what the readers find in data, before anything is tracked."""
+"""`optipmb check`: findings of the readers about data, before tracking."""
 
 import itertools
 from dataclasses import asdict

@@ -146,7 +146,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _Evaluated:
-    """Result for the tracks of one tracker: for programs, for tables beside each other, and as tables."""
+    """Result for the tracks of one tracker: for programs, for comparison, and as tables."""
 
     parts: dict[str, Any]
     figures: "Sequence[ClassFigures]"

@@ -160,7 +160,7 @@ class DatasetOptions:
             more: Further options of the data set.
 
         Raises:
-            DatasetError, UsageError: Any of it is not there, or not allowed; says what.
+            DatasetError, UsageError: Any of it is not there, or not allowed.
         """
         name, root = self.named()
         opened = open_dataset(name, root, self.detections, **self.options(name) | more)
@@ -259,7 +259,7 @@ def number_or_text(value: str) -> float | str:
 
 @contextlib.contextmanager
 def mcap_needed() -> Iterator[None]:
-    """Say what to install where the packages for recordings are missing."""
+    """Raise the command that installs the packages for recordings where they are missing."""
     try:
         yield
     except ImportError as error:

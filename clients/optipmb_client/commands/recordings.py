@@ -5,6 +5,7 @@ import secrets
 import signal
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -79,23 +80,30 @@ def _ended_by(stop: threading.Event) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def play(  # noqa: PLR0913  these are the command's options
-    file: Annotated[Path, typer.Argument(help="The MCAP file, as `optipmb record` writes it.", show_default=False)],
-    *,
+@dataclass(frozen=True, kw_only=True)
+class PlayOptions:
+    """Options of playing."""
+
     streams: Annotated[
         list[str] | None, typer.Option("--streams", metavar="NAME...", help="Only these streams.", show_default=False)
-    ] = None,
+    ] = None
     as_recorded: Annotated[
         bool,
         typer.Option(
             "--as-recorded", help="Play under the recorded names: only into a service that does nothing else."
         ),
-    ] = False,
-    profile: Annotated[
-        str | None, typer.Option("--profile", help="Parameter profile; default: what was in force.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for result files of the tracks.")] = None,
-    full: Full = False,
+    ] = False
+    profile: Annotated[str | None, typer.Option("--profile", help="Parameter profile; default: what was in force.")] = (
+        None
+    )
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for result files of the tracks.")] = None
+    full: Full = False
+
+
+def play(
+    file: Annotated[Path, typer.Argument(help="The MCAP file, as `optipmb record` writes it.", show_default=False)],
+    *,
+    how: PlayOptions,
     service: ServiceOptions,
     pace: PaceOptions,
     as_json: AsJson = False,
@@ -112,19 +120,19 @@ def play(  # noqa: PLR0913  these are the command's options
         from optipmb_client.recordings.play import play as play_streams  # noqa: PLC0415  as above
     chosen_pace = pace.pace()
     recording = RecordingFile(file)
-    plans = choose(recording, streams or ())
+    plans = choose(recording, how.streams or ())
     if recording.cut:
         warn(f"{file} was cut off; everything up to the cut is played")
-    site = None if as_recorded else f"play-{secrets.token_hex(3)}"
+    site = None if how.as_recorded else f"play-{secrets.token_hex(3)}"
     with (
         service.connection(pace.wait) as connection,
         FrameProgress("playing", sum(len(one.frames) for one in plans.values())) as progress,
     ):
-        how = Playing(chosen_pace, site, profile, service.prefix, progress.advance)
-        results = play_streams(connection, recording, plans, how)
-    if out is not None:
-        _write(file, out, results, {name: list(one.frames) for name, one in plans.items()}, full=full)
-    shown = {"command": "play", "cut": recording.cut, "out": out, "streams": [_summary(one) for one in results]}
+        playing = Playing(chosen_pace, site, how.profile, service.prefix, progress.advance)
+        results = play_streams(connection, recording, plans, playing)
+    if how.out is not None:
+        _write(file, how.out, results, {name: list(one.frames) for name, one in plans.items()}, full=how.full)
+    shown = {"command": "play", "cut": recording.cut, "out": how.out, "streams": [_summary(one) for one in results]}
     report(shown, *map(_line, results), as_json=as_json)
     wrong = False
     for result in results:

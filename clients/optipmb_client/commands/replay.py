@@ -68,7 +68,7 @@ def replay(
 
 
 def complain(results: Sequence[ReplayedSequence]) -> None:
-    """Print on standard error what is wrong with the results, and exit with status 1 when anything is."""
+    """Print problems of the results on standard error, and exit with status 1 if there are any."""
     missing = sum(result.missing for result in results)
     clouds = sum(result.clouds_missed for result in results)
     if missing:

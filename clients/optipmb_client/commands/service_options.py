@@ -33,7 +33,7 @@ class PaceOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ServiceOptions:
-    """Options that say where a service is."""
+    """Options of the connection to a service."""
 
     connect: Annotated[
         list[str] | None,

@@ -1,4 +1,4 @@
-"""`optipmb track`: a data set through the tracker, in this process; or what a service saved when tracking failed."""
+"""`optipmb track`: a data set, or a dump that a service saved, through the tracker in this process."""
 
 import sys
 from collections import Counter
@@ -56,7 +56,7 @@ class TrackOptions:
     ] = None
 
     def check_out(self, data: Data) -> None:
-        """Refuse a file where the results are several; a bag of tracks holds those of one topic of a bag."""
+        """Refuse a file where the results are several; a bag of tracks holds one topic of a bag."""
         out = self.out
         if self.submission is not None and (self.full or is_table(out)):
             raise UsageError("--submission: expected a folder as --out, and no --full: the files are for the benchmark")
@@ -145,7 +145,7 @@ def _say_result(result: "TrackedSequence") -> None:
 
 
 def _complain(results: "list[TrackedSequence]", profile: str) -> None:
-    """Print what was left out; end with status 1 when there were detections and no tracks."""
+    """Print the detections that were left out; end with status 1 if there were detections and no tracks."""
     detections = sum(one.detections for one in results)
     left_out: Counter[str] = sum((Counter(one.left_out) for one in results), Counter())
     if left_out:

@@ -31,7 +31,7 @@ TICK_S = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class ShownOptions:
-    """Options of what is shown."""
+    """Options of the content."""
 
     streams: Annotated[
         list[str] | None,
@@ -45,7 +45,7 @@ class ShownOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewerOptions:
-    """Options of where it is shown."""
+    """Options of the viewer."""
 
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser instead of opening a window.")] = (
         False
@@ -86,7 +86,7 @@ def watch(
     else:
         needed("watching", "watch", "rerun")
     messages = _live(service, timeout, shown) if file is None else _recorded(file, pace, shown)
-    first = next(messages, None)  # what is wrong with the source is reported before a viewer opens
+    first = next(messages, None)  # an error of the source is reported before a viewer opens
     ends = None if seconds is None else time.monotonic() + seconds
     until = _until(itertools.chain([first], messages), ends)
     if viewer.foxglove:

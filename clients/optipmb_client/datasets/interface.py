@@ -1,4 +1,4 @@
-"""Data sets: their sequences, frames and annotations, whatever the files look like.
+"""Sequences, frames and annotations of data sets of any format.
 
 Conventions: metres, seconds, radians, z up. Detections and clouds are in their sensor's frame, truth is in the world
 frame. Centres are geometric centres, sizes are length, width, height, stamps are nanoseconds.
@@ -133,7 +133,7 @@ class DataSequence(ABC):
     sensor: str = ""  # by which frames with equal stamps are ordered; empty: unknown
     sensor_column: str = "sensor"
     recording_columns: Mapping[str, str] = {}
-    sensors: "Sequence[DataSequence]" = ()  # those that it consists of
+    sensors: "Sequence[DataSequence]" = ()  # its parts, if it has several
 
     # A table of its tracks has the columns of the table of detections, if it came from one.
     key_columns: Mapping[str, str] = {}
@@ -229,14 +229,14 @@ class Dataset(ABC):
         """
 
     def join(self, out: Path, sequences: Sequence[DataSequence]) -> None:  # noqa: B027  most have no such file
-        """Write what a benchmark wants in one file, from the files of all sequences."""
+        """Write the file of a benchmark that holds all sequences, from their files."""
 
 
 def chosen(names: Iterable[str], known: Mapping[str, _T], what: str, spelt: Callable[[str], str] = str) -> list[_T]:
     """Return the values of some names, or of `all`, each once.
 
     Raises:
-        DatasetError: A name is not known; `what` says of what kind it is.
+        DatasetError: A name is not known; `what` names its kind.
     """
     wanted: dict[str, None] = {}
     for name in names:

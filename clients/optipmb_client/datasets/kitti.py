@@ -1,6 +1,6 @@
 """The KITTI tracking benchmark.
 
-Conventions: the sensor frame of detections is the rectified camera frame with its axes named anew, z up (see
+Conventions: the sensor frame of detections is the rectified camera frame with its axes renamed, z up (see
 `optipmb_client.camera`); the world is the same for the camera of frame 0. Clouds are in the velodyne frame. Frames are
 0.1 s apart. Truth boxes are ignored when largely invisible or cut by the image's border, as AB3DMOT's protocol has it.
 

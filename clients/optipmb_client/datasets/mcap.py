@@ -2,8 +2,8 @@
 
 Of a folder of recordings the name of the file comes first: `monday.garage.robot-1.lidar` is in `monday.mcap`.
 
-What is tracked are the frames that the service would track from the recording: each once, with the clouds that took
-part. Frames must be in the order of their stamps here; a recording in which they are not needs a service that is there
+The frames are those that the service would track from the recording: each once, with the clouds that took part.
+ Frames must be in the order of their stamps here; a recording in which they are not needs a service that is there
 when they come late (`optipmb play`). There is no truth.
 """
 
@@ -133,7 +133,7 @@ class RecordedDataset(Dataset):
         return list(chosen.values())
 
     def _plans(self, prefix: str) -> dict[str, StreamPlan]:
-        """Return what one file holds, by the full names of its streams; that of the last one is kept."""
+        """Return the plans of one file by the full names of its streams; the last ones are cached."""
         if self._planned is None or self._planned[0] != prefix:
             recording = self._files[prefix]
             plans = {prefix + stream.replace("/", "."): one for stream, one in plan(recording).items()}
@@ -160,7 +160,7 @@ def _pose(message: Detections | Points) -> Pose:
 def _placed(message: Detections) -> tuple[Pose, Floats, Floats, Floats | None, Floats | None]:
     """Return pose, centres, yaws, velocities and covariances of the centres.
 
-    Those of the world are carried to a sensor with a field of view.
+    Boxes in the world frame are carried to a sensor with a field of view.
     """
     center, yaw, velocity, covariance = message.center, message.yaw, message.velocity, message.position_covariance
     if message.frame == "sensor" or message.pose is None or message.field_of_view is None:

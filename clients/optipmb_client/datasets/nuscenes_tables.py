@@ -1,6 +1,6 @@
 """The tables of nuScenes: one JSON list of records per table, joined by tokens.
 
-Tables are read record by record and only what is used is kept, so the largest ones (a gigabyte each in the full
+Tables are read record by record and only used fields are kept, so the largest ones (a gigabyte each in the full
 release) never stand in memory. Conventions as in the dataset: global frame = world, metres, poses map the inner frame
 to the outer one. Stamps are microseconds, as recorded.
 """

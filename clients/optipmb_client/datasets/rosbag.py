@@ -98,7 +98,7 @@ class Bag:
                 raise DatasetError(self.path, "whole messages", str(error)) from error
 
     def read(self, raw: Raw) -> Any:
-        """Return what a message says.
+        """Return a message.
 
         Raises:
             DatasetError: Its bytes are no message of the topic's type.
@@ -176,7 +176,7 @@ class Plan:
     frames: list[PlannedFrame] = field(default_factory=list)  # ordered by stamp
     clouds: dict[int, Pose] = field(default_factory=dict)  # pose of each cloud that belongs to a frame, by its stamp
     cloud_topic: str | None = None
-    notes: list[str] = field(default_factory=list)  # what was left out, and why
+    notes: list[str] = field(default_factory=list)  # messages that are left out, and why
 
 
 def read_transforms(bag: Bag, choice: Choice) -> Transforms:
@@ -207,7 +207,7 @@ def read_transforms(bag: Bag, choice: Choice) -> Transforms:
 
 
 def plan(bag: Bag, topic: str, transforms: Transforms, choice: Choice) -> Plan:
-    """Return what is tracked of one topic of detections.
+    """Return the plan of one topic of detections.
 
     Raises:
         DatasetError: Frames are not in tf, no frame has a pose, or clouds of several topics would fit.
@@ -313,7 +313,7 @@ def write_bag(path: Path, bag: Bag, plan: Plan, tracks: Mapping[int, Tracks], *,
     Args:
         path: The file; returned.
         bag: Where the detections come from.
-        plan: What is tracked of it.
+        plan: Its frames.
         tracks: The tracks of each frame.
         keep_input: Also copy every message of the bag.
 
@@ -398,7 +398,7 @@ class RosbagSequence(DataSequence):
         return tuple(dict.fromkeys(name for raw in messages for name in self._boxes(raw).labels))
 
     def frames(self) -> Iterator[DetectionFrame]:
-        """Yield every frame in the order of the stamps. What is received between a frame and its cloud is kept."""
+        """Yield every frame in the order of the stamps. Messages between a frame and its cloud are kept."""
         topics = {self.plan.topic, *([self.plan.cloud_topic] if self.plan.cloud_topic else [])}
         due = [(frame.stamp_ns, frame.received_ns) for frame in self.plan.frames]
         known = set(due)

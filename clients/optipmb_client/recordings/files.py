@@ -1,6 +1,6 @@
 """Recordings on disk: MCAP files, written in chunks, and read back however they ended.
 
-Messages gather in a chunk that is compressed and written when it is full or at `flush`. What was flushed survives a
+Messages gather in a chunk that is compressed and written when it is full or at `flush`. Flushed messages survive a
 kill; the index at the end of the file comes with `close`. A file that was cut off is read up to the cut.
 """
 
@@ -68,7 +68,7 @@ class RecordingFile:
     Attributes:
         path: The file.
         cut: Whether the file ends in the middle, as after a kill; known once it has been read to its end.
-        about: What the recording tells of itself; as `cut`.
+        about: Metadata of the recording; as `cut`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -77,7 +77,7 @@ class RecordingFile:
         self.about: dict[str, str] = {}
 
     def __iter__(self) -> Iterator[Recorded]:
-        """Iterate over the messages of this product; those of others, and what is for viewers, are left out.
+        """Iterate over the messages of streams; messages for viewers are left out.
 
         Raises:
             DatasetError: The file cannot be read, is no MCAP file, or is damaged.
@@ -131,7 +131,7 @@ class RecordingWriter:
 
     Args:
         path: The file; it must not be there yet.
-        about: What is said of the recording as a whole.
+        about: Metadata of the recording.
 
     Raises:
         FileExistsError: It is there.
@@ -171,7 +171,7 @@ class RecordingWriter:
         try:
             message: Message | None = decode(payload, kind, encoding=encoding)
         except MessageError:
-            message = None  # what a publisher gets wrong is part of the incident
+            message = None  # invalid messages are part of the incident
         stamp_ns = getattr(message, "stamp_ns", None)
         stamp_ns = received_ns if stamp_ns is None or stamp_ns < 0 else stamp_ns
         sequence = (getattr(message, "seq", None) or 0) % SEQUENCES
@@ -188,7 +188,7 @@ class RecordingWriter:
         return message
 
     def flush(self) -> int:
-        """Write what was added so far, so that a kill cannot take it; return the size of the file in bytes."""
+        """Write all messages so far, so that they survive a kill; return the size of the file in bytes."""
         with self._lock, self._naming_file():
             if not self._closed:
                 self._writer.flush()

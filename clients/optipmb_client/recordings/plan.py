@@ -1,7 +1,7 @@
-"""What a recording holds of each stream, and in which order it is played: pure functions of its messages.
+"""Content of a recording by stream, and the order of playing it: pure functions of its messages.
 
 A frame is played with the cloud that took part in its tracks when it was recorded, however late that cloud came then,
-and without one where its recorded tracks were made without. So it does not depend on time what comes out.
+and without one where its recorded tracks were made without. So the result does not depend on time.
 """
 
 import collections
@@ -24,7 +24,7 @@ _ANYWHERE = {"stream": "any/any/any", "session": "0" * 32, "delivery": None, "re
 
 @dataclass
 class StreamPlan:
-    """What a recording holds of one stream.
+    """Content of a recording for one stream.
 
     Attributes:
         stream: Its name.
@@ -71,9 +71,9 @@ class StreamPlan:
 
 @dataclass(frozen=True)
 class Step:
-    """What is published at once: detections, and before them their cloud.
+    """Detections, and their cloud, which is published first.
 
-    `frame` is None for what is no valid message: it is played too, for the problem that it makes.
+    `frame` is None for an invalid message: it is played too, for its problem.
     """
 
     detections: Recorded
@@ -82,7 +82,7 @@ class Step:
 
 
 def plan(messages: Iterable[Recorded]) -> dict[str, StreamPlan]:
-    """Return what a recording holds, by stream; streams without detections are left out."""
+    """Return the plans of all streams that have detections."""
     plans: dict[str, StreamPlan] = {}
     for recorded in messages:
         one = plans.setdefault(recorded.stream, StreamPlan(recorded.stream))
@@ -102,10 +102,10 @@ def plan(messages: Iterable[Recorded]) -> dict[str, StreamPlan]:
 
 
 def steps(messages: Iterable[Recorded], plans: Mapping[str, StreamPlan]) -> Iterator[Step]:
-    """Yield what is to be published for the streams of `plans`, in the order in which it was received.
+    """Yield the steps of the streams of `plans`, in the order in which they were received.
 
     A frame that was received again is left out, and so is a cloud that is not needed. Frames wait for their cloud, so
-    what is between the two in the recording is kept in memory.
+    messages between the two are kept in memory.
     """
     done: set[tuple[str, FrameId]] = set()
     shelf: dict[tuple[str, int], list[Recorded]] = collections.defaultdict(list)
@@ -141,7 +141,7 @@ def renamed(recorded: Recorded, stream: str) -> Recorded:
 
 
 def content(tracks: Tracks) -> bytes:
-    """Return the bytes of tracks without what differs between two runs: names of stream and session, delivery."""
+    """Return the bytes of tracks without the fields that differ between runs: stream, session, delivery, revision."""
     return encode(tracks.model_copy(update=_ANYWHERE))
 
 

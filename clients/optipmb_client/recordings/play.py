@@ -191,7 +191,7 @@ class _Player:
         )
 
     def _sender(self, message: Recorded) -> Sender:
-        """Return the publisher for a message; that of clouds once somebody wants them."""
+        """Return the publisher for a message; for clouds once somebody wants them."""
         kind = (message.topic, message.encoding)
         if kind not in self._senders:
             if message.topic == "points":

@@ -1,8 +1,8 @@
 """Recording streams from the network.
 
-A thread per kind of message, small ones and clouds, moves what comes into the file; once a second everything is
+A thread per kind of message, small ones and clouds, moves messages into the file; once a second everything is
 flushed. Of each stream the parameters in force are asked for and recorded too, when it appears and whenever its session
-restarts: they belong to what made the tracks. Those of a session that ended before it could be asked are not known.
+restarts: they explain the tracks. Parameters of a session that ended before the question are not known.
 """
 
 import concurrent.futures
@@ -30,7 +30,7 @@ PARAMETERS_S = 2.0
 
 @dataclass(frozen=True)
 class Wanted:
-    """Streams to record: their names, or patterns with `*` in the place of names; for how long, and what of them."""
+    """Streams to record: their names, or patterns with `*` in the place of names."""
 
     patterns: Sequence[str]
     points: bool = True  # whether point clouds are recorded
@@ -60,7 +60,7 @@ def record(
 ) -> Recording:
     """Record streams into a new file until `stop` is set, or for a duration.
 
-    What the publishers and the service still keep of the seconds before comes first. `on_flush` is called about once a
+    Messages that publishers and service still keep of the seconds before come first. `on_flush` is called about once a
     second.
 
     Raises:

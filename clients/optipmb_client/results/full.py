@@ -1,4 +1,4 @@
-"""Everything that is known of the tracks of one sequence, beside its result file: `NAME.npz` beside `NAME.txt`.
+"""All columns of the tracks of one sequence, in a file next to its result file: `NAME.npz` next to `NAME.txt`.
 
 Result files of the benchmarks have no room for covariances and probabilities. This one holds every column of the tracks
 as a numpy array, one row per track and frame, in the world frame, ordered by frame and, in a frame, as in the result
@@ -68,7 +68,7 @@ def read_full(path: Path) -> FullTable:
     """Return the tracks of a sequence.
 
     Raises:
-        DatasetError: the file is missing, no such file, or lacks a column.
+        DatasetError: The file is missing, no such file, or lacks a column.
     """
     what = "a file of tracks with all columns"
     try:

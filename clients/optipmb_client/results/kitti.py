@@ -3,9 +3,9 @@
 A line has 18 fields: frame, id, type, truncated, occluded, alpha, x1, y1, x2, y2, h, w, l, x, y, z, ry, score. Boxes
 are in the rectified camera frame of their own frame (x y z = centre of the bottom), image boxes in pixels, `truncated`
 and `occluded` are -1 (unknown). Every track is written, nothing is thresholded: one that the image shows less
-than half of has the image box 0 0 0 0 and its 3D box as it is. Nobody can annotate what an image does not show, and the
-KITTI evaluation leaves boxes without height out of account, as it does those that are for more than half in unannotated
-regions. Numbers have six decimals, so the same tracks always give the same bytes.
+than half of has the image box 0 0 0 0 and its 3D box as it is: the KITTI evaluation ignores boxes without height, as it
+does boxes that are for more than half in unannotated regions. Numbers have six decimals, so the same tracks always give
+the same bytes.
 
 A submission leaves rows out: the server of the benchmark sweeps no scores, so every false track counts. It has the
 tracks that were confirmed in some frame and whose mean score is at least the threshold of their class, and of these the

@@ -35,14 +35,14 @@ from optipmb_client.results.rows import ResultTable, stacked
 NUSCENES_CLASSES = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck")
 """The classes of the tracking benchmark; others that a file holds are left out."""
 NUSCENES_META = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
-"""What a submission states about its inputs."""
+"""Inputs that a submission declares."""
 
 Kind: TypeAlias = Literal["detection", "tracking"]
 _Row: TypeAlias = "array[float]"
 
 _WIDTH = 14
 _UNTRACKED = frozenset(("barrier", "construction_vehicle", "traffic_cone", "vehicle.construction"))
-"""Classes of the detection benchmark that the tracking benchmark lacks, whatever they resemble."""
+"""Classes of the detection benchmark that the tracking benchmark lacks."""
 _LENGTHS = {"translation": 3, "size": 3, "rotation": 4}
 _PLANE = 2
 

@@ -38,7 +38,7 @@ def track_columns(
     Args:
         name: Value of the column `sequence`.
         tracks: The tracks of each frame.
-        sequence: What was tracked; knows the columns and rows of its table of detections, if it came from one.
+        sequence: The tracked sequence; knows the columns and rows of its table of detections, if it came from one.
         full: Whether to add the covariance.
     """
     order = sorted(tracks)
@@ -98,7 +98,7 @@ def latency(durations_ns: Sequence[int]) -> Latency | None:
 
 
 def horizons_for(out: Path) -> tuple[float, ...] | None:
-    """Return the horizons of the predicted paths that a result needs: a bag of ROS 2; None: those of the profile."""
+    """Return the horizons of the predicted paths that a result needs: a bag of ROS 2; None: the profile's."""
     if out.suffix != ".mcap":
         return None
     from optipmb_schemas.ros2.tracks import HORIZONS  # noqa: PLC0415  packages of an extra
@@ -112,7 +112,7 @@ class Results:
     `write` may be called in another process than `take` and `close`, on an object with the same arguments.
 
     Args:
-        dataset: What was tracked; it knows the format of its result files.
+        dataset: The tracked data set; it knows the format of its result files.
         out: The folder, or a file with the suffix of a table.
         full: Whether all columns of the tracks are written: into a file beside each result file, or into further
             columns of the table. Otherwise a file that an earlier run left beside a result file is removed.

@@ -288,10 +288,10 @@ class TableDataset(Dataset):
     Args:
         path: the file or folder.
         options: see `OPTIONS`.
-        lenient: whether what is wrong becomes a finding (`Reading`), where nothing is to be tracked.
+        lenient: Whether errors become findings (`Reading`), where nothing is to be tracked.
 
     Raises:
-        DatasetError: A file, a column, a value or an option is wrong; says where.
+        DatasetError: A file, a column, a value or an option is wrong.
         ClientError: pyarrow is not installed.
     """
 
@@ -382,7 +382,7 @@ def _truth_of(tables: Sequence[ObjectTable], key: str, file: Path) -> tuple[Obje
 
 
 def _gaps(sequence: TableSequence) -> list[str]:
-    """Say where frames seem to be missing: without a row, nobody knows that the detector found nothing."""
+    """Return a note if frames seem to be missing: without a row, an empty frame is unknown."""
     steps = np.diff(sequence.stamps)
     if not len(steps):
         return []

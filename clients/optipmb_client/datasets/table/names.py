@@ -1,7 +1,7 @@
 """Which column of a table means what, by its name.
 
 Names are compared in lower case, with every run of other characters as one underscore, and without a unit at the end
-(`yaw_deg`, `x [m]`). What a name says about units is kept.
+(`yaw_deg`, `x [m]`). Units in names are kept.
 """
 
 import re
@@ -14,17 +14,11 @@ from optipmb_client.table_files import BOX_LISTS
 
 @dataclass(frozen=True)
 class Column:
-    """A column that was found.
+    """A column of a table."""
 
-    Attributes:
-        name: as the table has it.
-        unit: that its name states: `deg`, `rad`, `s`, `ms`, `us`, `ns`, or None.
-        base: its name without the unit, normalised.
-    """
-
-    name: str
-    unit: str | None
-    base: str
+    name: str  # as the table has it
+    unit: str | None  # in its name: `deg`, `rad`, `s`, `ms`, `us`, `ns`
+    base: str  # its name without the unit, normalised
 
 
 def _vector(bases: str, part: str, place: int) -> tuple[str, ...]:
@@ -103,12 +97,7 @@ _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
 
 
 def find_columns(names: Iterable[str], chosen: Mapping[str, str]) -> dict[str, Column]:
-    """Return the column of each meaning that the table has.
-
-    Args:
-        names: of all columns.
-        chosen: meanings whose column the user has named.
-    """
+    """Return the column of each meaning among `names`; `chosen` are meanings whose column the user has named."""
     known = [_normalised(name) for name in names]
     taken: dict[str, Column] = {}
     used = set(chosen.values())
