@@ -89,8 +89,7 @@ class EvaluationJobs(JobOptions):
     """Options of evaluation in several processes."""
 
     jobs: Annotated[
-        int | None,
-        typer.Option(min=1, help="Classes at once; default: one for each processor.", show_default=False),
+        int | None, typer.Option(min=1, help="Classes at once; default: one for each processor.", show_default=False)
     ] = None
 
 

@@ -6,14 +6,7 @@ from typing import Annotated
 
 import typer
 
-from optipmb_client.commands.options import (
-    AsJson,
-    DatasetOptions,
-    Profile,
-    print_json,
-    print_table,
-    say,
-)
+from optipmb_client.commands.options import AsJson, DatasetOptions, Profile, print_json, print_table, say
 from optipmb_client.commands.service_options import ServiceOptions
 from optipmb_client.errors import UsageError
 from optipmb_client.load import Frames, Load, Run, draw_runs, find_limit, generated, recorded, run_load, table_of
@@ -52,12 +45,7 @@ class RunOptions:
 
 
 def load(
-    *,
-    made: GeneratedOptions,
-    data: RecordedOptions,
-    how: RunOptions,
-    service: ServiceOptions,
-    as_json: AsJson = False,
+    *, made: GeneratedOptions, data: RecordedOptions, how: RunOptions, service: ServiceOptions, as_json: AsJson = False
 ) -> None:
     """Send frames of many sensors through a running service, and show how long their tracks take and what is lost.
 

@@ -103,8 +103,7 @@ class DatasetOptions:
 
     data: Path | None = field(default=None, init=False)
     dataset: Annotated[
-        str | None,
-        typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False),
+        str | None, typer.Option("--dataset", help=f"Layout of the data: {', '.join(DATASETS)}.", show_default=False)
     ] = None
     root: Annotated[Path | None, typer.Option("--root", help="File or folder of the dataset; scenes need none.")] = None
     detections: Annotated[
@@ -202,8 +201,7 @@ class JobOptions:
     """Options of work in several processes."""
 
     jobs: Annotated[
-        int | None,
-        typer.Option(min=1, help="Recordings at once; default: one for each processor.", show_default=False),
+        int | None, typer.Option(min=1, help="Recordings at once; default: one for each processor.", show_default=False)
     ] = None
     ray: Ray = None
 

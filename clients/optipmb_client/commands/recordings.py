@@ -161,8 +161,7 @@ def _write(
     for result, sequence in zip(results, sequences, strict=True):
         known = enumerate(frames[result.name])
         files.take(
-            sequence,
-            files.write(sequence, {index: result.tracks[one] for index, one in known if one in result.tracks}),
+            sequence, files.write(sequence, {index: result.tracks[one] for index, one in known if one in result.tracks})
         )
     files.close(sequences)
 

@@ -21,15 +21,7 @@ import numpy as np
 from optipmb_schemas import Tracks
 
 from optipmb_client.camera import SENSOR_FROM_CAMERA, Camera, sensor_from_kitti
-from optipmb_client.datasets.interface import (
-    Cloud,
-    DataSequence,
-    Dataset,
-    DetectionFrame,
-    Points,
-    Regions,
-    Truth,
-)
+from optipmb_client.datasets.interface import Cloud, DataSequence, Dataset, DetectionFrame, Points, Regions, Truth
 from optipmb_client.files import DatasetError, numbers, read_points, read_rows
 from optipmb_client.geometry import Floats, Ints, Pose, pose_of, stack_poses, to_world
 from optipmb_client.results.kitti import SUBMISSION_SCORES, write_kitti_results

@@ -331,10 +331,7 @@ def write_bag(path: Path, bag: Bag, plan: Plan, tracks: Mapping[int, Tracks], *,
             ahead = next(given, None) if copied else None
             topics = {
                 end: writer.add_connection(
-                    f"{plan.topic}/tracks{end}",
-                    kind,
-                    msgdef=types.definition(kind),
-                    rihs01=types.hash_of(kind),
+                    f"{plan.topic}/tracks{end}", kind, msgdef=types.definition(kind), rihs01=types.hash_of(kind)
                 )
                 for end, kind in TOPICS.items()
             }

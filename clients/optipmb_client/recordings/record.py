@@ -71,11 +71,7 @@ def record(
     keys = Keys(wanted.prefix)
     topics = (*SMALL, "points") if wanted.points else SMALL
     chosen = [(topic, keys.matching(pattern, topic)) for topic in topics for pattern in wanted.patterns]
-    about = {
-        "made_by": f"optipmb {version('optipmb')}",
-        "prefix": wanted.prefix,
-        "streams": " ".join(wanted.patterns),
-    }
+    about = {"made_by": f"optipmb {version('optipmb')}", "prefix": wanted.prefix, "streams": " ".join(wanted.patterns)}
     with RecordingWriter(path, about) as writer:
         begun = time.monotonic()
         task = _Task(connection, keys, writer)
