@@ -12,19 +12,17 @@ import structlog
 from optipmb_service.grpc.server import GRACE_S, Server
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Iterator
 
-    from optipmb_service.observability.metrics import Value
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.grpc.metrics import CallMetrics
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
-
-    AddFigures = Callable[[Callable[[], Iterable[Value]]], None]
 
 log = structlog.get_logger("optipmb_service")
 
 
 @contextlib.contextmanager
-def serving(settings: Settings, client: Client, add: AddFigures) -> Iterator[None]:
+def serving(settings: Settings, client: Client) -> Iterator[CallMetrics]:
     """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other.
 
     Raises:
@@ -42,9 +40,8 @@ def serving(settings: Settings, client: Client, add: AddFigures) -> Iterator[Non
     server: Server | None = None
     try:
         server = asyncio.run_coroutine_threadsafe(begin(), loop).result()
-        add(server.metrics.figures)
         log.info("grpc", address=server.address)
-        yield
+        yield server.metrics
     finally:
         if server is not None:
             with contextlib.suppress(TimeoutError):

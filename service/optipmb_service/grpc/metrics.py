@@ -3,12 +3,6 @@
 from __future__ import annotations
 
 import collections
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from optipmb_service.observability.metrics import Value
 
 
 class CallMetrics:
@@ -24,18 +18,3 @@ class CallMetrics:
         self.refused: collections.Counter[str] = collections.Counter()
         self.request_bytes = 0
         self.invalid = 0
-
-    def figures(self) -> Iterator[Value]:
-        """Return all counts as metrics."""
-        for name, counts in (
-            ("grpc_open_calls", self.open),
-            ("grpc_requests_total", self.requests),
-            ("grpc_responses_total", self.responses),
-            ("grpc_skipped_total", self.skipped),
-            ("grpc_refused_total", self.refused),
-        ):
-            for label, count in dict(counts).items():
-                yield name, (label,), count
-        for labels, count in dict(self.ended).items():
-            yield "grpc_calls_total", labels, count
-        yield "grpc_invalid_total", (), self.invalid

@@ -23,14 +23,14 @@ from optipmb_service.grpc.metrics import CallMetrics
 from optipmb_service.grpc.publishers import Publishers
 from optipmb_service.grpc.status import EndCall, refused
 from optipmb_service.grpc.tls import credentials
-from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from optipmb_service.grpc.calls import Context
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
 
 SERVICE: Final = pb.DESCRIPTOR.services_by_name["TrackingService"].full_name
