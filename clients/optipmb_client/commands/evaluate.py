@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import RenderableType
 
 from optipmb_client import bulk
 from optipmb_client.commands.options import (
@@ -19,11 +18,12 @@ from optipmb_client.commands.options import (
     print_table,
     warn,
 )
-from optipmb_client.commands.tables import clear_table, comparison_tables, figure_tables, nuscenes_table
 from optipmb_client.errors import UsageError
 from optipmb_client.extras import needed
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from optipmb_client.evaluation import ClassResult, Rules
     from optipmb_client.evaluation.figures import ClassFigures
 
@@ -91,6 +91,7 @@ def evaluate(
     The best threshold is the one on the mean score of a track that gives the highest MOTA.
     """
     needed("optipmb evaluate", "evaluation", "scipy")
+    from optipmb_client.commands.tables import comparison_tables  # noqa: PLC0415  loads the solvers of scipy
 
     more = {"tracks": " ".join(map(str, tracks))} if data.named()[0] == "table" else {}
     opened = data.open(**more)
@@ -119,7 +120,7 @@ class _Evaluated:
 
     parts: dict[str, Any]
     figures: "Sequence[ClassFigures]"
-    tables: Sequence[RenderableType]
+    tables: "Sequence[RenderableType]"
 
 
 def _evaluated(
@@ -130,6 +131,7 @@ def _evaluated(
     executor: bulk.Executor,
     note: Callable[[str], None],
 ) -> _Evaluated:
+    from optipmb_client.commands.tables import clear_table, figure_tables, nuscenes_table  # noqa: PLC0415  as above
     from optipmb_client.evaluation import evaluate_files  # noqa: PLC0415  as above
     from optipmb_client.evaluation.figures import Settings, class_average  # noqa: PLC0415  as above
     from optipmb_client.evaluation.jobs import Evaluation, FiguresTask, figures_of  # noqa: PLC0415  as above
