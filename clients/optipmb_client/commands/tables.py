@@ -10,8 +10,6 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from optipmb_client.commands.options import plain_table
-
 if TYPE_CHECKING:
     from optipmb_client.evaluation import ClassResult
     from optipmb_client.evaluation.figures import ClassFigures
@@ -198,9 +196,9 @@ def _reliability(figures: "Sequence[ClassFigures]") -> Table:
 
 
 def _empty(columns: Sequence[str]) -> Table:
-    table = plain_table((), columns)
-    for column in table.columns:
-        column.justify = "left" if column.header in {"class", "tracks", SCORE, ""} else "right"
+    table = Table(box=None, pad_edge=False)
+    for name in columns:
+        table.add_column(name, justify="left" if name in {"class", "tracks", SCORE, ""} else "right", no_wrap=True)
     return table
 
 
