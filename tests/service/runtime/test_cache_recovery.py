@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 from fusing import FUSED
-from optipmb_service.runtime.awaited_caches import MOST, AwaitedCaches
 from optipmb_service.runtime.directory import BACK_NS, StreamDirectory
+from optipmb_service.runtime.recovery import MOST, CacheRecovery
 from optipmb_service.session.session import Session
 
 import optipmb
@@ -34,7 +35,7 @@ class Publishers:
         del session
         return self._directory.awaited("site/node", lambda _: True, sensors, self.now_ns)
 
-    def ask_cache(self, stream: str, then: Callable[[list[tuple[Packet, bool]], bool], None]) -> None:
+    def ask_cache(self, stream: str, then: Callable[[list[Packet], bool], None]) -> None:
         """Note it, without an answer."""
         del then
         self.asked.append(stream)
@@ -43,7 +44,8 @@ class Publishers:
 def test_publishers_that_come_and_go_leave_nothing_behind() -> None:
     """However many caches have answered: those are remembered whose publishers are there, and are not asked again."""
     publishers, session = Publishers(), Session(FUSED, optipmb.load_profile("nuscenes"), fused=True)
-    one = AwaitedCaches(FUSED, lambda: publishers)
+    streams: Any = SimpleNamespace(caches=publishers)
+    one = CacheRecovery(FUSED, streams)
     staying = [f"site/node/{number}" for number in range(MOST + 10)]
     for stream in staying:
         publishers.set(stream, present=True)
@@ -57,7 +59,7 @@ def test_publishers_that_come_and_go_leave_nothing_behind() -> None:
     assert set(staying) <= one._answered
     assert len(one._answered) <= 2 * len(staying) + 1
     assert len(one._asked) <= 2 * len(staying) + 1
-    assert not one.awaited(session, lambda *_: None)
+    assert not one.awaited(session, lambda *_, **__: None)
     publishers.set("site/node/new", present=True)
-    assert one.awaited(session, lambda *_: None) is True
+    assert one.awaited(session, lambda *_, **__: None) is True
     assert publishers.asked == ["site/node/new"]
