@@ -23,8 +23,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
-from optipmb_client.load import generated
-from optipmb_client.load.material import FIRST, head, message
+from optipmb_client.load import FIRST, generated, head, message
 from optipmb_service.app.worker import warm_up
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from optipmb_client.datasets import open_dataset
-from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
+from optipmb_client.results.nuscenes import NUSCENES_CLASSES
 from optipmb_client.tuning.clips import load, track_clip
 from optipmb_client.tuning.scoring import Measured, Scorer, rules_of, scorer_of
 

@@ -266,7 +266,7 @@ def test_the_cloud_has_the_pose_of_the_sensor() -> None:
     """In the world frame the ground is at height 0."""
     frame = next(scene(0, 1).frames())
     assert frame.cloud is not None
-    world = frame.cloud.xyz @ rotation_of(frame.cloud.quaternion).T + frame.cloud.translation
+    world = frame.cloud.xyz @ rotation_of(frame.cloud.pose.quaternion).T + frame.cloud.pose.translation
     assert abs(np.median(world[:, 2])) < 0.02
     assert world[:, 2].min() > -0.2
 

@@ -37,7 +37,7 @@ from optipmb_client.evaluation.nuscenes import (
     score_thresholds,
 )
 from optipmb_client.results import ResultTable
-from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
+from optipmb_client.results.nuscenes import NUSCENES_CLASSES
 from real_data import nuscenes_root
 
 CAR, PEDESTRIAN = NUSCENES_CLASSES.index("car"), NUSCENES_CLASSES.index("pedestrian")

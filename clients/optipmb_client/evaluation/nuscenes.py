@@ -41,8 +41,7 @@ from optipmb_client.evaluation.figures import defined, overall
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Bools, Floats, Ints, rotation_of
 from optipmb_client.results import ResultTable
-from optipmb_client.results.nuscenes import read_nuscenes_results, result_table
-from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
+from optipmb_client.results.nuscenes import NUSCENES_CLASSES, read_nuscenes_results, result_table
 
 RACK = "static_object.bicycle_rack"
 _RACKED = ("bicycle", "motorcycle")
@@ -585,7 +584,7 @@ def evaluate_nuscenes(
     dataset = NuScenesDataset(root, clouds=False)
     submission = read_nuscenes_results(results)
     scenes = dataset.tables.scenes.values()
-    names = sequences or [s.name for s in scenes if any(token in submission for token in s.tokens)]
+    names = sequences or [s.name for s in scenes if any(token in submission.rows for token in s.tokens)]
     if not names:
         raise DatasetError(submission.path, f"samples of scenes in {dataset.tables.folder}", "none")
     pairs = []

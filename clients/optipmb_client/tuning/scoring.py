@@ -29,7 +29,7 @@ from optipmb_client.evaluation.nuscenes import (
 )
 from optipmb_client.geometry import Bools, to_sensor
 from optipmb_client.results import ResultTable
-from optipmb_client.results.nuscenes_layout import NUSCENES_CLASSES
+from optipmb_client.results.nuscenes import NUSCENES_CLASSES
 from optipmb_client.tuning.clips import Clip
 
 Figures = dict[str, float]

@@ -5,22 +5,22 @@ Conventions: the sensor is a LiDAR on the roof of a car that drives along; its f
 give the same bytes, whatever was asked for before and in whichever order.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from optipmb_schemas import Tracks
 
 from optipmb_client.camera import synthetic_camera
-from optipmb_client.datasets.interface import Cloud, DataSequence, DetectionFrame, Regions, Truth
+from optipmb_client.datasets.interface import Cloud, DataSequence, Dataset, DetectionFrame, Regions, Truth
 from optipmb_client.datasets.scene.detector import CLASSES, Found, Seen, detect
 from optipmb_client.datasets.scene.lidar import Scan, scan
 from optipmb_client.datasets.scene.traffic import World, build_world, fixed_boxes
 from optipmb_client.files import DatasetError
 from optipmb_client.geometry import Bools, Floats, Ints, Pose, planar_pose, rotation_of, to_sensor, wrap_angle
-from optipmb_client.results import ResultWriter
-from optipmb_client.results.kitti import KittiResultWriter
+from optipmb_client.results.kitti import write_kitti_results
 
 HEIGHT = 1.75
 """Of the sensor above the ground."""
@@ -70,7 +70,7 @@ _BOUNDS = (
 )
 
 
-class SceneSequence:
+class SceneSequence(DataSequence):
     """One generated scene; it is driven through at the first use, each frame is scanned when it is asked for."""
 
     labels = CLASSES
@@ -83,7 +83,7 @@ class SceneSequence:
     def __len__(self) -> int:
         return self._options.frames
 
-    @property
+    @cached_property
     def has_clouds(self) -> bool:
         """Whether frames have point clouds."""
         return self._options.clouds
@@ -218,7 +218,7 @@ def visits(inside: Bools, absence: int) -> Ints:
     return identity
 
 
-class SceneDataset:
+class SceneDataset(Dataset):
     """Generated scenes; sequences are named by four digits, and each is another scene."""
 
     name = "scene"
@@ -244,9 +244,9 @@ class SceneDataset:
             raise DatasetError("--sequences", "at least one sequence", "none")
         return [SceneSequence(name, self._options) for name in wanted]
 
-    def writer(self, out: Path, sequence: DataSequence) -> ResultWriter:
-        """Return a writer of `out/SSSS.txt` in the format of KITTI, for a camera in the sensor's place."""
-        return KittiResultWriter(out / f"{sequence.name}.txt", synthetic_camera())
+    def write(self, out: Path, sequence: DataSequence, tracks: Mapping[int, Tracks]) -> Path:
+        """Write `out/SSSS.txt` in the format of KITTI, for a camera in the sensor's place."""
+        return write_kitti_results(out / f"{sequence.name}.txt", synthetic_camera(), sequence.poses, tracks)
 
 
 def scene_options(options: dict[str, float | bool]) -> SceneOptions:
