@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
 from optipmb_client.load import generated
-from optipmb_client.load.material import FIRST, head, message
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.track_publisher import TrackPublisher
@@ -124,8 +123,9 @@ class Network:
 def packets(objects: int, points: int) -> Iterator[list[Packet]]:
     """Yield the messages of each frame, its cloud first."""
     frames, keys = generated(objects, points, RATE_HZ), schemas.Keys()
+    load = first_of("load.material", "load", package="optipmb_client")
     for k in range(WARM + FRAMES):
-        begins = head(STREAM, bytes(16), FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
+        begins = load.head(STREAM, bytes(16), load.FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
         made = []
         detections, cloud = frames.detections[k % len(frames)], frames.clouds[k % len(frames)]
         bodies = (
@@ -134,17 +134,17 @@ def packets(objects: int, points: int) -> Iterator[list[Packet]]:
         )
         for body, key, kind in bodies:
             if body is not None:
-                payload = message(body, begins)
+                payload = load.message(body, begins)
                 encoding = schemas.encoding_of(kind)
                 made.append(Packet(key, payload, len(payload), encoding, time.time_ns(), time.monotonic_ns()))
         yield made
 
 
-def first_of(*modules: str) -> Any:
-    """Return the first of these modules of the service that the checkout has: an earlier one has it all in another."""
+def first_of(*modules: str, package: str = "optipmb_service") -> Any:
+    """Return the first of these modules of a package that the checkout has: an earlier one has it all in another."""
     for module in modules:
         with contextlib.suppress(ModuleNotFoundError):
-            return import_module(f"optipmb_service.{module}")
+            return import_module(f"{package}.{module}")
     raise ModuleNotFoundError(modules[-1])
 
 
