@@ -13,6 +13,15 @@ def _limit(default: int, meaning: str) -> int:
     return value
 
 
+_DIMENSIONS: Final = {
+    "M": "max_detections",
+    "N": "max_tracks",
+    "P": "max_points",
+    "H": "max_horizons",
+    "C": "max_labels",
+}
+
+
 @dataclass(frozen=True)
 class Limits:
     """What a receiver accepts at most. `rows` gives the limit of a symbolic array dimension."""
@@ -30,8 +39,8 @@ class Limits:
 
     def rows(self, dimension: str) -> int:
         """Return the limit of a dimension: M detections, N tracks or components, P points, H horizons, C classes."""
-        most = {"M": self.max_detections, "N": self.max_tracks, "P": self.max_points}
-        return (most | {"H": self.max_horizons, "C": self.max_labels})[dimension]
+        most: int = getattr(self, _DIMENSIONS[dimension])
+        return most
 
     def described(self) -> list[tuple[str, int, str]]:
         """Return name, value and meaning of every limit, for people."""

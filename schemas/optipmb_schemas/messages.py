@@ -343,10 +343,8 @@ class Density(Message):
 
 
 def _check_labels(label: Integers, labels: tuple[str, ...]) -> None:
-    indices = label.tolist()
-    if (most := max(indices, default=-1)) >= len(labels):
-        at = indices.index(most)
-        raise MessageError("invalid_value", f"label[{at}]", f"an index into the {len(labels)} labels", show(most))
+    if len(label) and (most := label[at := numeric.largest(label)]) >= len(labels):
+        raise MessageError("invalid_value", f"label[{at}]", f"an index into the {len(labels)} labels", show(int(most)))
 
 
 def _check_covariances(covariance: Reals) -> None:

@@ -4,12 +4,12 @@
 limits and the same errors. It is total: it returns a model or raises `MessageError`.
 """
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from functools import cache
 from struct import pack
 from typing import Any, Final, TypeVar
 
+import msgspec
 import numpy as np
 from google.protobuf import struct_pb2
 from google.protobuf.descriptor import FieldDescriptor
@@ -19,7 +19,7 @@ from google.protobuf.message import Message as ProtoMessage
 from numpy.typing import NDArray
 
 from optipmb_schemas.codec import build
-from optipmb_schemas.decoder import DECODERS, REFUSED, Block, checked
+from optipmb_schemas.decoder import DECODERS, MOST_BYTES, read
 from optipmb_schemas.errors import MessageError, invalid
 from optipmb_schemas.limits import DEFAULT, Limits
 from optipmb_schemas.model import Message
@@ -34,6 +34,7 @@ _DTYPE_NAMES: Final[dict[int, str]] = {
 _DTYPES: Final = {code: np.dtype(f"<{name}") for code, name in _DTYPE_NAMES.items()}
 DTYPE_CODES: Final[dict[str, Any]] = {name: code for code, name in _DTYPE_NAMES.items()}
 _FRAMES: Final[dict[int, str]] = {pb.FRAME_WORLD: "world", pb.FRAME_SENSOR: "sensor"}
+_pack: Final = msgspec.msgpack.Encoder().encode
 _FRAME_CODES: Final = {name: code for code, name in _FRAMES.items()}
 
 
@@ -72,10 +73,12 @@ def from_proto(proto: ProtoMessage, kind: type[T], limits: Limits = DEFAULT) -> 
     Raises:
         MessageError: whenever it is not a valid message within the limits.
     """
-    if kind in DECODERS:
-        with suppress(*REFUSED):
-            return checked(_usual_fields(proto), kind, limits)
-    return build(_fields(proto), kind, limits)
+    fields = _fields(proto)
+    if kind in DECODERS and proto.ByteSize() <= MOST_BYTES:
+        message = read(_pack(_with_blocks(fields, kind)), kind, limits)
+        if message is not None:
+            return message
+    return build(fields, kind, limits)
 
 
 def column(array: pb.Array) -> NDArray[Any]:
@@ -96,34 +99,27 @@ def _array(array: NDArray[Any], dtype: str) -> pb.Array:
     return pb.Array(dtype=DTYPE_CODES[dtype], shape=array.shape, data=data)
 
 
-def _usual_fields(proto: ProtoMessage) -> dict[str, Any]:
-    """Return the fields as `checked` takes them. One that has its default value is left out."""
-    readers = _readers(proto.DESCRIPTOR.full_name, _usual_reader)
-    return {(name := field.name): readers[name](value) for field, value in proto.ListFields()}
+def _with_blocks(fields: dict[str, Any], kind: type[Message]) -> dict[str, Any]:
+    """Return the fields with arrays in place of the lists of numbers that protobuf has for arrays of a fixed size."""
+    lists = {name: fields[name] for name in _repeated(kind) & fields.keys()}
+    inner = {name: _with_blocks(fields[name], inner) for name, inner in kind.nested.items() if name in fields}
+    return fields | inner | {name: _doubles(values) for name, values in lists.items()}
 
 
 def _fields(proto: ProtoMessage) -> dict[str, Any]:
     """Return the fields as `build` takes them. An absent one that can tell so is left out."""
-    presence = _presence(proto.DESCRIPTOR.full_name)
     return {
-        name: read(value)
-        for name, read in _readers(proto.DESCRIPTOR.full_name, _reader).items()
-        if (name not in presence or proto.HasField(name)) and (value := getattr(proto, name)) is not None
+        name: read(getattr(proto, name))
+        for name, read, has_presence in _readers(proto.DESCRIPTOR.full_name)
+        if not has_presence or proto.HasField(name)
     }
 
 
 @cache
-def _presence(name: str) -> frozenset[str]:
-    """Return the fields of a message type that can be absent."""
+def _readers(name: str) -> list[tuple[str, Callable[[Any], Any], bool]]:
+    """Return of every field of a message type its name, how to read it, and whether it can be absent."""
     fields = pb.DESCRIPTOR.message_types_by_name[name.rpartition(".")[2]].fields
-    return frozenset(field.name for field in fields if field.has_presence)
-
-
-@cache
-def _readers(name: str, reader: Callable[[FieldDescriptor], Callable[[Any], Any]]) -> dict[str, Callable[[Any], Any]]:
-    """Return how to read every field of a message type."""
-    fields = pb.DESCRIPTOR.message_types_by_name[name.rpartition(".")[2]].fields
-    return {field.name: reader(field) for field in fields}
+    return [(field.name, _reader(field), field.has_presence) for field in fields]
 
 
 def _reader(field: FieldDescriptor) -> Callable[[Any], Any]:
@@ -138,13 +134,6 @@ def _reader(field: FieldDescriptor) -> Callable[[Any], Any]:
     if field.message_type.full_name == struct_pb2.Struct.DESCRIPTOR.full_name:
         return MessageToDict
     return _fields
-
-
-def _usual_reader(field: FieldDescriptor) -> Callable[[Any], Any]:
-    if field.is_repeated and field.type == FieldDescriptor.TYPE_DOUBLE:
-        return _doubles
-    read = _reader(field)
-    return {_block: _usual_block, _fields: _usual_fields}.get(read, read)
 
 
 def _same(value: Any) -> Any:
@@ -163,12 +152,8 @@ def _block(array: pb.Array) -> dict[str, Any]:
     return {"dtype": _DTYPE_NAMES.get(array.dtype, array.dtype), "shape": list(array.shape), "data": array.data}
 
 
-def _usual_block(array: pb.Array) -> Block:
-    return Block(_DTYPE_NAMES[array.dtype], list(array.shape), memoryview(array.data))
-
-
-def _doubles(values: Sequence[float]) -> Block:
-    return Block("f8", [len(values)], memoryview(pack(f"<{len(values)}d", *values)))
+def _doubles(values: list[float]) -> dict[str, Any]:
+    return {"dtype": "f8", "shape": [len(values)], "data": pack(f"<{len(values)}d", *values)}
 
 
 @cache

@@ -10,6 +10,9 @@ from functools import lru_cache
 from math import prod
 from typing import Any, Final, Self
 
+from msgspec import UNSET
+from msgspec.structs import asdict
+
 from optipmb_schemas.blocks import DTYPES
 from optipmb_schemas.codec import decode, encoding_of
 from optipmb_schemas.decoder import DECODERS, REFUSED
@@ -72,36 +75,38 @@ def transcode(payload: bytes, *, encoding: str = "", limits: Limits = DEFAULT) -
     return EncodedTracks.of(to_proto(decode(payload, Tracks, encoding=encoding, limits=limits)))
 
 
-def _tracks(fields: dict[str, Any], limits: Limits) -> EncodedTracks | None:
+def _tracks(fields: Any, limits: Limits) -> EncodedTracks | None:
     """Return the tracks of fields that are as a service writes them, else None.
 
     Fields that are not known here are of a newer version, and are left out.
     """
-    if not fields.keys() >= Tracks.names_required or len(fields["labels"]) > limits.max_labels:
+    scalars = {name: value for name in _SCALARS if (value := getattr(fields, name)) is not UNSET}
+    if len(fields.labels) > limits.max_labels or None in scalars.values():
         return None
-    (rows,), (horizons,) = fields["id"].shape, fields["horizons"].shape if "horizons" in fields else (0,)
+    (rows,), (horizons,) = fields.id.shape, fields.horizons.shape or (0,)
     if not (0 <= rows <= limits.max_tracks and 0 <= horizons <= limits.max_horizons):
         return None
     parts: list[bytes] = []
-    for name, dtype, shape, size, prefix in _columns(rows, horizons, len(fields["labels"])):
-        block = fields.get(name)
-        if block is not None:
-            if block.dtype != dtype or block.shape != shape or len(block.data) != size:
+    for name, shape, size, prefix in _columns(rows, horizons, len(fields.labels)):
+        block = getattr(fields, name)
+        if block.shape is not None:  # else it is absent
+            if block.shape != shape or len(block.data) != size:
                 return None
             parts += (prefix, block.data)
-    scalars = {name: fields[name] for name in _SCALARS if name in fields}
+    if "delivery" in scalars:
+        scalars["delivery"] = {name: one for name, one in asdict(fields.delivery).items() if one is not UNSET}
     return EncodedTracks.of(pb.Tracks(**scalars), b"".join(parts))
 
 
 @lru_cache(512)
-def _columns(rows: int, horizons: int, classes: int) -> list[tuple[str, str, list[int], int, bytes]]:
-    """Return of each column name, number type, shape, bytes, and what stands before them in the serialized message."""
+def _columns(rows: int, horizons: int, classes: int) -> list[tuple[str, tuple[int, ...], int, bytes]]:
+    """Return of each column name, shape, bytes, and what stands before them in the serialized message."""
     sizes, columns = {"N": rows, "H": horizons, "C": classes}, []
     for name, one in Tracks.arrays.items():
-        shape = [length if isinstance(length, int) else sizes[length] for length in one.shape]
+        shape = tuple(length if isinstance(length, int) else sizes[length] for length in one.shape)
         size = prod(shape) * DTYPES[one.dtype]
         proto: Any = pb.Tracks()
         getattr(proto, name).CopyFrom(pb.Array(dtype=DTYPE_CODES[one.dtype], shape=shape, data=bytes(size)))
         field: bytes = proto.SerializeToString()
-        columns.append((name, one.dtype, shape, size, field[: len(field) - size]))
+        columns.append((name, shape, size, field[: len(field) - size]))
     return columns

@@ -119,7 +119,7 @@ class Incoming:
         if isinstance(message, schemas.Points) and not await self._points_wanted(outgoing):
             return
         put = outgoing.detections if isinstance(message, schemas.Detections) else outgoing.points
-        payload = schemas.encode(message)
+        payload = schemas.encode(message) if isinstance(message, schemas.Points) else schemas.encoded(message)
         if len(payload) <= INLINE_BYTES:
             put(payload)
         else:
