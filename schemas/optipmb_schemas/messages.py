@@ -15,8 +15,19 @@ from pydantic import AfterValidator, Field
 
 from optipmb_schemas.arrays import Array, Integers, Numeric, Reals, Singles, first_descent, numeric, unit_quaternion
 from optipmb_schemas.errors import MessageError, invalid, shape_text, show
-from optipmb_schemas.fields import Count, Epoch, Flag, Horizons, Labels, Name, NonNegative, SessionId, Stamp, Stream
-from optipmb_schemas.model import Message
+from optipmb_schemas.model import (
+    Count,
+    Epoch,
+    Flag,
+    Horizons,
+    Labels,
+    Message,
+    Name,
+    NonNegative,
+    SessionId,
+    Stamp,
+    Stream,
+)
 
 FAR = 1e8
 """Largest coordinate in metres: beyond every map projection, small enough that no square overflows."""

@@ -10,7 +10,7 @@ import contextlib
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-from optipmb_schemas.protobuf.transcode import transcode
+from optipmb_schemas.protobuf.convert import transcode
 from optipmb_service.grpc.selection import Pace, Selection
 from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
 from optipmb_service.session.convert import density_of

@@ -9,7 +9,7 @@ from mcap.records import Channel, DataEnd, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 from optipmb_schemas import MessageError
-from optipmb_schemas.fields import check_stream
+from optipmb_schemas.model import check_stream
 
 from optipmb_client.files import DatasetError
 from optipmb_client.mcap_files.writing import ENCODING, KINDS

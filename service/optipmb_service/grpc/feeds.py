@@ -13,7 +13,7 @@ import optipmb_schemas as schemas
 import structlog
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-from optipmb_schemas.protobuf.transcode import EncodedTracks, transcode
+from optipmb_schemas.protobuf.convert import EncodedTracks, transcode
 
 from optipmb_service.grpc.idle_pool import IdlePool
 from optipmb_service.grpc.outbox import varint

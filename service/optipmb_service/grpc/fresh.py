@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from optipmb_schemas.protobuf.transcode import EncodedTracks
+    from optipmb_schemas.protobuf.convert import EncodedTracks
 
     from optipmb_service.grpc.feeds import Item
 

@@ -19,7 +19,7 @@ from optipmb_service.grpc.outbox import Outbox
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
 
-    from optipmb_schemas.protobuf.transcode import EncodedTracks
+    from optipmb_schemas.protobuf.convert import EncodedTracks
 
     from optipmb_service.grpc.calls import Call
     from optipmb_service.grpc.selection import Selection

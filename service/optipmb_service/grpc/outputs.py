@@ -10,7 +10,7 @@ import grpc
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
-from optipmb_schemas.protobuf.transcode import transcode
+from optipmb_schemas.protobuf.convert import transcode
 
 from optipmb_service.grpc.feeds import tracks_item
 from optipmb_service.grpc.fresh import Fresh, order
@@ -22,7 +22,7 @@ from optipmb_service.grpc.status import EndCall
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable
 
-    from optipmb_schemas.protobuf.transcode import EncodedTracks
+    from optipmb_schemas.protobuf.convert import EncodedTracks
 
     from optipmb_service.grpc.calls import Call
 
