@@ -713,7 +713,7 @@ class _Builder:
             data = self._data_in(fields)
             plan = _plan_of(kind, self._shapes_in(fields))
             _need([*map(len, data)] == plan.sizes)
-            _need(plan.is_usual if limits is DEFAULT else plan.is_within(limits))
+            _need(plan.is_usual if limits.at_least_default else plan.is_within(limits))
             for column in plan.columns:
                 column.read(data, values)
             given |= plan.names
@@ -890,7 +890,7 @@ def read_columns(payload: bytes, kind: type[T], limits: Limits) -> T | None:
     of floats. Where it would copy a large payload, `_is_encoding` compares the payload without them.
     """
     builder: Any = _BUILDERS.get(kind)
-    if np is None or builder is None or not (_LITTLE and (limits is DEFAULT or _is_generous(limits))):
+    if np is None or builder is None or not (_LITTLE and (limits.at_least_default or _is_generous(limits))):
         return None
     try:
         fields = DECODERS[kind](payload)

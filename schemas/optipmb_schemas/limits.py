@@ -5,6 +5,7 @@ take in the tens of megabytes. A message above a limit is answered by a `too_lar
 """
 
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Final
 
 
@@ -41,6 +42,11 @@ class Limits:
         """Return the limit of a dimension: M detections, N tracks or components, P points, H horizons, C classes."""
         most: int = getattr(self, _DIMENSIONS[dimension])
         return most
+
+    @cached_property
+    def at_least_default(self) -> bool:
+        """Whether no limit is below the default."""
+        return all(getattr(self, f.name) >= f.default for f in fields(self))
 
     def described(self) -> list[tuple[str, int, str]]:
         """Return name, value and meaning of every limit, for people."""

@@ -13,7 +13,7 @@ from optipmb_service.runtime.ports import EdgeError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from optipmb_service.grpc.beside import AddFigures
+    from optipmb_service.grpc.server import AddFigures
     from optipmb_service.http import Source, Watched
     from optipmb_service.settings.model import Settings
     from optipmb_service.zenoh.client import Client
@@ -61,7 +61,7 @@ def grpc_edge(settings: Settings, client: Callable[[], Client], add: AddFigures)
         yield
         return
     try:
-        from optipmb_service.grpc.beside import serving  # noqa: PLC0415 - an extra that only this needs
+        from optipmb_service.grpc.server import serving  # noqa: PLC0415 - an extra that only this needs
     except ModuleNotFoundError as error:
         raise EdgeError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
     with serving(settings, client(), add):
