@@ -25,10 +25,7 @@ from typing import TYPE_CHECKING, Any
 import optipmb_schemas as schemas
 from optipmb_client.load import generated
 from optipmb_client.load.material import FIRST, head, message
-from optipmb_service.app.kernels import warm_up
-from optipmb_service.observability import logs
-from optipmb_service.observability.metrics import Metrics
-from optipmb_service.observability.problem_reporter import ProblemReporter
+from optipmb_service.app.worker import warm_up
 from optipmb_service.runtime.persistence import NoPersistence
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
@@ -37,6 +34,9 @@ from optipmb_service.runtime.stream_actor import StreamActor
 from optipmb_service.runtime.track_publisher import TrackPublisher
 from optipmb_service.session import convert
 from optipmb_service.session.session import Session
+from optipmb_service.telemetry import logs
+from optipmb_service.telemetry.metrics import Metrics
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 import optipmb
 

@@ -271,7 +271,7 @@ for one in threads: one.join()
 def test_threads_may_decode_their_first_messages_at_once() -> None:
     """No process ends by a signal whose threads all decode as soon as the modules are imported."""
     folder = str(Path(__file__).parents[1] / "support")
-    for _ in range(8):
+    for _ in range(3):
         code = f"import sys; sys.path.insert(0, {folder!r}){FIRST}"
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
         assert (done.returncode, done.stderr) == (0, "")

@@ -12,10 +12,10 @@ import optipmb_service
 import pytest
 from optipmb_schemas import Code
 from optipmb_service.app import cli
-from optipmb_service.observability.logs import EVENTS
 from optipmb_service.session.problems import CODES
-from optipmb_service.settings.loading import load
-from reference import main, page
+from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, load
+from optipmb_service.telemetry.logs import EVENTS
+from reference import docstrings, main, page
 
 FILE = Path(__file__).parents[2] / "docs" / "operation.md"
 SOURCES = sorted(Path(optipmb_service.__file__).parent.rglob("*.py"))
@@ -53,6 +53,12 @@ def test_a_page_that_is_not_current_is_found(tmp_path: Path) -> None:
     assert main(["--check", str(copy)]) == 1
     assert main([str(copy)]) == 0
     assert main(["--check", str(copy)]) == 0
+
+
+def test_every_setting_is_described() -> None:
+    """No setting without a word on what it does."""
+    for table in (Settings, LimitSettings, Ros2Settings, Ros2Stream):
+        assert docstrings(table).keys() >= table.model_fields.keys()
 
 
 def test_every_log_event_is_described() -> None:

@@ -205,7 +205,7 @@ class HandMember:
     @property
     def held(self) -> set[int]:
         """The partitions whose streams it would publish now."""
-        valid = self.member._write_lease.valid(self.clock.ns)
+        valid = self.clock.ns < self.member._may_write_until_ns
         return set(self.member._table.held) if valid else set()
 
     def end(self) -> None:

@@ -6,14 +6,14 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from optipmb_schemas import Detections, Keys, Points, encode, encoding_of
-from optipmb_service.observability.metrics import Metrics
-from optipmb_service.observability.problem_reporter import ProblemReporter
 from optipmb_service.runtime.missed_frames import NoLog
 from optipmb_service.runtime.persistence import NoPersistence
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.registry import Registry
-from optipmb_service.settings.model import Settings
+from optipmb_service.settings import Settings
+from optipmb_service.telemetry.metrics import Metrics
+from optipmb_service.telemetry.problem_reporter import ProblemReporter
 from sessions import chained
 
 if TYPE_CHECKING:

@@ -18,12 +18,9 @@ import structlog
 
 import optipmb
 from optipmb_service import __version__
-from optipmb_service.app.clustering import open_log, open_store
-from optipmb_service.app.ending import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
+from optipmb_service.app.lifecycle import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
+from optipmb_service.app.storage import open_log, open_store
 from optipmb_service.cluster.member import Member
-from optipmb_service.observability import collectors
-from optipmb_service.observability.metrics import Metrics
-from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.intake import Intake
 from optipmb_service.runtime.kept_tracks import RecentTracks
 from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter, NoPersistence
@@ -34,17 +31,26 @@ from optipmb_service.runtime.service_queries import ServiceQueries, members_of
 from optipmb_service.runtime.stream_queries import StreamQueries
 from optipmb_service.runtime.track_query import TrackQuery
 from optipmb_service.session.problems import problem_of
+from optipmb_service.session.values import SECOND
+from optipmb_service.telemetry.health import Reporter
+from optipmb_service.telemetry.metrics import (
+    NETWORK_METRICS,
+    PROBLEM_METRICS,
+    STREAM_METRICS,
+    Metrics,
+    StreamFigures,
+)
+from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.zenoh import Transport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
-    from optipmb_service.observability.metrics import Value
     from optipmb_service.runtime.context import Actor
     from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.profiles import Profiles
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
     from optipmb_service.zenoh.key_numbers import KeyCount
 
@@ -52,17 +58,12 @@ log = structlog.get_logger("optipmb_service")
 
 DRAIN_POLL_S: Final = 0.01
 JOIN_S: Final = 0.3
-SAVE_S: Final = 0.5
-"""The last checkpoints have so long even where messages took all the time."""
-
-NAME_CHECK_NS: Final = 10_000_000_000
-"""How often another process of the same name is looked for."""
-
-LEASES_S: Final = 1.0
-"""What is left at the end to say that the leases are free, however long the checkpoints take."""
+SAVE_S: Final = 0.5  # the last checkpoints have so long even where messages took all the time
+NAME_CHECK_NS: Final = 10_000_000_000  # how often another process of the same name is looked for
+LEASES_S: Final = 1.0  # what is left at the end to say that the leases are free, however long the checkpoints take
 
 
-class Service:
+class Service(Reporter):
     """A service on the network, without signals or a loop of its own: `run` adds these, tests use it as it is.
 
     Args:
@@ -130,7 +131,8 @@ class Service:
             linger_s=settings.lease_s,
             idle_s=settings.idle_s,
         )
-        self._metrics.add(self._figures)
+        self._metrics.add(PROBLEM_METRICS | STREAM_METRICS, self._figures)
+        self._metrics.add(NETWORK_METRICS, self.client)
         self._stream_queries = StreamQueries(
             self._registry, TrackQuery([*logged, recent], settings.instance, settings.limits.limits())
         )
@@ -156,7 +158,7 @@ class Service:
             self._transport.announce()
 
     def housekeeping(self) -> None:
-        """Do what is due about once a second."""
+        """Report silent streams and summaries of problems; to be called about once a second."""
         now_ns = time.monotonic_ns()
         self._registry.sweep(now_ns)
         self._transport.look_for_returned(self._report_returned)
@@ -166,7 +168,7 @@ class Service:
         self._reporter.flush(now_ns)
 
     def stop(self, seconds: float = math.inf) -> bool:
-        """Let others go on, track what was received, within the grace, and close.
+        """Hand the streams over, track what was received, within the grace, and close.
 
         All of it takes a bounded time, so that whoever waits for the end kills nothing that is still being kept; but
         closing the network, before which all that is to be kept is written.
@@ -274,78 +276,58 @@ class Service:
                 summary = actor.summary(now_ns)
             except Exception as error:
                 log.exception("internal_error", stream=actor.stream)
-                self._report(actor.stream, "the line of a session in the status", f"{type(error).__name__}: {error}")
+                self._internal("the line of a session in the status", actor.stream, f"{type(error).__name__}: {error}")
             else:
                 summaries += [summary] if summary is not None else []
         return tuple(summaries)
 
+    def report_certificate(self, why: str) -> None:
+        """Report that a certificate has ended."""
+        self._report("certificate", "certificates that hold", why, message=why)
+
     def _report_returned(self, token: str, due: int, newest: int) -> None:
         expected, received = f"messages numbered from {due} on by Zenoh", f"numbers that began again, now {newest}"
-        problem = problem_of(
-            "numbers_back",
-            stream=schemas.Keys(self._settings.prefix).stream_of(token),
-            instance=self._settings.instance,
-            expected=expected,
-            received=received,
-            message=f"Publisher: expected {expected}, received {received}; remove `id` from its Zenoh configuration.",
-        )
-        self._reporter.report(problem, time.monotonic_ns())
+        message = f"Publisher: expected {expected}, received {received}; remove `id` from its Zenoh configuration."
+        stream = schemas.Keys(self._settings.prefix).stream_of(token)
+        self._report("numbers_back", expected, received, stream=stream, message=message)
 
     def _report_duplicate_name(self) -> None:
         name = self._settings.instance
-        problem = problem_of(
-            "duplicate_name",
-            stream="",
-            instance=name,
-            path="instance",
-            expected="a name that no other process has",
-            received=name,
-            message=f"Setting instance: another process is named {name}, too; give each a name of its own.",
-        )
-        self._reporter.report(problem, time.monotonic_ns())
-
-    def report_certificate(self, why: str) -> None:
-        """Report that a certificate has ended."""
-        problem = problem_of(
-            "certificate",
-            stream="",
-            instance=self._settings.instance,
-            expected="certificates that hold",
-            received=why,
-            message=why,
-        )
-        self._reporter.report(problem, time.monotonic_ns())
+        message = f"Setting instance: another process is named {name}, too; give each a name of its own."
+        self._report("duplicate_name", "a name that no other process has", name, path="instance", message=message)
 
     def _unkept(self, stream: str, why: str) -> None:
         """Report that the state of a stream cannot be kept."""
-        self._report(stream, "a state that can be written down", why)
+        self._internal("a state that can be written down", stream, why)
 
-    def _report(self, stream: str, expected: str, received: str) -> None:
+    def _internal(self, expected: str, stream: str, received: str) -> None:
+        message = f"Stream: expected {expected}, received {received}."
+        self._report("internal", expected, received, stream=stream, message=message)
+
+    def _report(
+        self, code: str, expected: str, received: str, *, message: str, stream: str = "", path: str = ""
+    ) -> None:
         problem = problem_of(
-            "internal",
+            code,
             stream=stream,
             instance=self._settings.instance,
+            path=path,
             expected=expected,
             received=received,
-            message=f"Stream: expected {expected}, received {received}.",
+            message=message,
         )
         self._reporter.report(problem, time.monotonic_ns())
 
-    def _figures(self) -> Iterator[Value]:
-        """Read what `metrics` does not count itself."""
-        sessions = self._summaries(time.monotonic_ns())
-        densities = [session.density for actor in self._registry.actors() if (session := actor.session) is not None]
-        yield from collectors.of_problems(self._reporter.counts())
-        yield from collectors.of_totals(self._registry.totals())
-        yield from collectors.of_durability(
-            self._persistence.written,
-            self._persistence.complete_ns,
-            owned=len(sessions),
+    def _figures(self) -> StreamFigures:
+        now_ns = time.monotonic_ns()
+        sessions, complete_ns = self._summaries(now_ns), self._persistence.complete_ns
+        return StreamFigures(
+            self._reporter,
+            self._registry.totals(),
+            sessions,
+            sessions[: self._settings.http_streams],
+            [session.density for actor in self._registry.actors() if (session := actor.session) is not None],
             standing_by=self._intake.standing_by,
-            now_ns=time.monotonic_ns(),
+            checkpoints=self._persistence.written,
+            checkpoint_age_s=None if complete_ns is None else max(0, now_ns - complete_ns) / SECOND,
         )
-        client = self.client()
-        yield from collectors.of_network(client.key_numbers.declared, linked=client.linked())
-        yield from collectors.of_sessions(sessions)
-        yield from collectors.of_densities(densities)
-        yield from collectors.of_streams(sessions, self._settings.http_streams)

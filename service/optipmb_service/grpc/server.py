@@ -22,17 +22,15 @@ from optipmb_service.grpc import inputs, outputs
 from optipmb_service.grpc.access import Access, credentials
 from optipmb_service.grpc.calls import Call, CallerGoneError, EndCall, ending_with_caller
 from optipmb_service.grpc.network import Network
-from optipmb_service.observability.problem_reporter import ProblemReporter, log_problem
 from optipmb_service.runtime.ports import EdgeError, TransportError
+from optipmb_service.telemetry.problem_reporter import ProblemReporter, log_problem
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Iterator
+    from collections.abc import Awaitable, Callable, Iterator
 
-    from optipmb_service.observability.metrics import Value
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
 
-    AddFigures = Callable[[Callable[[], Iterable[Value]]], None]
     Context = grpc.aio.ServicerContext[Any, Any]
 
 SERVICE: Final = pb.DESCRIPTOR.services_by_name["TrackingService"].full_name
@@ -95,21 +93,6 @@ class CallMetrics:
         self.refused: collections.Counter[str] = collections.Counter()
         self.request_bytes = 0
         self.invalid = 0
-
-    def figures(self) -> Iterator[Value]:
-        """Return all counts as metrics."""
-        for name, counts in (
-            ("grpc_open_calls", self.open),
-            ("grpc_requests_total", self.requests),
-            ("grpc_responses_total", self.responses),
-            ("grpc_skipped_total", self.skipped),
-            ("grpc_refused_total", self.refused),
-        ):
-            for label, count in dict(counts).items():
-                yield name, (label,), count
-        for labels, count in dict(self.ended).items():
-            yield "grpc_calls_total", labels, count
-        yield "grpc_invalid_total", (), self.invalid
 
 
 class Server:
@@ -271,7 +254,7 @@ class Server:
 
 
 @contextlib.contextmanager
-def serving(settings: Settings, client: Client, add: AddFigures) -> Iterator[None]:
+def serving(settings: Settings, client: Client) -> Iterator[CallMetrics]:
     """Serve meanwhile, on a thread with a loop of its own: neither side waits for the other.
 
     Raises:
@@ -289,9 +272,8 @@ def serving(settings: Settings, client: Client, add: AddFigures) -> Iterator[Non
     server: Server | None = None
     try:
         server = asyncio.run_coroutine_threadsafe(begin(), loop).result()
-        add(server.metrics.figures)
         log.info("grpc", address=server.address)
-        yield
+        yield server.metrics
     finally:
         if server is not None:
             with contextlib.suppress(TimeoutError):

@@ -17,7 +17,7 @@ from optipmb_service.session.values import SECOND, Incarnation
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
 MAX_LIVES: Final = 65_536
 """Streams without a session whose past is remembered."""

@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
     import optipmb
     from optipmb_service.cluster.member import Member
-    from optipmb_service.observability.metrics import Metrics
-    from optipmb_service.observability.problem_reporter import ProblemReporter
     from optipmb_service.runtime.byte_budget import ByteBudget
     from optipmb_service.runtime.missed_frames import MissedFrames
     from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.ports import Caches, MessageSink, Packet
     from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
     from optipmb_service.session.values import Incarnation
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.metrics import Metrics
+    from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 PARTS: Final = 4
 """What a stream's memory is divided into: mailbox, clouds, frames held, window."""

@@ -14,7 +14,7 @@ from optipmb_service.runtime.ports import TransportError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from optipmb_service.cluster.log_reader import LogReader
+    from optipmb_service.cluster.message_log import LogReader
 
 MOST: Final = 256
 """Frames of an answer, unless more have one stamp."""

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
     import optipmb_schemas as schemas
 
-    from optipmb_service.cluster.log_reader import LogReader
-    from optipmb_service.cluster.message_log import LogMessage
+    from optipmb_service.cluster.message_log import LogMessage, LogReader
     from optipmb_service.runtime.fusion import Fusion
     from optipmb_service.session.checkpoint import Checkpoint
 

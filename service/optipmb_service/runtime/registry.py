@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from optipmb_service.cluster.member import Member
-    from optipmb_service.observability.metrics import Metrics
-    from optipmb_service.observability.problem_reporter import ProblemReporter
     from optipmb_service.runtime.missed_frames import MissedFrames
     from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.ports import Caches, MessageSink, Packet
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.runtime.scheduler import Scheduler
     from optipmb_service.session.values import Incarnation
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
+    from optipmb_service.telemetry.metrics import Metrics
+    from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 RIVAL_LEASES: Final = 3
 """Leases for which the token of an instance may stay whose stream has been taken over."""

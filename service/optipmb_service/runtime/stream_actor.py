@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import structlog
 
-from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.awaited_caches import AwaitedCaches
 from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.missed_frames import LogCheck
@@ -31,6 +30,7 @@ from optipmb_service.runtime.stream_outputs import StreamOutputs
 from optipmb_service.runtime.stream_sensors import StreamSensors
 from optipmb_service.runtime.stream_tracking import StreamTracking
 from optipmb_service.session.checkpoint import forgotten
+from optipmb_service.telemetry.stream_meter import StreamMeter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence

@@ -14,10 +14,10 @@ from optipmb_service.session.values import Begun, Quarantined, Tracked
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from optipmb_service.observability.stream_meter import StreamMeter
     from optipmb_service.runtime.context import ActorContext
     from optipmb_service.session.session import Session
     from optipmb_service.session.values import Output
+    from optipmb_service.telemetry.stream_meter import StreamMeter
 
 log = structlog.get_logger("optipmb_service")
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.session.values import MAX_SENSORS
+from optipmb_service.telemetry.stream_meter import StreamMeter
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from optipmb_service.runtime.actor_table import ActorTable
     from optipmb_service.runtime.rivals import Rivals
     from optipmb_service.runtime.untracked import UntrackedMessages
-    from optipmb_service.settings.model import Settings
+    from optipmb_service.settings import Settings
 
     Report = Callable[[str, str, str, str], None]
 

@@ -15,10 +15,10 @@ from optipmb_service.runtime.ports import TransportError
 from optipmb_service.session.values import SECOND
 
 if TYPE_CHECKING:
-    from optipmb_service.observability.metrics import Metrics
-    from optipmb_service.observability.stream_meter import StreamMeter
     from optipmb_service.runtime.ports import MessageSink, Publisher
     from optipmb_service.session.values import Tracked
+    from optipmb_service.telemetry.metrics import Metrics
+    from optipmb_service.telemetry.stream_meter import StreamMeter
 
 log = structlog.get_logger("optipmb_service")
 

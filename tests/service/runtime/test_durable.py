@@ -15,8 +15,8 @@ import pytest
 import zenoh.ext
 from lease_log import Alone
 from optipmb_schemas import Keys, ServiceStatus, SessionState, encode
-from optipmb_service.app.clustering import STORE_FILE
-from optipmb_service.app.ending import longest_end_s
+from optipmb_service.app.lifecycle import longest_end_s
+from optipmb_service.app.storage import STORE_FILE
 from optipmb_service.cluster.leases import ALIVE, member_key
 from optipmb_service.cluster.sqlite import SqliteStore
 from optipmb_service.cluster.store import StoreError, Write

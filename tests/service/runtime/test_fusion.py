@@ -19,7 +19,7 @@ from optipmb_service.runtime.ports import Packet
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import SECOND, Policy
-from optipmb_service.settings.loading import SettingsInvalidError, load
+from optipmb_service.settings import SettingsInvalidError, load
 from router import Node, Sensor, until
 from sessions import Merged, tracks
 

@@ -24,11 +24,10 @@ from optipmb_schemas import (
     encode,
     encoding_of,
 )
-from optipmb_service.app.clustering import STORE_FILE
+from optipmb_service.app.storage import STORE_FILE
 from optipmb_service.cluster.leases import PARTITIONS
 from optipmb_service.cluster.member import Member
 from optipmb_service.cluster.sqlite import SqliteStore
-from optipmb_service.observability.health import ProcessHealth
 from optipmb_service.runtime import persistence, stream_queries
 from optipmb_service.runtime.byte_budget import ByteBudget
 from optipmb_service.runtime.mailbox import Mailbox
@@ -38,7 +37,9 @@ from optipmb_service.runtime.ports import PACKET_BYTES, Packet
 from optipmb_service.runtime.takeover_buffer import TakeoverBuffer
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import MAX_COUNT, SECOND
-from optipmb_service.settings.tables import LimitSettings
+from optipmb_service.settings import LimitSettings
+from optipmb_service.telemetry.health import ProcessHealth
+from optipmb_service.telemetry.metrics import Metrics
 from router import Node, Sensor, until
 
 import optipmb
@@ -209,7 +210,7 @@ def test_a_tracking_thread_that_is_stuck_is_not_healthy(start: Callable[..., Any
             return self._tracker.step(density, frame)
 
     service, endpoint = start(tracker=Stuck, stuck_s=1.0)
-    health = ProcessHealth("test")
+    health = ProcessHealth("test", Metrics())
     health.report(service)
     with Node(endpoint) as node:
         node.send(CARELESS.detections(0))

@@ -17,8 +17,7 @@ from nats_process import NatsProcess
 from optipmb_client import Connection, ServiceRefused, ServiceUnavailable, kept_tracks
 from optipmb_client.table_files import read_table
 from optipmb_schemas import Keys, Limits, Tracks, TracksRequest, decode, encode, encoding_of
-from optipmb_service.cluster.log_reader import LogReader
-from optipmb_service.cluster.message_log import MessageLog
+from optipmb_service.cluster.message_log import LogReader, MessageLog
 from optipmb_service.runtime import track_query
 from optipmb_service.runtime.kept_tracks import LATE_NS, LoggedTracks, RecentTracks, TracksRange
 from router import Node, Sensor, plain, until

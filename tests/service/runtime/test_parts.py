@@ -10,17 +10,15 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.observability.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
-from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.mailbox import Mailbox
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.scheduler import Scheduler
 from optipmb_service.session.pending import CloudBuffer
 from optipmb_service.session.problems import problem_of
-from optipmb_service.settings.loading import SettingsInvalidError, load
-from optipmb_service.settings.model import Settings
-from optipmb_service.settings.tables import LimitSettings
+from optipmb_service.settings import SettingsInvalidError, load
+from optipmb_service.telemetry.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
+from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Sensor
 
 import optipmb
@@ -357,12 +355,6 @@ def test_router_or_client() -> None:
     assert (router.is_router, router.endpoints) == (True, ("tcp/127.0.0.1:7447",))
     assert (client.is_router, client.endpoints) == (False, ())
     assert (both.is_router, both.endpoints) == (True, ("tcp/127.0.0.1:7447",))
-
-
-def test_every_setting_is_described() -> None:
-    """No setting without a word on what it does."""
-    for model in (Settings, LimitSettings):
-        assert all(field.description for field in model.model_fields.values())
 
 
 def test_streams_of_a_profile_share_a_tracker() -> None:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from hypothesis import given
 from hypothesis import strategies as st
 from optipmb_schemas import Keys
-from optipmb_service.observability.stream_meter import StreamMeter
 from optipmb_service.runtime.quotas import Quota, Quotas, victim_of
+from optipmb_service.telemetry.stream_meter import StreamMeter
 from router import SECOND, Node, Sensor, until
 
 if TYPE_CHECKING:
