@@ -17,6 +17,7 @@ there is one set of rules and one set of errors. Tests hold the messages of both
 
 import json
 import re
+import struct
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +25,6 @@ from functools import cache, lru_cache
 from itertools import accumulate, chain, pairwise
 from math import prod
 from operator import attrgetter
-from struct import unpack
 from typing import Annotated, Any, Final, Literal, TypeVar, get_type_hints
 
 import msgpack
@@ -571,18 +571,12 @@ MOST_BYTES: Final = 2**16
 MOST_NUMBERS: Final = 2**13
 """Numbers of a message up to which the ranges of all columns are compared at once."""
 
-_MOST_LABELS: Final = 256
-_MOST_TEXT: Final = 2000
-_MOST_VALUES: Final = 1000
-_MOST_DEPTH: Final = 4
-"""Bytes of a text, values and levels of lists and maps that no valid message in this form exceeds."""
-
 _TypedDict: Any = TypedDict  # made of types that are not known before
 _PARTS: Final[frozenset[type[Message]]] = frozenset({Pose, FieldOfView})
 """Messages inside others that have required float64 arrays of fixed lengths and closed ranges alone."""
 _LITTLE: Final = sys.byteorder == "little"
 _BOUNDS: Final = ("ge", "gt", "le", "lt")
-REFUSED: Final = (msgspec.MsgspecError, ValueError, TypeError, LookupError, RecursionError)
+REFUSED: Final = (msgspec.MsgspecError, ValueError, TypeError, LookupError, RecursionError, struct.error)
 """Errors of a payload that is not valid, or not in this form."""
 
 
@@ -606,7 +600,7 @@ def _struct_of(kind: type[Message]) -> Any:
     hints |= {name: _block_of(array.dtype, len(array.shape)) for name, array in kind.arrays.items()}
     hints |= {name: _struct_of(inner) for name, inner in kind.nested.items()}
     if "labels" in hints:
-        hints["labels"] = Annotated[tuple[str, ...], msgspec.Meta(max_length=_MOST_LABELS)]
+        hints["labels"] = Annotated[tuple[str, ...], msgspec.Meta(max_length=DEFAULT.max_labels)]
     fields: list[Any] = []
     for name in kind.names:
         if name in kind.names_required:
@@ -663,8 +657,8 @@ def _part(kind: type[Message], *data: bytes) -> Message:
     """Return a message of a few arrays of their bytes."""
     arrays = {}
     for (name, described), numbers in zip(kind.arrays.items(), data, strict=True):
-        _need(len(numbers) == 8 * int(described.shape[0]))
-        _need(all(described.low <= one <= described.high for one in unpack(f"<{described.shape[0]}d", numbers)))
+        values = struct.unpack(f"<{described.shape[0]}d", numbers)
+        _need(all(described.low <= one <= described.high for one in values))
         arrays[name] = np.frombuffer(numbers)
     for name, check in _checks_of(kind):
         check(arrays[name])
@@ -890,7 +884,7 @@ def read_columns(payload: bytes, kind: type[T], limits: Limits) -> T | None:
     of floats. Where it would copy a large payload, `_is_encoding` compares the payload without them.
     """
     builder: Any = _BUILDERS.get(kind)
-    if np is None or builder is None or not (_LITTLE and (limits.at_least_default or _is_generous(limits))):
+    if np is None or builder is None or not (_LITTLE and limits.has_usual_structure):
         return None
     try:
         fields = DECODERS[kind](payload)
@@ -910,12 +904,3 @@ def read_columns(payload: bytes, kind: type[T], limits: Limits) -> T | None:
 def _arrays_of(message: Message) -> list[Numeric]:
     values = message.__dict__
     return [value for name in message.arrays if (value := values[name]) is not None]
-
-
-def _is_generous(limits: Limits) -> bool:
-    return (
-        limits.max_text >= _MOST_TEXT
-        and limits.max_values >= _MOST_VALUES
-        and limits.max_depth >= _MOST_DEPTH
-        and limits.max_labels >= DEFAULT.max_labels
-    )

@@ -4,7 +4,7 @@ The defaults carry the largest LiDAR clouds in use with room to spare, and keep 
 take in the tens of megabytes. A message above a limit is answered by a `too_large` problem that names it.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Final
 
@@ -21,6 +21,9 @@ _DIMENSIONS: Final = {
     "H": "max_horizons",
     "C": "max_labels",
 }
+
+
+_STRUCTURE: Final = ("max_text", "max_values", "max_depth", "max_labels")
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,11 @@ class Limits:
     def at_least_default(self) -> bool:
         """Whether no limit is below the default."""
         return all(getattr(self, f.name) >= f.default for f in fields(self))
+
+    @cached_property
+    def has_usual_structure(self) -> bool:
+        """Whether none of texts, values, nesting and labels is below the default."""
+        return replace(DEFAULT, **{name: getattr(self, name) for name in _STRUCTURE}).at_least_default
 
     def described(self) -> list[tuple[str, int, str]]:
         """Return name, value and meaning of every limit, for people."""
