@@ -512,7 +512,7 @@ def _block(array: Numeric, dtype: str) -> dict[str, Any]:
 
 
 def _large_head(name: str, dtype: str, shape: tuple[int, ...], offset: int) -> bytes:
-    """Return all before the data of a large array, a field of a message that lies at `offset`: so they are aligned."""
+    """Return the bytes before the data of a large array whose field begins at `offset`, with the padding."""
     before, after = _large_parts(name, dtype, shape)
     padding = -(offset + len(before) + 2 + len(after)) % ALIGNMENT
     return before + b"\xc4" + bytes((padding, *bytes(padding))) + after
@@ -523,7 +523,7 @@ def _large_head(name: str, dtype: str, shape: tuple[int, ...], offset: int) -> b
 
 @lru_cache(4096)
 def _small_head(kind: type[Message], name: str, shape: tuple[int, ...]) -> tuple[bytes, int]:
-    """Return all before the data of an array of a message, nothing if it is large; and how many bytes both have."""
+    """Return the bytes before the data of an array, none if it is large, and the length of both."""
     dtype = kind.arrays[name].dtype
     size = prod(shape) * DTYPES[dtype]
     if size >= LARGE:
@@ -536,7 +536,7 @@ def _small_head(kind: type[Message], name: str, shape: tuple[int, ...]) -> tuple
 def _column_heads(
     kind: type[Message], names: tuple[str, ...], size: int, offset: int
 ) -> tuple[tuple[bytes, ...], tuple[slice, ...]]:
-    """Return what stands before the data of each of some arrays, and where in these data each one lies, in bytes.
+    """Return the bytes before the data of each array, and the place of each in the data of all, in bytes.
 
     Args:
         kind: type of the message.
@@ -557,7 +557,7 @@ def _column_heads(
 
 @lru_cache(1024)
 def _large_parts(name: str, dtype: str, shape: tuple[int, ...]) -> tuple[bytes, bytes]:
-    """Return what stands before the padding of a large array, and what between it and the data."""
+    """Return the bytes before the padding of a large array, and those between it and the data."""
     pack, size = _msgpack.packb, prod(shape) * DTYPES[dtype]
     before = pack(name) + b"\x84" + b"".join(map(pack, ("dtype", dtype, "shape", shape, "pad")))
     return before, pack("data") + b"\xc6" + size.to_bytes(4, "big")
@@ -589,7 +589,7 @@ def _block_of(dtype: str, dimensions: int) -> Any:
 
 
 _ABSENT: Final = _block_of("f8", 1)("f8", None, b"")
-"""In the place of an array that is absent."""
+"""Block of an array that is absent."""
 
 
 @cache
@@ -635,7 +635,7 @@ def _scalars_of(kind: type[Message]) -> tuple[str, ...]:
 
 @cache
 def _checker_of(kind: type[Message]) -> Callable[[dict[str, Any]], dict[str, Any]]:
-    """Return what checks the scalars of a message as its model does."""
+    """Return the validator of the scalars of a message, by the rules of its model."""
     hints = get_type_hints(kind, include_extras=True)
     scalars = {name: hints[name] for name in _scalars_of(kind)}
     return TypeAdapter(_TypedDict(kind.__name__, scalars, total=False)).validate_python
@@ -725,9 +725,9 @@ class _Columns:
 
     Attributes:
         dtype: their number type.
-        order: which of the arrays they are.
-        places: name, place and shape of each, None for one dimension, and whether rows of it may be unknown.
-        known: how many numbers must be within their bounds.
+        order: numbers of the arrays.
+        places: name, place and shape of each (None: one dimension), and whether its rows may be unknown.
+        known: count of the numbers that must be within their bounds; rows of the others may be unknown.
         low, high: bounds of each number.
     """
 
@@ -791,13 +791,13 @@ class _Column:
 
 @dataclass(slots=True)
 class _Plan:
-    """How arrays of some shapes are read.
+    """Reading plan for the arrays of a message, by their shapes.
 
     Attributes:
-        names: those that are there.
-        sizes: bytes of all.
+        names: arrays that are present.
+        sizes: bytes of each array, 0 of an absent one.
         lengths: symbolic dimensions.
-        columns: those of each number type, or every one for itself.
+        columns: columns of one number type together, or single ones.
         is_usual: whether they are within the default limits.
     """
 
@@ -815,9 +815,9 @@ class _Plan:
         return all(length <= limits.rows(letter) for letter, length in self.lengths)
 
 
-@lru_cache(64)
+@lru_cache(128)
 def _plan_of(kind: type[Message], shapes: tuple[tuple[int, ...] | None, ...]) -> _Plan:
-    """Return how arrays of these shapes are read, None where one is absent. Raises ValueError: no message has them."""
+    """Return the plan for arrays of these shapes, None for an absent one. Raises ValueError: no message has them."""
     lengths: dict[str, int] = {}
     arrays = []
     for at, ((name, described), shape) in enumerate(zip(kind.arrays.items(), shapes, strict=True)):
@@ -847,7 +847,7 @@ def _least(described: Array) -> Any:
 
 
 def _values_of(names: Sequence[str]) -> Callable[[Any], tuple[Any, ...]]:
-    """Return what returns the values of some attributes."""
+    """Return a getter of some attributes, as a tuple."""
     if len(names) > 1:
         return attrgetter(*names)
     return lambda fields: tuple([attrgetter(name)(fields) for name in names])
