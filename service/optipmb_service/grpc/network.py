@@ -248,10 +248,12 @@ class Network:
         Raises:
             TransportError: the network cannot be used.
         """
-        messages = await asyncio.to_thread(self._client.recent, key, HISTORY_S)
-        return await asyncio.to_thread(
-            lambda: [tracks for one in messages if (tracks := self._tracks(one)) is not None]
-        )
+
+        def read() -> list[EncodedTracks]:
+            messages = self._client.recent(key, HISTORY_S)
+            return [tracks for one in messages if (tracks := self._tracks(one)) is not None]
+
+        return await asyncio.to_thread(read)
 
     def _receive(self, feed: _Feed, message: Message) -> None:
         """Take a message on the thread of its subscription."""
