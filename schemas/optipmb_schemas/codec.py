@@ -390,10 +390,19 @@ def _read_block(block: dict[str, Any], description: Array, limits: Limits) -> Nu
 _SMALL_MAP: Final = 16
 """Fields from which on the head of a map has three bytes."""
 
-_BUFFER: Final = 2048
-"""Bytes for fields that are no arrays, which it grows beyond. The default would be 256 KiB, new for each message."""
-
 _PLAIN: Final = frozenset({str, bytes, int, float, bool})  # what msgpack takes as it is
+
+
+def _scalar(value: Any) -> Any:
+    """Return a number or text of a subclass, such as numpy's float64, as what it is."""
+    kinds: tuple[Any, ...] = (float, str, bytes, int)
+    for kind in kinds:
+        if isinstance(value, kind):
+            return kind(value)
+    raise TypeError(f"no plain value: {type(value).__name__}")
+
+
+_encoder: Final = msgspec.msgpack.Encoder(enc_hook=_scalar)
 
 
 def encode(message: Message, **others: Any) -> bytes:
@@ -422,15 +431,14 @@ def _is_encoding(payload: bytes, message: Message) -> bool:
 def _parts(kind: type[Message], values: dict[str, Any]) -> list[Any]:
     """Return the encoding in parts, bytes and arrays."""
     fields = [(name, value) for name in kind.names if (value := values[name]) is not None]
-    packer = _msgpack.Packer(buf_size=_BUFFER)
-    parts: list[Any] = [packer.pack_map_header(len(fields))]
+    parts: list[Any] = [_head(len(fields))]
     offset, plain = len(parts[0]), {}
     for name, value in fields:
         if type(value) is not ARRAY:
             plain[name] = value if type(value) in _PLAIN else _plain(value, blocks=True)
             continue
         if plain:
-            parts.append(_without_head(packer.pack(plain), len(plain)))
+            parts.append(_without_head(plain))
             offset += len(parts[-1])
             plain = {}
         head, length = _small_head(kind, name, value.shape)
@@ -440,7 +448,7 @@ def _parts(kind: type[Message], values: dict[str, Any]) -> list[Any]:
         parts += head, value
         offset += length
     if plain:
-        parts.append(_without_head(packer.pack(plain), len(plain)))
+        parts.append(_without_head(plain))
     return parts
 
 
@@ -456,12 +464,10 @@ def encode_columns(
         columns: of float64, the numbers of all arrays as their bytes.
         others: the fields behind the arrays, likewise; a message in one as its fields.
     """
-    packer = _msgpack.Packer(buf_size=_BUFFER)
-    parts: list[Any] = [packer.pack_map_header(len(header) + len(names) + len(others))]
-    parts.append(_without_head(packer.pack(header), len(header)))
+    parts: list[Any] = [_head(len(header) + len(names) + len(others)), _without_head(header)]
     heads, places = _column_heads(kind, names, columns.size, (len(parts[0]) + len(parts[1])) % ALIGNMENT)
     parts += chain.from_iterable(zip(heads, map(numeric.memory_of(columns).__getitem__, places), strict=True))
-    parts.append(_without_head(packer.pack(others), len(others)))
+    parts.append(_without_head(others))
     return b"".join(parts)
 
 
@@ -471,9 +477,14 @@ def encoded(message: Message) -> bytes:
     return encode(message) if kept is None else kept
 
 
-def _without_head(packed: bytes, count: int) -> bytes:
-    """Return the fields of a packed map of so many without the head that says how many."""
-    return packed[1 if count < _SMALL_MAP else 3 :]
+def _head(count: int) -> bytes:
+    """Return the head of a map."""
+    return bytes([0x80 | count]) if count < _SMALL_MAP else b"\xde" + count.to_bytes(2, "big")
+
+
+def _without_head(fields: dict[str, Any]) -> bytes:
+    """Return the fields of a map as msgpack, without its head."""
+    return _encoder.encode(fields)[len(_head(len(fields))) :]
 
 
 def encode_json(message: Message) -> bytes:
@@ -866,13 +877,11 @@ DECODERS: Final[dict[type[Message], Callable[[bytes], Any]]] = {
 
 _BUILDERS: Final = {kind: _Builder(kind) for kind in DECODERS}
 
-_encoder: Final = msgspec.msgpack.Encoder()
-
 
 def _encode(fields: Any) -> bytes:
     """Return a struct as msgpack, whose head msgspec makes of three bytes where the type has 16 fields."""
     again = _encoder.encode(fields)
-    return again if again[:2] != b"\xde\0" or again[2] >= _SMALL_MAP else bytes([0x80 | again[2]]) + again[3:]
+    return again if again[:2] != b"\xde\0" or again[2] >= _SMALL_MAP else _head(again[2]) + again[3:]
 
 
 def read_columns(payload: bytes, kind: type[T], limits: Limits) -> T | None:
