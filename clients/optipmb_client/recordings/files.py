@@ -18,7 +18,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from optipmb_schemas import Detections, Message, MessageError, Points, Problem, SessionParameters, Tracks, decode
 from optipmb_schemas.codec import MAJOR
 from optipmb_schemas.export import schema_of
-from optipmb_schemas.fields import check_stream
+from optipmb_schemas.model import check_stream
 
 from optipmb_client.files import DatasetError
 from optipmb_client.foxglove_view import FoxgloveMessages, Shown

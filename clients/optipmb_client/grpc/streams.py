@@ -1,20 +1,24 @@
-"""One stream on its way to a gateway: kept for the next one when it goes."""
+"""A stream on its way to a gateway, and the tracks of a pattern on their way back: resumed at the next when it goes."""
 
 import collections
 import itertools
 import threading
+import time
 from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from dataclasses import dataclass, field
+from typing import Any, Final, TypeVar
 
-import grpc
-from optipmb_schemas import Message
+from optipmb_schemas import Keys, Message
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_client.errors import ClientError, ConnectionFailed
-from optipmb_client.grpc.channels import FIRST_PAUSE_S, LONGEST_PAUSE_S, Channels, lasting, refused
+from optipmb_client.grpc.channels import Channels, ResumedCall
+from optipmb_client.incoming import Arrival, Inbox
 
-__all__ = ["GrpcSender", "Publishing"]
+__all__ = ["GrpcSender", "GrpcSubscription", "Publishing"]
+
+T = TypeVar("T", bound=Message)
 
 CLOSE_S: Final = 5.0
 CLOUDS: Final = 4
@@ -25,7 +29,7 @@ WAITING_BYTES: Final = 64 * 2**20
 _Numbered = tuple[int, bytes]
 
 
-class Publishing:
+class Publishing(ResumedCall):
     """The detections and clouds of one stream in a `Publish` call, opened anew at the next gateway when it fails.
 
     The newest messages are kept and sent again then: nobody knows which of them the old gateway had passed on, and
@@ -44,9 +48,9 @@ class Publishing:
     """
 
     def __init__(self, channels: Channels, stream: str, cache: int, cache_clouds: int, timeout: float) -> None:
+        super().__init__(channels, "Publish", f"publish {stream}")
         options = pb.PublishOptions(stream=stream, cache=cache, cache_clouds=cache_clouds)
         self._options = pb.PublishRequest(options=options).SerializeToString()
-        self._channels = channels
         self._waiting = {"detections": _Waiting(max(cache, 1)), "points": _Waiting(CLOUDS)}
         self._kept: dict[str, collections.deque[_Numbered]] = {
             "detections": collections.deque(maxlen=max(cache, 1)),
@@ -59,11 +63,8 @@ class Publishing:
         self._closing = False
         self._opened = False
         self._senders = 2
-        self._call: Any = None
-        self._over = threading.Event()
         self.points_wanted = self._keeps_clouds
         self.error: ClientError | None = None
-        self._thread = threading.Thread(target=self._run, name=f"publish {stream}", daemon=True)
         self._thread.start()
         with self._changed:
             self._changed.wait_for(lambda: self._opened or self.error is not None, timeout)
@@ -96,39 +97,21 @@ class Publishing:
             self._closing = True
             self._changed.notify_all()
         self._thread.join(CLOSE_S)
-        self._over.set()
-        if self._call is not None:
-            self._call.cancel()
+        self._cancel()
 
-    def _run(self) -> None:
-        pause = FIRST_PAUSE_S
-        while not self._over.is_set():
-            channel: Any = None
-            try:
-                method, channel = self._channels.call("Publish")
-                self._call = method(self._requests(), metadata=self._channels.metadata)
-                for response in self._call:
-                    pause = FIRST_PAUSE_S
-                    self._take(pb.PublishResponse.FromString(response))
-                if self._closing:
-                    return
-            except grpc.RpcError as error:
-                if lasting(error):
-                    self._fail(refused(error))
-                    return
-            except (ConnectionFailed, ValueError) as error:  # the connection, or the channel, was closed
-                self._fail(ConnectionFailed(str(error)))
-                return
-            self._channels.failed(channel)
-            self._over.wait(pause)
-            pause = min(2 * pause, LONGEST_PAUSE_S)
-
-    def _take(self, response: pb.PublishResponse) -> None:
-        if response.WhichOneof("response") == "acknowledgement":
+    def _take(self, response: bytes) -> None:
+        said = pb.PublishResponse.FromString(response)
+        if said.WhichOneof("response") == "acknowledgement":
             with self._changed:
-                self.points_wanted = self._keeps_clouds or response.acknowledgement.points_wanted
+                self.points_wanted = self._keeps_clouds or said.acknowledgement.points_wanted
                 self._opened = True
                 self._changed.notify_all()
+
+    def _began(self) -> None:
+        """Wait for the first acknowledgement."""
+
+    def _is_done(self) -> bool:
+        return self._closing
 
     def _fail(self, error: ClientError) -> None:
         with self._changed:
@@ -223,3 +206,86 @@ class GrpcSender:
         if not self._closed:
             self._closed = True
             self._publishing.release()
+
+
+QUEUE: Final = 1024
+"""Messages of a stream that may wait in the gateway: the most that it allows."""
+
+
+@dataclass(frozen=True)
+class _ProtoArrival(Arrival):
+    """A message that came in protobuf."""
+
+    proto: Any = field(kw_only=True)
+
+    def read(self, kind: type[T]) -> T:
+        """Return the message, checked.
+
+        Raises:
+            MessageError: it is not valid.
+        """
+        return convert.from_proto(self.proto, kind)
+
+
+class GrpcSubscription(ResumedCall):
+    """A `Subscribe` call, made anew when it ends; what the services keep comes first each time.
+
+    Args:
+        channels: to gateways.
+        pattern: of streams.
+        inbox: for what comes.
+        keys: of the network, for the names of arrivals.
+        problems: whether problems come too.
+        timeout: seconds to wait until it is in force.
+
+    Raises:
+        ConnectionFailed: it is not in force in time.
+        ServiceRefused: the gateway does not allow it.
+    """
+
+    def __init__(
+        self, channels: Channels, pattern: str, inbox: Inbox, keys: Keys, *, problems: bool, timeout: float
+    ) -> None:
+        super().__init__(channels, "Subscribe", f"subscribe {pattern}")
+        request = pb.SubscribeRequest(pattern=pattern, queue=QUEUE, history=True, problems=problems)
+        self._request = request.SerializeToString()
+        self._inbox = inbox
+        self._keys = keys
+        self._settled = threading.Event()
+        self._error: ClientError | None = None
+        self._thread.start()
+        if not self._settled.wait(timeout):
+            self._error = ConnectionFailed(f"no gRPC gateway took the subscription within {timeout:g} s")
+        if self._error is not None:
+            self.close()
+            raise self._error
+
+    def close(self) -> None:
+        """End it; what is in the inbox stays readable."""
+        self._cancel()
+        self._thread.join(CLOSE_S)
+
+    def _requests(self) -> Iterator[bytes]:
+        return iter((self._request,))
+
+    def _began(self) -> None:
+        self._call.initial_metadata()  # it is in force
+        if self._call.is_active():
+            self._settled.set()
+
+    def _is_done(self) -> bool:
+        return False
+
+    def _fail(self, error: ClientError) -> None:
+        self._error = error
+        self._settled.set()
+        if not self._over.is_set():
+            self._inbox.close()  # nothing will come any more
+
+    def _take(self, response: bytes) -> None:
+        said = pb.SubscribeResponse.FromString(response)
+        self._inbox.dropped += said.skipped
+        tracks = said.WhichOneof("response") == "tracks"
+        proto = said.tracks if tracks else said.problem
+        key = self._keys.tracks(proto.stream) if tracks else self._keys.problems(proto.stream)
+        self._inbox.put(_ProtoArrival(key, b"", "application/protobuf", time.monotonic_ns(), proto=proto))
