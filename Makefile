@@ -140,7 +140,7 @@ repeat:
 
 schemas: $(VENV)/.installed
 	$(BIN)/python -m optipmb_schemas.export --check --page docs/messages.md schemas/json
-	$(BIN)/python docs/reference.py --check docs/operation.md
+	$(BIN)/python docs/reference.py --check docs/reference.md
 
 wheel: kernels
 	sh tests/wheel.sh $(PYTHON) $(BIN)
@@ -159,7 +159,7 @@ $(DOCS)/.installed: pyproject.toml
 	touch $@
 
 docs: $(DOCS)/.installed
-	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
 	@echo "the site is in out/site"
 
 # Everything that a release needs, up to publishing.

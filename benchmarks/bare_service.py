@@ -55,7 +55,7 @@ class Frames:
     def take(self, sample: zenoh.Sample) -> None:
         """Take detections."""
         self._waiting.append(sample.payload.to_bytes())
-        self._scheduler.submit(self)
+        self._scheduler.submit(self.work)
 
     def work(self) -> bool:
         """Answer a frame."""

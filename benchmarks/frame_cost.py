@@ -23,14 +23,10 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
-from optipmb_client.load import generated
-from optipmb_client.load.material import FIRST, head, message
+from optipmb_client.load import FIRST, generated, head, message
 from optipmb_service.app.worker import warm_up
-from optipmb_service.runtime.persistence import NoPersistence
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
-from optipmb_service.runtime.registry import Registry
-from optipmb_service.runtime.stream_actor import StreamActor
 from optipmb_service.runtime.track_publisher import TrackPublisher
 from optipmb_service.session import convert
 from optipmb_service.session.session import Session
@@ -99,7 +95,7 @@ class Network:
         """Run the actors until none has anything to do."""
         while self.waiting:
             actor = self.waiting.pop(0)
-            if actor.work():
+            if (actor if callable(actor) else actor.work)():
                 self.waiting.append(actor)
 
     def holds(self, stream: str) -> bool:
@@ -161,11 +157,16 @@ def measured(objects: int, points: int) -> dict[str, float]:
     warm_up()
     parts = Parts()
     network: Any = Network()  # in the place of several parts
-    decoding = first_of("runtime.stream_tracking", "runtime.stream_actor")
+    decoding = first_of("runtime.stream", "runtime.stream_tracking", "runtime.stream_actor")
+    table, persistence = first_of("runtime.streams", "runtime.registry"), first_of("runtime.persistence")
+    streams_type = getattr(table, "Streams", None) or table.Registry
+    turn_of = first_of("runtime.stream", "runtime.stream_actor")
+    nothing: Any = None
     encode_checkpoint = first_of("session.checkpoint_codec", "session.checkpoint").encode_checkpoint
     for part, owner, name in (
-        ("handing over", Registry, "frame"),
-        ("handing over", Registry, "cloud"),
+        ("handing over", streams_type, "receive"),
+        ("handing over", streams_type, "frame"),
+        ("handing over", streams_type, "cloud"),
         ("decoding", decoding, "message_of"),
         ("session", Session, "on_detections"),
         ("session", Session, "on_points"),
@@ -177,38 +178,44 @@ def measured(objects: int, points: int) -> dict[str, float]:
         ("metrics", Metrics, "received"),
         ("metrics", Metrics, "published"),
         ("metrics", Metrics, "tracks"),
-        ("actor", StreamActor, "work"),
+        ("actor", getattr(turn_of, "Stream", None) or turn_of.StreamActor, "work"),
     ):
         if hasattr(owner, name):
             setattr(owner, name, parts.time(part, getattr(owner, name)))
-    # What another checkout may not have yet.
-    newer: dict[str, Any] = {}
-    with contextlib.suppress(ModuleNotFoundError):
-        newer["missed"] = import_module("optipmb_service.runtime.missed_frames").NoLog()
-    registry = Registry(
+    # Another checkout may have other parts.
+    if hasattr(streams_type, "receive"):
+        writer = persistence.CheckpointWriter(nothing, 1.0, network, off="")
+        others = {"open_publisher": network.open_publisher, "checkpoints": writer, "log": None}
+    else:
+        others = {"sink": network, "persistence": persistence.NoPersistence()}
+        with contextlib.suppress(ModuleNotFoundError):
+            others["missed"] = import_module("optipmb_service.runtime.missed_frames").NoLog()
+    streams = streams_type(
         first_of("settings.model", "settings").Settings(instance="cost", store="none"),
         Profiles.read("nuscenes", {}),
-        sink=network,
         reporter=ProblemReporter(network.publish_problem, lambda *_: None),
         scheduler=network,
         member=network,
-        persistence=NoPersistence(),
         arm=lambda *_: None,
         metrics=Metrics(),
-        **newer,
+        **others,
     )
     rows: list[dict[str, float]] = []
     checkpoints: list[float] = []
     for k, frame in enumerate(packets(objects, points)):
         for packet in frame:
-            (registry.frame if packet.key.endswith("detections") else registry.cloud)(packet)
+            if hasattr(streams, "receive"):
+                streams.receive(packet)
+            else:
+                (streams.frame if packet.key.endswith("detections") else streams.cloud)(packet)
         network.run()
         row = parts.taken()
         if k >= WARM:
             rows.append(row)
-            if k % CHECKPOINT_EVERY == 0 and (actor := registry.actor(STREAM)) is not None and actor.session:
+            if k % CHECKPOINT_EVERY == 0:
+                session = (streams.of if hasattr(streams, "of") else streams.actor)(STREAM).session
                 began_ns = time.thread_time_ns()
-                encode_checkpoint(actor.session.snapshot())
+                encode_checkpoint(session.snapshot())
                 checkpoints.append((time.thread_time_ns() - began_ns) / 1e3 / CHECKPOINT_EVERY)
     if network.published != WARM + FRAMES or network.problems:
         raise RuntimeError(f"{network.published} frames were answered, {network.problems[:1]}")

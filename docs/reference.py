@@ -1,7 +1,7 @@
-"""The tables of `docs/operation.md`, made from the code that they describe.
+"""The tables of `docs/reference.md`, made from the code that they describe.
 
-python docs/reference.py docs/operation.md            write them
-python docs/reference.py --check docs/operation.md    status 1 when they are not current
+python docs/reference.py docs/reference.md            write them
+python docs/reference.py --check docs/reference.md    status 1 when they are not current
 """
 
 from __future__ import annotations

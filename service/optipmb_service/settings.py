@@ -4,7 +4,7 @@ A TOML file, over it the environment, over that the options of the command line.
 and the name in capitals, nested names after ``__`` (``OPTIPMB_LIMITS__MAX_BYTES``); lists are written with commas
 there, tables as JSON.
 
-Times are in seconds. Every setting is described by its docstring, which `docs/operation.md` prints.
+Times are in seconds. Every setting is described by its docstring, which `docs/reference.md` prints.
 """
 
 from __future__ import annotations

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import result_of, run_here
-from optipmb_client.child import ServiceProcess
 from optipmb_client.datasets import open_dataset
-from optipmb_client.mcap_files.writing import RecordingWriter
 from optipmb_client.offline import track_whole
+from optipmb_client.recordings.files import RecordingWriter
+from optipmb_client.service_process import ServiceProcess
 from optipmb_schemas import PATHS, Detections, Keys, encode, encoding_of
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Tracked

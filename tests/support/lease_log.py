@@ -113,7 +113,7 @@ class MemoryLeases:
             raise StoreError("cut off")
 
 
-class Alone:
+class Alone(Member):
     """Leases of all partitions, for the checkpoints of a store that nobody else uses.
 
     Args:

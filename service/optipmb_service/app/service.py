@@ -1,6 +1,6 @@
 """A service on the network: every part of it, put together, started and ended in order.
 
-Messages go from a thread of the network to a stream's mailbox to the tracking thread.
+Messages go from a thread of the network to a stream's backlog to the tracking thread.
 
 Start: open Zenoh, subscribe, answer queries, say alive. End: withdraw the alive token, let other members take the
 streams over, stop receiving, track what was received as long as the grace lasts, close.
@@ -22,14 +22,12 @@ from optipmb_service.app.lifecycle import CLOSE_S, HANDOVER_S, LAST_S, Deadline,
 from optipmb_service.app.storage import open_log, open_store
 from optipmb_service.cluster.member import Member
 from optipmb_service.runtime.intake import Intake
-from optipmb_service.runtime.kept_tracks import RecentTracks
-from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter, NoPersistence
+from optipmb_service.runtime.kept_tracks import TrackQuery
+from optipmb_service.runtime.persistence import DAY_S, CheckpointWriter
 from optipmb_service.runtime.ports import TransportError
-from optipmb_service.runtime.registry import Registry
+from optipmb_service.runtime.queries import ServiceQueries, StreamQueries, members_of
 from optipmb_service.runtime.scheduler import Scheduler
-from optipmb_service.runtime.service_queries import ServiceQueries, members_of
-from optipmb_service.runtime.stream_queries import StreamQueries
-from optipmb_service.runtime.track_query import TrackQuery
+from optipmb_service.runtime.streams import Streams
 from optipmb_service.session.problems import problem_of
 from optipmb_service.session.values import SECOND
 from optipmb_service.telemetry.health import Reporter
@@ -47,8 +45,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from optipmb_service.runtime.context import Actor
-    from optipmb_service.runtime.persistence import Persistence
     from optipmb_service.runtime.profiles import Profiles
     from optipmb_service.settings import Settings
     from optipmb_service.zenoh.client import Client
@@ -69,7 +65,7 @@ class Service(Reporter):
     Args:
         settings: what is in force.
         profiles: the parameters that can be had.
-        arm: has `StreamActor.wake` called at a monotonic time (ns).
+        arm: calls a function at a monotonic time (ns).
         tracker: makes the trackers of sessions; default: trackers bounded as the settings say.
         private: folder that the workers of one parent share; default: this process has no parent.
         metrics: what counts; its own by default.
@@ -83,7 +79,7 @@ class Service(Reporter):
         self,
         settings: Settings,
         profiles: Profiles,
-        arm: Callable[[Actor, int], None],
+        arm: Callable[[Callable[[], None], int], None],
         tracker: Callable[[optipmb.Parameters], Any] | None = None,
         private: Path | None = None,
         metrics: Metrics | None = None,
@@ -103,28 +99,25 @@ class Service(Reporter):
         self._reporter = ProblemReporter(self._transport.publish_problem, log_problem)
         self._scheduler = Scheduler()
         self._member = Member(settings.instance, store, settings.lease_s)
-        self._persistence: Persistence = (
-            CheckpointWriter(store, settings.checkpoint_s, self._member, self._unkept, settings.keep_days * DAY_S)
-            if keeps_nothing is None
-            else NoPersistence(keeps_nothing)
+        self._checkpoints = CheckpointWriter(
+            store, settings.checkpoint_s, self._member, self._unkept, settings.keep_days * DAY_S, keeps_nothing
         )
-        recent = RecentTracks(self._transport.recent_tracks, settings.limits.limits())
-        self._missed, logged = open_log(settings)
-        self._registry = Registry(
+        self._log = open_log(settings)
+        self._streams = Streams(
             settings,
             profiles,
-            sink=self._transport,
+            open_publisher=self._transport.open_publisher,
             reporter=self._reporter,
             scheduler=self._scheduler,
             member=self._member,
-            persistence=self._persistence,
-            missed=self._missed,
+            checkpoints=self._checkpoints,
+            log=self._log,
             arm=arm,
             metrics=self._metrics,
             tracker=tracker or profiles.trackers(partial(optipmb.Tracker, max_pairs=settings.max_pairs)),
         )
         self._intake = Intake(
-            self._registry,
+            self._streams,
             self._member,
             self._transport,
             standby=not settings.cluster,
@@ -133,15 +126,13 @@ class Service(Reporter):
         )
         self._metrics.add(PROBLEM_METRICS | STREAM_METRICS, self._figures)
         self._metrics.add(NETWORK_METRICS, self.client)
-        self._stream_queries = StreamQueries(
-            self._registry, TrackQuery([*logged, recent], settings.instance, settings.limits.limits())
-        )
+        tracks = TrackQuery(self._log, self._transport.recent_tracks, settings.instance, settings.limits.limits())
+        self._stream_queries = StreamQueries(self._streams, tracks)
         self._service_queries = ServiceQueries(
-            self._registry,
+            self._streams,
             status=self.status,
             metrics=self._metrics.text,
             samples=self._metrics.samples,
-            member=self._member,
             hand_over=self._intake.hand_over,
             workers=settings.workers,
         )
@@ -149,8 +140,8 @@ class Service(Reporter):
     def start(self, *, announce: bool = True) -> None:
         """Receive, answer, and say so."""
         self._transport.watch()
-        self._persistence.start(self._registry.keep)
-        self._member.start(self._intake.changed, self._registry.resume, self._registry.occupied, self.client().linked)
+        self._checkpoints.start(self._streams.keep)
+        self._member.start(self._intake.changed, self._streams.resume, self._streams.occupied, self.client().linked)
         self._intake.start()
         self._transport.serve(self._stream_queries.answer, self._service_queries.answer)
         self._state = "ready"
@@ -160,7 +151,7 @@ class Service(Reporter):
     def housekeeping(self) -> None:
         """Report silent streams and summaries of problems; to be called about once a second."""
         now_ns = time.monotonic_ns()
-        self._registry.sweep(now_ns)
+        self._streams.sweep(now_ns)
         self._transport.look_for_returned(self._report_returned)
         if now_ns >= self._name_checked_ns:
             self._name_checked_ns = now_ns + NAME_CHECK_NS
@@ -190,16 +181,17 @@ class Service(Reporter):
         grace = Deadline(grace_s)
         self._intake.close(JOIN_S)
         steps.do("receiving", partial(self._transport.stop, JOIN_S))
-        if not self._persistence.durable:
-            self._registry.finish()  # else what waits for its cloud comes again from the publishers' caches
-        while self._registry.busy and grace.left():
+        if not self._checkpoints.durable:
+            self._streams.finish()  # else what waits for its cloud comes again from the publishers' caches
+        while self._streams.busy and grace.left():
             time.sleep(DRAIN_POLL_S)
         ended = self._scheduler.close(JOIN_S)
         if ended:
-            self._registry.keep_now()
-        kept = self._persistence.close(max(SAVE_S, ends.left() - LEASES_S))
+            self._streams.keep_now()
+        kept = self._checkpoints.close(max(SAVE_S, ends.left() - LEASES_S))
         self._member.close(ends.left())
-        self._missed.close(JOIN_S)
+        if self._log is not None:
+            self._log.close(JOIN_S)
         self._reporter.flush(time.monotonic_ns())
         unfinished = steps.unfinished(ends.left())
         self._transport.close()
@@ -218,7 +210,7 @@ class Service(Reporter):
     @property
     def failure(self) -> str:
         """Why the state is `degraded`, `paused` or `unlinked`; empty while it is none of these."""
-        return self._member.failure or self.client().failure or self._persistence.failure
+        return self._member.failure or self.client().failure or self._checkpoints.failure
 
     @property
     def state(self) -> str:
@@ -235,12 +227,12 @@ class Service(Reporter):
             return "unlinked"
         if self._member.draining:
             return "draining"
-        return "degraded" if self._persistence.failure else "ready"
+        return "degraded" if self._checkpoints.failure else "ready"
 
     def status(self) -> schemas.ServiceStatus:
         """Return the answer to `q/status`."""
         now_ns = time.monotonic_ns()
-        totals = self._registry.totals()
+        totals = self._streams.totals()
         return schemas.ServiceStatus(
             instance=self._settings.instance,
             version=__version__,
@@ -262,7 +254,7 @@ class Service(Reporter):
 
     def tap(self, stream: str, receive: Callable[[str, bytes, str], None]) -> Callable[[], None]:
         """Hand over what comes on a stream to a viewer, until the result is called."""
-        return self._transport.tap(stream, receive, self._registry.fusion.seen_by(stream))
+        return self._transport.tap(stream, receive, self._streams.fusion.seen_by(stream))
 
     def client(self) -> Client:
         """Return what an edge in this process uses of the network."""
@@ -271,12 +263,12 @@ class Service(Reporter):
     def _summaries(self, now_ns: int) -> tuple[schemas.SessionSummary, ...]:
         """Return a line for each session; one that cannot be made is a problem of its stream alone."""
         summaries = []
-        for actor in self._registry.actors():
+        for stream in self._streams.tracking():
             try:
-                summary = actor.summary(now_ns)
+                summary = stream.summary(now_ns)
             except Exception as error:
-                log.exception("internal_error", stream=actor.stream)
-                self._internal("the line of a session in the status", actor.stream, f"{type(error).__name__}: {error}")
+                log.exception("internal_error", stream=stream.name)
+                self._internal("the line of a session in the status", stream.name, f"{type(error).__name__}: {error}")
             else:
                 summaries += [summary] if summary is not None else []
         return tuple(summaries)
@@ -320,14 +312,14 @@ class Service(Reporter):
 
     def _figures(self) -> StreamFigures:
         now_ns = time.monotonic_ns()
-        sessions, complete_ns = self._summaries(now_ns), self._persistence.complete_ns
+        sessions, complete_ns = self._summaries(now_ns), self._checkpoints.complete_ns
         return StreamFigures(
             self._reporter,
-            self._registry.totals(),
+            self._streams.totals(),
             sessions,
             sessions[: self._settings.http_streams],
-            [session.density for actor in self._registry.actors() if (session := actor.session) is not None],
+            [session.density for one in self._streams.tracking() if (session := one.session) is not None],
             standing_by=self._intake.standing_by,
-            checkpoints=self._persistence.written,
+            checkpoints=self._checkpoints.written,
             checkpoint_age_s=None if complete_ns is None else max(0, now_ns - complete_ns) / SECOND,
         )

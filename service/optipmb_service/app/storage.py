@@ -12,17 +12,14 @@ from optipmb_schemas import Keys
 from optipmb_service.cluster.leases import NOBODY, PARTITIONS, partition_key, partition_of
 from optipmb_service.cluster.sqlite import SqliteStore, in_use
 from optipmb_service.cluster.store import Fenced, StoreError, Write
-from optipmb_service.runtime.fusion import Fusion
-from optipmb_service.runtime.kept_tracks import LoggedTracks
-from optipmb_service.runtime.missed_frames import LoggedFrames, NoLog
 from optipmb_service.runtime.persistence import DAY_S
+from optipmb_service.runtime.profiles import Fusion
+from optipmb_service.runtime.recovery import Log
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from optipmb_service.cluster.store import LeaseStore
-    from optipmb_service.runtime.kept_tracks import KeptTracks
-    from optipmb_service.runtime.missed_frames import MissedFrames
     from optipmb_service.settings import Settings
 
 log = structlog.get_logger("optipmb_service")
@@ -158,11 +155,11 @@ def _reach(store: LeaseStore) -> None:
             return
 
 
-def open_log(settings: Settings) -> tuple[MissedFrames, list[KeptTracks]]:
-    """Return where frames are that a session has missed, and tracks: in the log, where there is a cluster."""
+def open_log(settings: Settings) -> Log | None:
+    """Return the log of frames and tracks, where there is a cluster."""
     if not settings.cluster:
-        return NoLog(), []
+        return None
     from optipmb_service.cluster.message_log import LogReader, MessageLog  # noqa: PLC0415 - an extra
 
     reader = LogReader(MessageLog(settings.cluster, settings.prefix, nats_access(settings)), settings.standby_s)
-    return LoggedFrames(reader, Keys(settings.prefix), Fusion(settings.fuse)), [LoggedTracks(reader)]
+    return Log(reader, Keys(settings.prefix), Fusion(settings.fuse))

@@ -34,8 +34,9 @@ from optipmb_service.settings import Settings
 from optipmb_service.telemetry import logs
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from optipmb_service.app.lifecycle import StopRequest
-    from optipmb_service.runtime.context import Actor
     from optipmb_service.telemetry.health import ProcessHealth
 
 log = structlog.get_logger("optipmb_service")
@@ -102,9 +103,9 @@ async def _serve(
     if parent is not None:
         parent.listen(asked)
 
-    def arm(actor: Actor, at_ns: int) -> None:
+    def arm(wake: Callable[[], None], at_ns: int) -> None:
         # The loop's time and the deadlines are one clock, the monotonic one.
-        loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, actor.wake)
+        loop.call_soon_threadsafe(loop.call_at, at_ns / 1e9, wake)
 
     await unless(asked, lambda: warm_up(private))
     if asked.is_set():

@@ -13,8 +13,8 @@ from optipmb_schemas import Keys
 from optipmb_service.cluster import message_log
 from optipmb_service.cluster.log_position import Missed, Position
 from optipmb_service.cluster.message_log import LogMessage, LogReader, MessageLog, Retention
-from optipmb_service.runtime.fusion import Fusion
-from optipmb_service.runtime.missed_frames import LoggedFrames
+from optipmb_service.runtime.profiles import Fusion
+from optipmb_service.runtime.recovery import Log
 from optipmb_service.session.checkpoint import forgotten
 from optipmb_service.session.session import Session
 from optipmb_service.session.values import Policy
@@ -114,7 +114,7 @@ def test_a_session_begins_whatever_the_log_says(filled: MessageLog, monkeypatch:
 
     found: list[Sequence[object]] = []
     monkeypatch.setattr(reader, "missed", Mock(side_effect=ValueError("a mistake")))
-    LoggedFrames(reader, Keys(), Fusion(())).fetch(STREAM, None, found.append, found.append)
+    Log(reader, Keys(), Fusion(())).fetch(STREAM, None, found.append, found.append)
     assert found == [[]]
 
 
@@ -129,7 +129,7 @@ def test_what_was_closed_does_not_come_back(filled: MessageLog) -> None:
         found.append(packets)
         came.set()
 
-    frames = LoggedFrames(LogReader(filled, 600.0), Keys(), Fusion(("a/*/*",)))
+    frames = Log(LogReader(filled, 600.0), Keys(), Fusion(("a/*/*",)))
     for checkpoint in (None, closed):
         came.clear()
         frames.fetch("a/b/fused", checkpoint, take, lambda _: None)
