@@ -8,7 +8,7 @@ from evaluation_cases import parked, tracks_of, truth_of
 from optipmb_client.datasets import DatasetError, open_dataset
 from optipmb_client.evaluation.calibration import CalibrationResult, calibration, evaluate_calibration
 from optipmb_client.evaluation.cases import Rules
-from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
+from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
 from optipmb_client.geometry import Floats
 from optipmb_client.results.full import FullTable, full_path, read_full, write_full
 from optipmb_client.tracking import Tracking, track

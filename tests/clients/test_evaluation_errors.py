@@ -8,7 +8,7 @@ import pytest
 from optipmb_client.datasets import DataSequence, DetectionFrame, open_dataset
 from optipmb_client.evaluation.cases import Rules
 from optipmb_client.evaluation.errors import DIRECTIONS, ErrorResult, evaluate_errors
-from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
+from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
 from optipmb_client.tracking import Tracking, track
 
 import optipmb

@@ -27,7 +27,7 @@ FRAMES = 60
 @pytest.fixture(scope="module")
 def sequence() -> DataSequence:
     """A generated scene without clouds."""
-    (one,) = open_dataset("scene", frames=FRAMES, vehicles=10, clouds=False).sequences(["0000"])
+    (one,) = open_dataset("scene", frames=FRAMES, vehicles=10, clouds=False, seed=4).sequences(["0000"])
     return one
 
 

@@ -88,7 +88,6 @@ def sweep(
     The parameter is changed in the classes named, by default in all that are labelled.
     """
     from optipmb_client import tuning  # noqa: PLC0415  loads the tracker and its compiler
-    from optipmb_client.tuning.picture import write_sweep  # noqa: PLC0415  as above
 
     wanted = [_values(text) for text in parameter or FIGURE_5]
     opened = data.open()
@@ -100,7 +99,7 @@ def sweep(
         found = [next(rows) for _ in values]
         own = {label: tuning.value_of(parameters, label, path) for label in source.classes}
         tried = [tuning.value_of(row.variant.parameters, source.classes[0], path) for row in found]
-        figures = {label: [one.to_json() for one in each] for label, each in _by_class(found)}
+        figures = {label: [tuning.plain_figures(one) for one in each] for label, each in _by_class(found)}
         swept.append({"parameter": path, "profile": own, "values": tried, "figures": figures})
         for label, each in [] if as_json else _by_class(found):
             now = f" (profile: {own[label]})" if label in own else ""
@@ -109,7 +108,7 @@ def sweep(
     result = _head("sweep", opened, name) | {"sweeps": swept}
     if out is not None:
         picture = find_spec("matplotlib") is not None
-        write_sweep(out, result, picture=picture)
+        tuning.write_sweep(out, result, picture=picture)
         if not picture:
             warn(str(to_install("matplotlib", "sweep.png")))
     report(result, *([] if out is None else [f"figures in {out}"]), as_json=as_json)
@@ -146,8 +145,9 @@ def _by_class(rows: "Many[Row]") -> "list[tuple[str, list[Figures]]]":
 
 def cells_of(figures: "Figures", names: "Many[str]") -> list[str]:
     """Return figures as the cells of a table."""
-    values = [figures.to_json()[name] for name in names]
-    return ["-" if one is None else str(int(one)) if one == int(one) else f"{one:.4f}" for one in values]
+    from optipmb_client.evaluation.figures import number  # noqa: PLC0415  as above
+
+    return [number(figures[name]) for name in names]
 
 
 def _print_rows(title: str, columns: "Many[str]", cells: "Many[Many[str]]", *, marked: int | None = None) -> None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from optipmb_client.evaluation import ClassResult, Rules
-    from optipmb_client.evaluation.figures import ClassFigures
+    from optipmb_client.evaluation.evaluate import ClassFigures
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,8 +133,13 @@ def _evaluated(
 ) -> _Evaluated:
     from optipmb_client.commands.tables import clear_table, figure_tables, nuscenes_table  # noqa: PLC0415  as above
     from optipmb_client.evaluation import evaluate_files  # noqa: PLC0415  as above
-    from optipmb_client.evaluation.figures import Settings, class_average  # noqa: PLC0415  as above
-    from optipmb_client.evaluation.jobs import Evaluation, FiguresTask, figures_of  # noqa: PLC0415  as above
+    from optipmb_client.evaluation.evaluate import (  # noqa: PLC0415  as above
+        Evaluation,
+        FiguresTask,
+        Settings,
+        class_average,
+        figures_of,
+    )
     from optipmb_client.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
 
     asked = opened.dataset.arguments

@@ -1,6 +1,7 @@
 """`optipmb tune`: from detections and labels to a parameter profile."""
 
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -193,17 +194,16 @@ def _report(refined: "Refined") -> Group:
     for fold in refined.folds:
         figures.add_row(f"without {' '.join(fold.sequences)}: before", *cells_of(fold.before[0], SHOWN))
         figures.add_row(f"without {' '.join(fold.sequences)}: after", *cells_of(fold.after[0], SHOWN))
-    evidence = _table("changed", "from", "to", "gain", "+-", "gains")
-    for one in refined.evidence:
+    changes = _table("changed", "from", "to", "gain", "+-", "gains")
+    for one in refined.changes:
         gains = f"{one.positive} of {one.groups}"
-        evidence.add_row(one.path, str(one.start), str(one.value), f"{one.gain:.5f}", f"{one.error:.5f}", gains)
+        changes.add_row(one.path, str(one.start), str(one.value), f"{one.gain:.5f}", f"{one.error:.5f}", gains)
     ranking = _table("tracks ranked by", refined.plan.metric, "gain", "+-", "sAMOTA", "AMOTA", "MOTA")
     for score in refined.ranking:
-        values = score.figures.to_json()
-        shown = (score.value, score.gain, score.error, *(values[name] for name in ("sAMOTA", "AMOTA", "MOTA")))
-        ranking.add_row(score.score, *(f"{value:.4f}" if value is not None else "-" for value in shown))
+        shown = (score.value, score.gain, score.error, *(score.figures[name] for name in ("sAMOTA", "AMOTA", "MOTA")))
+        ranking.add_row(score.score, *(f"{value:.4f}" if isfinite(value) else "-" for value in shown))
     return Group(
-        figures, Text(), evidence, Text(_objective(refined)), Text(), ranking, Text(_calibration(refined)), Text()
+        figures, Text(), changes, Text(_objective(refined)), Text(), ranking, Text(_calibration(refined)), Text()
     )
 
 

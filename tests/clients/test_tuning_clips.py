@@ -9,16 +9,14 @@ import pytest
 from optipmb_client import offline
 from optipmb_client.datasets import Dataset, open_dataset
 from optipmb_client.datasets.scene.lidar import Scan, scan
-from optipmb_client.evaluation.ab3dmot import ab3dmot_rules, evaluate_ab3dmot
-from optipmb_client.evaluation.cases import prepare
-from optipmb_client.evaluation.figures import evaluate_figures, load_recordings
-from optipmb_client.evaluation.nuscenes import evaluate_nuscenes, evaluate_scenes
-from optipmb_client.evaluation.nuscenes_scene import NuScenesConfig, prepare_scene
+from optipmb_client.evaluation.ab3dmot import evaluate_ab3dmot
+from optipmb_client.evaluation.cases import ab3dmot_rules, prepare
+from optipmb_client.evaluation.evaluate import evaluate_figures, load_recordings
+from optipmb_client.evaluation.nuscenes import NuScenesConfig, evaluate_nuscenes, evaluate_scenes, prepare_scene
 from optipmb_client.results.kitti import read_kitti_results
 from optipmb_client.tracking import Tracking, track
-from optipmb_client.tuning.degrade import Degradation, degrade
-from optipmb_client.tuning.folds import deal
-from optipmb_client.tuning.material import Clip, load, of_class, track_clip
+from optipmb_client.tuning.clips import Clip, Degradation, degrade, load, of_class, track_clip
+from optipmb_client.tuning.objective import folds_of
 from optipmb_client.tuning.scoring import rules_of, scorer_of
 from optipmb_client.tuning.values import only
 from real_data import kitti_root, nuscenes_root
@@ -99,19 +97,19 @@ def test_figures_of_kitti_are_those_of_its_result_files(tmp_path: Path) -> None:
             for clip in clips
         ]
         official = evaluate_ab3dmot(cases)
-        assert (found.fp, found.fn, found.ids, found.frag, found.gt) == (
+        assert (found["FP"], found["FN"], found["IDS"], found["FRAG"], found["GT"]) == (
             official.best.false,
             official.best.missed,
             official.best.switches,
             official.best.fragments,
             official.best.truth,
         )
-        assert found.samota == pytest.approx(official.samota, abs=1e-6)
-        assert found.amota == pytest.approx(official.amota, abs=1e-6)
-        assert found.motp == pytest.approx(official.best.motp, abs=1e-4) or official.best.true > 0
+        assert found["sAMOTA"] == pytest.approx(official.samota, abs=1e-6)
+        assert found["AMOTA"] == pytest.approx(official.amota, abs=1e-6)
+        assert found["MOTP"] == pytest.approx(official.best.motp, abs=1e-4) or official.best.true > 0
         (figures,) = evaluate_figures("kitti", load_recordings("kitti", sequences, tmp_path), [name])
         if figures.best is not None:
-            assert found.hota == pytest.approx(figures.best.hota.hota, abs=1e-6)
+            assert found["HOTA"] == pytest.approx(figures.best.hota.hota, abs=1e-6)
 
 
 def test_figures_of_nuscenes_are_the_official_ones_of_its_result_file(tmp_path: Path) -> None:
@@ -133,9 +131,9 @@ def test_figures_of_nuscenes_are_the_official_ones_of_its_result_file(tmp_path: 
             (official, 1e-4),  # a threshold between two scores moves with their last digits
         ):
             wanted = scores.classes[name]
-            assert found.amota == pytest.approx(wanted.amota, abs=rounding)
-            assert found.mota == pytest.approx(wanted.best.mota, abs=rounding)
-            assert (found.fp, found.fn, found.ids) == (wanted.best.fp, wanted.best.fn, wanted.best.ids)
+            assert found["AMOTA"] == pytest.approx(wanted.amota, abs=rounding)
+            assert found["MOTA"] == pytest.approx(wanted.best.mota, abs=rounding)
+            assert (found["FP"], found["FN"], found["IDS"]) == (wanted.best.fp, wanted.best.fn, wanted.best.ids)
 
 
 def test_degraded_detections_are_a_matter_of_the_seed() -> None:
@@ -166,9 +164,9 @@ def test_degraded_detections_are_as_much_worse_as_asked() -> None:
 def test_groups_are_even_and_leave_out_what_has_no_truth() -> None:
     """Every sequence with truth is in one group; groups weigh about the same; too few sequences make no groups."""
     weights = [100, 0, 50, 49, 30, 21, 3]
-    groups = deal(weights, 3)
+    groups = folds_of(weights, 3)
     assert sorted(i for group in groups for i in group) == [0, 2, 3, 4, 5, 6]
     totals = [sum(weights[i] for i in group) for group in groups]
     assert max(totals) - min(totals) <= 30
-    assert deal([5, 0, 0], 3) == []
-    assert len(deal([5, 4], 3)) == 2
+    assert folds_of([5, 0, 0], 3) == []
+    assert len(folds_of([5, 4], 3)) == 2

@@ -1,9 +1,10 @@
-"""What tuning works on: the detections of one class, ready to be tracked any number of times, and the truth.
+"""Sequences in memory, ready to be tracked any number of times: detections of some classes, and their truth.
 
 Conventions: frames are in the world frame, made once by `optipmb.make_frame`; so are the tracks. The truth is in
 the sensor frame of each row's frame, where KITTI compares, and in the world frame.
 """
 
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -13,14 +14,15 @@ from optipmb import Frame, Modules, Parameters, Tracker, Tracks
 from optipmb_client.camera import Camera
 from optipmb_client.datasets import DataSequence, DatasetError, Truth
 from optipmb_client.evaluation import Rules
-from optipmb_client.geometry import Floats, Ints, stack_poses, to_sensor
+from optipmb_client.geometry import Floats, Ints, stack_poses, to_sensor, wrap_angle
 from optipmb_client.offline import tracker_frame
 from optipmb_client.results import ResultTable
 from optipmb_client.results.full import COLUMNS, FullTable
 from optipmb_client.results.kitti import LEAST_SHOWN
 from optipmb_client.results.rows import stacked
 
-__all__ = ["Clip", "load", "of_class", "track_clip", "track_fully"]
+_DETECTION_COLUMNS = ("center", "size", "yaw", "velocity", "score", "source", "position_covariance")
+_LEAST_SCORE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -87,14 +89,63 @@ def of_class(clip: Clip, name: str, rules: Rules) -> Clip:
     frames = []
     for frame in clip.frames:
         chosen = np.flatnonzero(frame.label == index)
-        columns = {key: column[chosen] for key in _COLUMNS if (column := getattr(frame, key)) is not None}
+        columns = {key: column[chosen] for key in _DETECTION_COLUMNS if (column := getattr(frame, key)) is not None}
         frames.append(replace(frame, label=np.zeros(len(chosen), dtype=np.int64), labels=(name,), **columns))
-    alike = (name, *rules.neighbours.get(name, ()))
-    rows = np.isin(clip.truth.names, alike)
+    rows = np.isin(clip.truth.names, (name, *rules.neighbours.get(name, ())))
     return replace(clip, labels=(name,), frames=tuple(frames), truth=clip.truth.take(rows), world=clip.world.take(rows))
 
 
-_COLUMNS = ("center", "size", "yaw", "velocity", "score", "source", "position_covariance")
+@dataclass(frozen=True)
+class Degradation:
+    """How much worse the detections of a degraded copy are."""
+
+    drop: float = 0.1
+    """Share of the detections that are lost."""
+    position: float = 0.1
+    """Standard deviation of the noise added to x and to y, m."""
+    heading: float = 0.05
+    """Of the noise added to the heading, rad."""
+    velocity: float = 0.2
+    """Of the noise added to each component of a known velocity, m/s."""
+    score: float = 0.5
+    """Of the noise added to the logit of the score."""
+
+
+def degrade(clip: Clip, degradation: Degradation, seed: int, copy: int = 0) -> Clip:
+    """Return a clip with worse detections; `copy` counts several copies of the same seed.
+
+    A detector is better on the sequences that it was trained on than anywhere else. The same seed and the same
+    detections give the same copy.
+    """
+    rng = np.random.Generator(np.random.PCG64([seed, copy, zlib.crc32("/".join((clip.name, *clip.labels)).encode())]))
+    return replace(clip, frames=tuple(_worse(frame, degradation, rng) for frame in clip.frames))
+
+
+def _worse(frame: Frame, degradation: Degradation, rng: np.random.Generator) -> Frame:
+    # Every number is drawn for every detection, so that one more of them changes no other.
+    count = len(frame.score)
+    kept = np.flatnonzero(rng.random(count) >= degradation.drop)
+    shift = degradation.position * rng.standard_normal((count, 2))
+    turn = degradation.heading * rng.standard_normal(count)
+    drift = degradation.velocity * rng.standard_normal((count, 2))
+    blur = degradation.score * rng.standard_normal(count)
+    center = frame.center.copy()
+    center[:, :2] += shift
+    with np.errstate(divide="ignore"):  # a score of one has the logit infinity and stays one
+        logit = np.log(frame.score) - np.log1p(-frame.score) + blur
+    score = np.clip(0.5 * (1.0 + np.tanh(0.5 * logit)), _LEAST_SCORE, 1.0)
+    return Frame(
+        stamp_ns=frame.stamp_ns,
+        center=center[kept],
+        size=frame.size[kept],
+        yaw=wrap_angle(frame.yaw + turn)[kept],
+        velocity=(frame.velocity + drift)[kept],
+        score=score[kept],
+        label=frame.label[kept],
+        source=frame.source[kept],
+        labels=frame.labels,
+        cloud=frame.cloud,
+    )
 
 
 def track_clip(
@@ -113,7 +164,7 @@ def track_clip(
 
 
 def track_fully(clip: Clip, parameters: Parameters) -> tuple[ResultTable, FullTable]:
-    """Return the tracks of a clip as `track_clip` does, and everything known of them."""
+    """Return the tracks of a clip as `track_clip` does, and all their columns."""
     found = list(_steps(clip, parameters, None, every_frame=False))
     table, parts = _table(clip, parameters, found), [tracks for _, tracks in found]
     return table, FullTable(table.labels, table.frame, *(stacked(parts, name) for name in COLUMNS))
@@ -143,9 +194,8 @@ def _table(clip: Clip, parameters: Parameters, found: Sequence[tuple[int, Tracks
     identity, label, center, size, yaw, score = (
         stacked(parts, name) for name in ("id", "label", "center", "size", "yaw", "score")
     )
-    if clip.camera is None or not parts:
-        image = np.full((len(when), 4), np.nan)
-    else:
+    image = np.full((len(when), 4), np.nan)
+    if clip.camera is not None and parts:
         local, turned = to_sensor(clip.rotation[when], clip.translation[when], center, yaw)
         image = clip.camera.boxes(local, size, turned, LEAST_SHOWN)[0]  # as the result files have it
     return ResultTable(parameters.labels, when, identity, label, center, size, yaw, score, image)
