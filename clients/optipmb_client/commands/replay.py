@@ -44,10 +44,11 @@ def replay(
     chosen_pace = pace.pace()
     opened = data.open()
     name = how.profile or opened.dataset.profile
+    if how.profile == "auto":
+        raise UsageError("--profile: one that the service knows, such as generic; auto is made for offline tracking")
     if name == "auto":
-        raise UsageError(
-            "--profile: one that the service knows; auto is made for offline tracking (see: optipmb profiles)"
-        )
+        name = "generic"
+        warn("profile generic, which is auto at 10 Hz (--profile NAME, see: optipmb profiles)")
     replaying = Replaying(name, chosen_pace, how.classes or (), streams, service.prefix, how.full)
     with (
         closing(linked(service.connect, config=service.config, timeout=pace.wait)) as connection,

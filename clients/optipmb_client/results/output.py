@@ -3,11 +3,11 @@
 A table has one row per track and frame, in the world frame, in order of frames and, in a frame, of ids. Columns: those
 that name the recording and the time in the table of detections (for other data sets `sequence` and `stamp_ns`), then
 frame (its number in the table of detections, or else counted from 0), id, class, x, y, z, l, w, h, yaw, vx, vy,
-yaw_rate, acceleration, score, existence, age, time_since_detection and detection_row: the row of the table (from 0; for
-other data sets the place in the frame) of the detection that the track was given, no value while it is missed. A
-velocity has no value until it is known: from the second detection on, where the detector gives none. On request the
-upper triangle of the covariance of (x, y, v, phi, omega, a) follows, `cov_x_x` to `cov_a_a`. Metres, seconds, radians.
-The same tracks always give the same bytes.
+yaw_rate, acceleration, score, existence, confirmed (1 or 0), age, time_since_detection and detection_row: the row of
+the table (from 0; for other data sets the place in the frame) of the detection that the track was given, no value while
+it is missed. A velocity has no value until it is known: from the second detection on, where the detector gives none. On
+request the upper triangle of the covariance of (x, y, v, phi, omega, a) follows, `cov_x_x` to `cov_a_a`. Metres,
+seconds, radians. The same tracks always give the same bytes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,6 +23,8 @@ from optipmb_client.results.rows import stacked
 from optipmb_client.table_files import Columns, is_table, write_table
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from optipmb_client.datasets.interface import DataSequence, Dataset
 
 _STATE: Final = ("x", "y", "v", "phi", "omega", "a")
@@ -62,6 +64,7 @@ def track_columns(
     columns["yaw"] = stacked(parts, "yaw")
     columns |= dict(zip(("vx", "vy"), np.where(unknown[:, None], np.nan, velocity).T, strict=True))
     columns |= {name: stacked(parts, name) for name in ("yaw_rate", "acceleration", "score", "existence")}
+    columns["confirmed"] = np.concatenate([np.empty(0, np.int64), *map(_confirmed, parts)])
     columns |= {"age": age, "time_since_detection": unseen}
     detection: list[float] = []
     for index, part in zip(order, parts, strict=True):
@@ -73,6 +76,11 @@ def track_columns(
         covariance = stacked(parts, "covariance")
         columns |= {name: covariance[:, i, j] for name, (i, j) in COVARIANCE.items()}
     return columns
+
+
+def _confirmed(tracks: Tracks) -> "NDArray[np.int64]":
+    """Return which tracks are confirmed, 1 or 0: all, where the service does not tell."""
+    return np.ones(len(tracks.id), np.int64) if tracks.confirmed is None else np.asarray(tracks.confirmed, np.int64)
 
 
 def join(parts: Sequence[Columns]) -> Columns:

@@ -237,7 +237,7 @@ class Streams:
 
     def _command(self, session: str, command: Callable[[Stream], None], *, urgent: bool, limited: bool = True) -> bool:
         while (stream := self._streams.get(session) or self._stream(session, limited=limited)) is not None:
-            if stream.backlog.command(lambda one=stream: command(one), urgent=urgent):  # type: ignore[misc]  # bound now
+            if stream.backlog.command(partial(command, stream), urgent=urgent):
                 return True
             self._forget_closed(session)
         return False
@@ -543,7 +543,7 @@ class Streams:
         with self._lock:
             self._past += MessageCounters(received=frames, shed=frames, clouds_shed=len(lost) - frames)
         expected = "room for what waits for its session, for two minutes at most"
-        self._report("shed", session, expected, f"{len(lost)} more; the oldest were dropped")
+        self._report("shed", session, expected, f"{len(lost)} more; the oldest were dropped", len(lost))
 
     def _refuse(self, packet: Packet, code: str, stream: str, expected: str, received: str) -> None:
         with self._lock:
@@ -551,7 +551,7 @@ class Streams:
             self._past += MessageCounters(received=frame, refused=frame, clouds_refused=not frame)
         self._report(code, stream, expected, received)
 
-    def _report(self, code: str, stream: str, expected: str, received: str) -> None:
+    def _report(self, code: str, stream: str, expected: str, received: str, count: int = 1) -> None:
         problem = problem_of(
             code,
             stream=stream,
@@ -560,6 +560,7 @@ class Streams:
             expected=expected,
             received=received,
             message=f"Key: expected {expected}, received {received}.",
+            count=count,
         )
         self.reporter.report(problem, time.monotonic_ns())
 

@@ -41,7 +41,7 @@ OPTIONS: Final = (
 )
 GAP: Final = 1.5
 SPARSE: Final = 1.5
-_WRITTEN: Final = frozenset({"existence", "age", "time_since_detection", "detection_row"})
+_WRITTEN: Final = frozenset({"existence", "confirmed", "age", "time_since_detection", "detection_row"})
 """Columns by which a table of tracks that OptiPMB wrote is known."""
 _HEAD: Final = 4096
 _UNITS: Final = {"yaw": "radians", "heading": "x", "sizes": "lwh", "axes": "z-up"}
