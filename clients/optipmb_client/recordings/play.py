@@ -48,21 +48,13 @@ class PlayedStream:
 
 @dataclass(frozen=True)
 class Playing:
-    """How a recording is played.
-
-    Attributes:
-        pace: How fast.
-        site: Streams are played as `<site>-<their site>/...`, so that they meet no session; None: as recorded.
-        profile: Profile; default: the recorded one.
-        prefix: First part of all keys.
-        on_frame: Called when the tracks of a frame have come back.
-    """
+    """How a recording is played."""
 
     pace: Pace
-    site: str | None
-    profile: str | None = None
-    prefix: str = PREFIX
-    on_frame: Callable[[], None] = lambda: None
+    site: str | None  # streams are played as `<site>-<their site>/...` and meet no session; None: as recorded
+    profile: str | None = None  # default: the recorded one
+    prefix: str = PREFIX  # first part of all keys
+    on_frame: Callable[[], None] = lambda: None  # called when the tracks of a frame have come back
 
 
 def choose(recording: Iterable[Recorded], streams: Iterable[str] = ()) -> dict[str, StreamPlan]:
