@@ -24,16 +24,11 @@ from typing import TYPE_CHECKING, Any
 
 import optipmb_schemas as schemas
 from optipmb_client.load import generated
-from optipmb_client.load.material import FIRST, head, message
-from optipmb_service.app.worker import warm_up
 from optipmb_service.runtime.ports import Packet
 from optipmb_service.runtime.profiles import Profiles
 from optipmb_service.runtime.track_publisher import TrackPublisher
 from optipmb_service.session import convert
 from optipmb_service.session.session import Session
-from optipmb_service.telemetry import logs
-from optipmb_service.telemetry.metrics import Metrics
-from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 import optipmb
 
@@ -128,8 +123,9 @@ class Network:
 def packets(objects: int, points: int) -> Iterator[list[Packet]]:
     """Yield the messages of each frame, its cloud first."""
     frames, keys = generated(objects, points, RATE_HZ), schemas.Keys()
+    load = first_of("load.material", "load", package="optipmb_client")
     for k in range(WARM + FRAMES):
-        begins = head(STREAM, bytes(16), FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
+        begins = load.head(STREAM, bytes(16), load.FIRST + k, 10**18 + round(k * 1e9 / RATE_HZ))
         made = []
         detections, cloud = frames.detections[k % len(frames)], frames.clouds[k % len(frames)]
         bodies = (
@@ -138,24 +134,26 @@ def packets(objects: int, points: int) -> Iterator[list[Packet]]:
         )
         for body, key, kind in bodies:
             if body is not None:
-                payload = message(body, begins)
+                payload = load.message(body, begins)
                 encoding = schemas.encoding_of(kind)
                 made.append(Packet(key, payload, len(payload), encoding, time.time_ns(), time.monotonic_ns()))
         yield made
 
 
-def first_of(*modules: str) -> Any:
-    """Return the first of these modules of the service that the checkout has: an earlier one has it all in another."""
+def first_of(*modules: str, package: str = "optipmb_service") -> Any:
+    """Return the first of these modules of a package that the checkout has: an earlier one has it all in another."""
     for module in modules:
         with contextlib.suppress(ModuleNotFoundError):
-            return import_module(f"optipmb_service.{module}")
+            return import_module(f"{package}.{module}")
     raise ModuleNotFoundError(modules[-1])
 
 
 def measured(objects: int, points: int) -> dict[str, float]:
     """Return the median microseconds of each part of a frame."""
-    logs.configure("console", "error")
-    warm_up()
+    first_of("telemetry.logs", "observability.logs").configure("console", "error")
+    first_of("app.kernels", "app.worker").warm_up()
+    metrics = first_of("telemetry.metrics", "observability.metrics").Metrics
+    reporter = first_of("telemetry.problem_reporter", "observability.problem_reporter").ProblemReporter
     parts = Parts()
     network: Any = Network()  # in the place of several parts
     decoding = first_of("runtime.stream", "runtime.stream_tracking", "runtime.stream_actor")
@@ -176,9 +174,9 @@ def measured(objects: int, points: int) -> dict[str, float]:
         ("conversion", convert, "tracks_of"),
         ("step", optipmb.Tracker, "step"),
         ("publishing", TrackPublisher, "send"),
-        ("metrics", Metrics, "received"),
-        ("metrics", Metrics, "published"),
-        ("metrics", Metrics, "tracks"),
+        ("metrics", metrics, "received"),
+        ("metrics", metrics, "published"),
+        ("metrics", metrics, "tracks"),
         ("actor", getattr(turn_of, "Stream", None) or turn_of.StreamActor, "work"),
     ):
         if hasattr(owner, name):
@@ -194,11 +192,11 @@ def measured(objects: int, points: int) -> dict[str, float]:
     streams = streams_type(
         first_of("settings.model", "settings").Settings(instance="cost", store="none"),
         Profiles.read("nuscenes", {}),
-        reporter=ProblemReporter(network.publish_problem, lambda *_: None),
+        reporter=reporter(network.publish_problem, lambda *_: None),
         scheduler=network,
         member=network,
         arm=lambda *_: None,
-        metrics=Metrics(),
+        metrics=metrics(),
         **others,
     )
     rows: list[dict[str, float]] = []

@@ -31,7 +31,7 @@ __all__ = [
     "kept_tracks",
 ]
 
-# Imported on first use: offline commands need no Zenoh, and the service no publisher.
+# Imported on first use: offline commands need no Zenoh.
 _MODULES = {
     "errors": ("ClientError", "ConnectionFailed", "ServiceRefused", "ServiceUnavailable", "UsageError"),
     "publisher": ("Publisher",),

@@ -24,7 +24,7 @@ from optipmb_schemas.arrays import ArrayLike, numeric
 from optipmb_client.links import Link, linked
 
 if TYPE_CHECKING:
-    from optipmb_client.grpc.publishing import GrpcSender
+    from optipmb_client.grpc.streams import GrpcSender
     from optipmb_client.zenoh.handles import Sender
 
 __all__ = ["Publisher"]

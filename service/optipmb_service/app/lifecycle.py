@@ -344,7 +344,7 @@ def grpc_edge(settings: Settings, client: Client, metrics: Metrics) -> Iterator[
         yield
         return
     try:
-        from optipmb_service.grpc.beside import serving  # noqa: PLC0415 - an extra that only this needs
+        from optipmb_service.grpc.server import serving  # noqa: PLC0415 - an extra that only this needs
     except ModuleNotFoundError as error:
         raise EdgeError(f"gRPC needs {error.name}, which is not installed: {install_command('grpc')}") from error
     with serving(settings, client) as calls:

@@ -129,14 +129,14 @@ class Stream:
 
     def tell(self, command: Callable[[Stream], None]) -> None:
         """Run a command before all that waits."""
-        self.backlog.command(lambda: command(self), urgent=True)
+        self.backlog.command(partial(command, self), urgent=True)
 
     def ask(self, command: Callable[[Stream], None], *, create: bool) -> None:
         """Call `command` as soon as no session is about to begin or end; with `create`, one begins if there is none."""
         if create and self.session is None and not self._busy and self._member.holds(self.name):
             self._open()
         if self._busy:
-            self._asking.append(lambda: self.ask(command, create=create))
+            self._asking.append(partial(self.ask, command, create=create))
         else:
             self._guard(command, self)
 
