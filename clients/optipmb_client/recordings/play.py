@@ -19,7 +19,7 @@ from optipmb_client.replay import CLOUD_WAIT_S, Exchange, Pace, await_wanted
 from optipmb_client.results.output import Latency, latency
 from optipmb_client.sessions import close_session, session_state, set_parameters
 from optipmb_client.zenoh import Connection
-from optipmb_client.zenoh.sender import Sender
+from optipmb_client.zenoh.handles import Sender
 
 
 @dataclass(frozen=True)

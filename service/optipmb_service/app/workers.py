@@ -37,7 +37,7 @@ from optipmb_service.runtime.profiles import Fusion
 from optipmb_service.runtime.queries import TEXT, UNDRAINED, drain_asked, guarded, move_asked
 from optipmb_service.telemetry.health import BEAT_S, Reporter
 from optipmb_service.telemetry.metrics import NETWORK_METRICS
-from optipmb_service.zenoh import Transport
+from optipmb_service.zenoh.transport import Transport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
