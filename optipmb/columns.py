@@ -27,7 +27,6 @@ from optipmb.density import (
     objects_in,
 )
 from optipmb.errors import DensityError
-from optipmb.frame import MAX_SPEED
 from optipmb.rows import Rows, shown
 
 if TYPE_CHECKING:
@@ -43,11 +42,11 @@ CLASSES: Final = "classes.probability"
 COUNTED: Final = "calibration"
 """Part of the names of `Density.self_calibration` among the columns."""
 
-SENSOR: Final = "sensor.motion"
-"""Name of `Density.sensor_motion` among the columns."""
+SENSOR: Final = "sensor"
+"""Name of `Density.sensor` among the columns."""
 
 MOST_COUNTED: Final = 1e9
-"""Bound of the counts of scores; those of the tracker are far below."""
+"""Bound of counts of scores, and of numbers of the sensor's motion; those of the tracker are far below."""
 
 ROUNDING: Final = 1e-6
 """By how much the sum of probabilities may differ from 1."""
@@ -110,8 +109,8 @@ def columns_of(density: Density) -> dict[str, NDArray[Any]]:
     }
     if density.self_calibration is not None:
         columns |= {f"{COUNTED}.{name}": getattr(density.self_calibration, name) for name in _shapes(0, 0, 0)}
-    if density.sensor_motion is not None:
-        columns |= {SENSOR: density.sensor_motion}
+    if density.sensor is not None:
+        columns |= {SENSOR: density.sensor}
     return columns if density.class_probability is None else columns | {CLASSES: density.class_probability}
 
 
@@ -140,8 +139,8 @@ def bytes_of(density: Density) -> dict[str, bytes]:
         parts |= {
             f"{COUNTED}.{name}": getattr(density.self_calibration, name).view(np.float64) for name in _shapes(0, 0, 0)
         }
-    if density.sensor_motion is not None:
-        parts[SENSOR] = density.sensor_motion
+    if density.sensor is not None:
+        parts[SENSOR] = density.sensor
     return {part: words.astype("<f8", copy=False).tobytes() for part, words in parts.items()}
 
 
@@ -167,7 +166,7 @@ def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[An
     if "classes" in parts:
         columns[CLASSES] = _words(parts, "classes", classes).reshape(-1, classes)
     if SENSOR in parts:
-        columns[SENSOR] = _words(parts, SENSOR, 3)
+        columns[SENSOR] = _words(parts, SENSOR, 5)
     if f"{COUNTED}.classes" in parts:
         for name, (shape, kind) in _shapes(0, 0, 0).items():
             width = prod(shape[1:]) * np.dtype(kind).itemsize // 8
@@ -242,8 +241,8 @@ def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: 
         own = _self_calibration(columns, _shapes(len(labels), len(bernoulli), len(poisson)))
     motion = columns.get(SENSOR)
     if motion is not None:
-        if not (isinstance(motion, np.ndarray) and motion.shape == (3,) and (np.abs(motion) <= MAX_SPEED).all()):
-            raise DensityError(SENSOR, f"(3,) finite numbers up to {MAX_SPEED:g}", shown(motion))
+        if not (isinstance(motion, np.ndarray) and motion.shape == (5,) and (np.abs(motion) <= MOST_COUNTED).all()):
+            raise DensityError(SENSOR, f"(5,) finite numbers up to {MOST_COUNTED:g}", shown(motion))
         motion = np.array(motion, np.float64)
     return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses, pi, own, motion)
 

@@ -181,6 +181,12 @@ SLOT: Final = BINS + 2
 NO_BIN: Final = -1
 
 
+ENOUGH: Final = 3.0
+"""Evidence for a motion of the sensor from which it is used, and"""
+LEAST_MOVED_S: Final = 0.25
+"""the time over which it has to be found before, s."""
+
+
 @record
 class SelfCalibration:
     """Counts of the detections of a stream by score.
@@ -222,8 +228,9 @@ class Density:
         class_probability: (N, C) posterior of each detected object over the classes (`optipmb.class_posterior`); None
             where the profile has no groups.
         self_calibration: counts of scores; None where the profile does not calibrate them itself.
-        sensor_motion: (3,) velocity, m/s, and turn rate, rad/s, with which what stands passes a sensor whose motion is
-            estimated (`optipmb.sensor_motion`); None where it is not: frames have poses, or the sensor stands.
+        sensor: (5,) velocity, m/s, and turn rate, rad/s, with which what stands passes a sensor without poses, the
+            evidence that it moves so, and the time over which that was found, s (`optipmb.sensor_motion`); None where
+            it stands or frames have poses.
     """
 
     stamp_ns: int
@@ -234,7 +241,15 @@ class Density:
     misses: Misses | None = None
     class_probability: NDArray[np.float64] | None = None
     self_calibration: SelfCalibration | None = None
-    sensor_motion: NDArray[np.float64] | None = None
+    sensor: NDArray[np.float64] | None = None
+
+    @property
+    def sensor_motion(self) -> NDArray[np.float64] | None:
+        """Velocity, m/s, and turn rate, rad/s, (3,) of `sensor`; None where the evidence is not enough to use them."""
+        sensor = self.sensor
+        if sensor is None or sensor[3] < ENOUGH or sensor[4] < LEAST_MOVED_S:
+            return None
+        return sensor[:3]
 
     @property
     def missed_from_ns(self) -> NDArray[np.int64]:

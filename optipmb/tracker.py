@@ -264,7 +264,7 @@ class Tracker:
         now, table, modules = frame.stamp_ns, self._table, self.modules
         dt = table.period if density.stamp_ns == NO_FRAME else (now - density.stamp_ns) * 1e-9
         if self.parameters.sensor_motion:
-            density = follow_sensor(density, frame)
+            density = follow_sensor(density, frame, self._table)
 
         # PMB prediction
         predicted, repaired = predict(density, now, table)
@@ -318,8 +318,8 @@ class Tracker:
             given = frame.score, frame.label, chosen
             own = followed(own, density, predicted, posterior, hits, fate, *given, table)
             posterior = replace(posterior, self_calibration=own)
-        if density.sensor_motion is not None:
-            posterior = replace(posterior, sensor_motion=density.sensor_motion)
+        if density.sensor is not None:
+            posterior = replace(posterior, sensor=density.sensor)
 
         # Track extraction
         tracks = extract(objects, posterior.missed_from_ns, hits, measurements, now, table, two_thresholds=modules.ote)

@@ -123,6 +123,7 @@ TWINS = {
     "sensor_motion._refine": "test_sensor_motion.test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins",
     "sensor_motion.common_motion": "test_sensor_motion.test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins",
     "sensor_motion.nearest": "test_sensor_motion.test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins",
+    "sensor_motion.sideways": "test_sensor_motion.test_sideways_is_the_least_distance_to_where_an_object_can_drive",
     "sensor_motion.together": "test_sensor_motion.test_the_motion_is_the_rigid_fit_of_the_pairs_it_joins",
     "tracker.update": "test_oracle.test_every_combination_of_modules_equals_algorithm_1",
     "undetected.with_births": "test_kernels.test_components_that_stay_and_those_that_are_born_stand_in_order",
