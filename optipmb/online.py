@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from optipmb.field_of_view import FieldOfView
     from optipmb.frame import PointCloud, Pose
     from optipmb.paths import PredictedPaths
+    from optipmb.rows import Array
     from optipmb.tracker import Modules
 
-    Array = NDArray[np.float64]
 
 FLAT: Final = (("center", ("x", "y", "z")), ("size", ("l", "w", "h")), ("velocity", ("vx", "vy")))
 """Arrays of a frame, and the columns that may stand for them."""

@@ -33,17 +33,16 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, PHI, V
-from optipmb.records import read_only
+from optipmb.rows import read_only
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.density import Density
     from optipmb.frame import Frame
+    from optipmb.rows import Array, Index
     from optipmb.table import ClassTable
 
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
 
 MOST: Final = 64
 """Objects nearest to the sensor, and detections of the highest scores, that are compared: the work is bounded."""
@@ -115,10 +114,8 @@ class Pairs(NamedTuple):
 def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> Density:
     """Carry a density into the axes of a frame without a pose, with the motion of the sensor found on the way.
 
-    Args:
-        density: posterior of the last frame, in the axes of that.
+    Arguments of its own:
         frame: with boxes in the axes of the sensor; a frame with a pose ends what was known of the motion.
-        table: parameters as columns.
 
     Returns:
         The density, the same where the sensor stands.

@@ -11,13 +11,13 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from optipmb.errors import EffortError
+from optipmb.extract import sound
 from optipmb.field_of_view import FieldOfView
 from optipmb.frame import PointCloud, Pose, make_frame
 from optipmb.geometry import bev_iou
 from optipmb.parameters import load_profile, parse_parameters
 from optipmb.paths import predict_tracks
 from optipmb.sensor_motion import Pairs, common_motion, sideways
-from optipmb.soundness import sound
 from optipmb.tracker import Modules, Tracker
 
 

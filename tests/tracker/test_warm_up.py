@@ -112,7 +112,7 @@ def test_kernels_are_counted_while_another_thread_imports(monkeypatch: pytest.Mo
 def test_a_compilation_is_announced_once(caplog: pytest.LogCaptureFixture) -> None:
     """The logger `optipmb` says once that a kernel of the package is compiled, and nothing of other functions."""
     announcement = compiled._FirstCompilation()
-    for module in ("elsewhere", "optipmb.update", "optipmb.prune"):
+    for module in ("elsewhere", "optipmb.update", "optipmb.association"):
         function = FunctionType((lambda: None).__code__, {"__name__": module})
         dispatcher = numba.njit(function)
         announcement.on_start(event.Event("numba:compile", event.EventStatus.START, {"dispatcher": dispatcher}))
