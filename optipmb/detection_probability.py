@@ -53,7 +53,7 @@ def detection_probability(
     share = moment.dt / table.detection_time if table.detection_time > 0.0 else 1.0
     p_d: Array
     if cloud is None and looks is None:
-        p_d = of_rows(over_time(table["detection"], share), objects.words, components.words)
+        p_d = of_rows(np.ascontiguousarray(over_time(table["detection"], share)), objects.words, components.words)
         return p_d
     label = np.concatenate((objects.label, components.label))
     p_d = table["detection"][label]
